@@ -1,0 +1,35 @@
+"""Which physics a run computes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+__all__ = ["Effects"]
+
+_REASONS = {
+    "yielding": ("soil flows when shear exceeds friction", "purely elastic soil was asked for"),
+    "rate_dependence": (
+        "friction rises with the inertial number, mu(I)",
+        "friction is the constant mu_s (Drucker-Prager)",
+    ),
+    "separation": ("soil below its critical density carries no stress", "soil may carry tension"),
+}
+
+
+@dataclass(frozen=True)
+class Effects:
+    """Physics that can be left out; the kernels are compiled without what is off."""
+
+    yielding: bool = True
+    """Frictional yield; off: elastic soil."""
+    rate_dependence: bool = True
+    """mu(I) instead of a constant mu_s. Needs `yielding`."""
+    separation: bool = True
+    """A stress-free state below the critical density; off: the soil can carry tension."""
+
+    def described(self) -> dict[str, dict[str, bool | str]]:
+        """Each effect with its state and the reason, as stored in a run file."""
+        return {
+            f.name: {"on": getattr(self, f.name), "reason": _REASONS[f.name][0 if getattr(self, f.name) else 1]}
+            for f in fields(self)
+        }

@@ -1,0 +1,197 @@
+"""Particle-grid transfers with quadratic B-splines (APIC / MLS), and the material update between them.
+
+Both kernels visit the 27 nodes around a particle. Node (i, j, k) is entry (i ny + j) nz + k of a flat array of
+4-vectors: momentum and mass on the way to the grid, velocity (and an unused number) on the way back.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .constitutive import constitutive, soil_struct
+from .effects import Effects
+
+__all__ = ["grid_struct", "transfer"]
+
+
+@cache
+def grid_struct(real: type) -> type:
+    """Struct of the grid and the step in precision `real`."""
+    vec3 = wp.types.vector(3, real)
+
+    @wp.struct
+    class Grid:
+        origin: vec3  # position of node (0, 0, 0) [m]
+        spacing: real  # dx [m]
+        inverse_spacing: real  # 1 / dx [1/m]
+        nx: int
+        ny: int
+        nz: int
+        dt: real  # [s]
+        gravity: real  # [m/s^2]
+        # Nodes with index <= low or >= high belong to the floor and the walls.
+        low: wp.vec3i
+        high: wp.vec3i
+        particle_mass: real  # [kg]
+        particle_volume: real  # at the critical density [m^3]
+        speed_limit: real  # one cell per step [m/s]
+
+    return Grid
+
+
+@cache
+def transfer(real: type, effects: Effects, atomic: bool) -> SimpleNamespace:
+    """Kernels `to_grid` and `to_particles` in precision `real` with only the physics in `effects`.
+
+    `atomic` is needed where many threads write to the grid at once (a GPU).
+    """
+    vec3 = wp.types.vector(3, real)
+    vec4 = wp.types.vector(4, real)
+    law = constitutive(real, effects)
+    vec6, mat33 = law.vec6, law.mat33
+    Soil, Grid = soil_struct(real), grid_struct(real)
+    update, kirchhoff = law.update, law.kirchhoff
+
+    @wp.func
+    def base_and_offset(x: vec3, grid: Grid):
+        # Lowest of the three nodes per axis, and the particle's distance from it in cells, in [0.5, 1.5).
+        # The index is bounded: a stray position must not write outside the grid (it would end the process).
+        g = (x - grid.origin) * grid.inverse_spacing
+        i = wp.clamp(int(g[0] - real(0.5)), 0, grid.nx - 3)
+        j = wp.clamp(int(g[1] - real(0.5)), 0, grid.ny - 3)
+        k = wp.clamp(int(g[2] - real(0.5)), 0, grid.nz - 3)
+        return wp.vec3i(i, j, k), g - vec3(real(i), real(j), real(k))
+
+    @wp.func
+    def weights(f: real):
+        a = real(1.5) - f
+        b = f - real(1.0)
+        c = f - real(0.5)
+        return vec3(real(0.5) * a * a, real(0.75) - b * b, real(0.5) * c * c)
+
+    @wp.func
+    def moments(w: vec3, f: real):
+        return vec3(-f * w[0], (real(1.0) - f) * w[1], (real(2.0) - f) * w[2])
+
+    @wp.func
+    def deposit(nodes: wp.array(dtype=vec4), at: int, amount: vec4):
+        # On the CPU one thread runs the kernel, and a plain sum is faster than an atomic one.
+        if wp.static(atomic):
+            wp.atomic_add(nodes, at, amount)
+        else:
+            nodes[at] = nodes[at] + amount
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def to_grid(
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        c: wp.array(dtype=mat33),
+        e: wp.array(dtype=vec6),
+        ln_j: wp.array(dtype=real),
+        grid: Grid,
+        soil: Soil,
+        nodes: wp.array(dtype=vec4),
+        substep: wp.array(dtype=int),
+    ):
+        p = wp.tid()
+        if p == 0:
+            substep[0] = substep[0] + 1
+        base, f = base_and_offset(x[p], grid)
+        wx = weights(f[0])
+        wy = weights(f[1])
+        wz = weights(f[2])
+        h = grid.spacing
+        # Affine momentum m C - dt V D^-1 tau, D = dx^2 / 4, times dx: momentum change per cell.
+        force = kirchhoff(e[p], ln_j[p], soil) * (real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing)
+        q = c[p] * (grid.particle_mass * h) + force
+        start = grid.particle_mass * v[p] - q * f
+        qx = vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0))
+        qy = vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0))
+        qz = vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0))
+        corner = vec4(start[0], start[1], start[2], grid.particle_mass)
+        for i in range(3):
+            for j in range(3):
+                row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
+                at = corner + real(i) * qx + real(j) * qy
+                w = wx[i] * wy[j]
+                deposit(nodes, row, (w * wz[0]) * at)
+                deposit(nodes, row + 1, (w * wz[1]) * (at + qz))
+                deposit(nodes, row + 2, (w * wz[2]) * (at + real(2.0) * qz))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def to_particles(
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        c: wp.array(dtype=mat33),
+        e: wp.array(dtype=vec6),
+        ln_j: wp.array(dtype=real),
+        grid: Grid,
+        soil: Soil,
+        velocity: wp.array(dtype=vec4),
+        substep: wp.array(dtype=int),
+        stray: wp.array(dtype=int),
+    ):
+        p = wp.tid()
+        position = x[p]
+        base, f = base_and_offset(position, grid)
+        wx = weights(f[0])
+        wy = weights(f[1])
+        wz = weights(f[2])
+        # Weights times the node's distance from the particle, for the velocity gradient.
+        ax = moments(wx, f[0])
+        ay = moments(wy, f[1])
+        az = moments(wz, f[2])
+        total = vec4()
+        gx = vec4()
+        gy = vec4()
+        gz = vec4()
+        for i in range(3):
+            plane = vec4()
+            plane_y = vec4()
+            plane_z = vec4()
+            for j in range(3):
+                row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
+                v0 = velocity[row]
+                v1 = velocity[row + 1]
+                v2 = velocity[row + 2]
+                line = wz[0] * v0 + wz[1] * v1 + wz[2] * v2
+                line_z = az[0] * v0 + az[1] * v1 + az[2] * v2
+                plane += wy[j] * line
+                plane_y += ay[j] * line
+                plane_z += wy[j] * line_z
+            total += wx[i] * plane
+            gx += ax[i] * plane
+            gy += wx[i] * plane_y
+            gz += wx[i] * plane_z
+        scale = real(4.0) * grid.inverse_spacing
+        gradient = mat33(
+            gx[0] * scale, gy[0] * scale, gz[0] * scale,
+            gx[1] * scale, gy[1] * scale, gz[1] * scale,
+            gx[2] * scale, gy[2] * scale, gz[2] * scale,
+        )  # fmt: skip
+        speed = vec3(total[0], total[1], total[2])
+        moved = position + grid.dt * speed
+        g = (moved - grid.origin) * grid.inverse_spacing
+        inside = (
+            g[0] >= real(0.5) and g[1] >= real(0.5) and g[2] >= real(0.5)
+            and g[0] < real(grid.nx) - real(1.5)
+            and g[1] < real(grid.ny) - real(1.5)
+            and g[2] < real(grid.nz) - real(1.5)
+        )  # fmt: skip
+        slow = wp.length_sq(speed) < grid.speed_limit * grid.speed_limit  # false for a NaN, too
+        if inside and slow:
+            state = update(e[p], ln_j[p], grid.dt * gradient, grid.dt, soil)
+            x[p] = moved
+            v[p] = speed
+            c[p] = gradient
+            e[p] = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
+            ln_j[p] = state[6]
+        else:
+            # The particle keeps its last good state; the solver stops at the end of the frame.
+            if wp.atomic_add(stray, 0, 1) == 0:
+                stray[1] = p
+                stray[2] = substep[0]
+                stray[3] = wp.where(slow, 1, 0)
+
+    return SimpleNamespace(to_grid=to_grid, to_particles=to_particles)
