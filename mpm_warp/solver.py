@@ -66,7 +66,6 @@ class Solver:
     ) -> None:
         if precision not in PRECISIONS:
             raise SceneError(f"precision is {precision!r}; allowed: {', '.join(PRECISIONS)}")
-        wp.config.quiet = True
         wp.init()
         if device not in {str(d) for d in wp.get_devices()} | {"cuda"} or (device == "cuda" and not wp.is_cuda_available()):
             raise SceneError(f"device is {device!r}; allowed here: {', '.join(str(d) for d in wp.get_devices())}")
