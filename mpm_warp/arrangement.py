@@ -41,7 +41,11 @@ def arrange(
         # Sampled on a larger box and trimmed: points crowd at the edge of the box they were sampled in.
         radius = POISSON_RADIUS * spacing
         margin = 2.0 * radius
-        points = poisson_disk(tuple(s + 2.0 * margin for s in size), radius, seed) + [-margin, -margin, margin]
+        points = poisson_disk(tuple(s + 2.0 * margin for s in size), radius, seed) + [
+            -margin,
+            -margin,
+            margin,
+        ]
         inside = (points >= [0.0, 0.0, -size[2]]) & (points <= [size[0], size[1], 0.0])
         return points[inside.all(axis=1)], spacing**3
     raise SceneError(f"bed.arrangement is {kind!r}; allowed: {', '.join(ARRANGEMENTS)}")
@@ -57,7 +61,9 @@ def lattice(size: tuple[float, float, float], spacing: float) -> tuple[np.ndarra
     return grid, float(np.prod(step))
 
 
-def poisson_disk(size: tuple[float, float, float], radius: float, seed: int, candidates: int = 30) -> np.ndarray:
+def poisson_disk(
+    size: tuple[float, float, float], radius: float, seed: int, candidates: int = 30
+) -> np.ndarray:
     """Random points no closer to each other than `radius` (Bridson 2007), shape (n, 3) [m]."""
     rng = np.random.default_rng(seed)
     extent = np.asarray(size, dtype=float)

@@ -74,13 +74,11 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
 
     @wp.func
     def norm_squared(s: vec6):
-        return (
-            s[0] * s[0] + s[1] * s[1] + s[2] * s[2] + real(2.0) * (s[3] * s[3] + s[4] * s[4] + s[5] * s[5])
-        )
+        return s[0] * s[0] + s[1] * s[1] + s[2] * s[2] + real(2.0) * (s[3] * s[3] + s[4] * s[4] + s[5] * s[5])
 
     @wp.func
     def deviator(s: vec6):
-        third = (s[0] + s[1] + s[2]) * real(1.0 / 3.0)
+        third = (s[0] + s[1] + s[2]) / real(3.0)
         return vec6(s[0] - third, s[1] - third, s[2] - third, s[3], s[4], s[5])
 
     @wp.func
@@ -101,7 +99,7 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
         x2 = commuting_product(x, x)
         x3 = commuting_product(x2, x)
         x4 = commuting_product(x2, x2)
-        return real(0.5) * x - real(0.25) * x2 + real(1.0 / 6.0) * x3 - real(0.125) * x4
+        return real(0.5) * x - real(0.25) * x2 + x3 / real(6.0) - real(0.125) * x4
 
     @wp.func
     def exp_twice_minus_one_exact(e: vec6):
@@ -118,7 +116,7 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
             return exp_twice_minus_one_exact(e)
         e2 = commuting_product(e, e)
         e3 = commuting_product(e2, e)
-        return real(2.0) * e + real(2.0) * e2 + real(4.0 / 3.0) * e3
+        return real(2.0) * e + real(2.0) * e2 + real(4.0) / real(3.0) * e3
 
     @wp.func
     def strain_trial(e: vec6, a: mat33):
@@ -147,7 +145,7 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
         )  # fmt: skip
         g = t + second + wp.determinant(a)
         if wp.abs(g) < real(0.01):
-            return g * (real(1.0) - g * (real(0.5) - g * (real(1.0 / 3.0) - g * real(0.25))))
+            return g * (real(1.0) - g * (real(0.5) - g * (real(1.0) / real(3.0) - g * real(0.25))))
         return wp.log(wp.max(real(1.0) + g, real(1e-6)))
 
     @wp.func

@@ -23,7 +23,9 @@ def body_struct(real: type) -> type:
         rotation: wp.array(dtype=quat)
         velocity: wp.array(dtype=vec3)  # pose difference over the substep [m/s]
         spin: wp.array(dtype=vec3)  # angular velocity, world frame [rad/s]
-        impulse: wp.array(dtype=vec3)  # [0] by the soil on the body [N s], [1] its moment about the centre of mass
+        impulse: wp.array(
+            dtype=vec3
+        )  # [0] by the soil on the body [N s], [1] its moment about the centre of mass
 
     return Body
 

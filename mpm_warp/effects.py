@@ -30,6 +30,9 @@ class Effects:
     def described(self) -> dict[str, dict[str, bool | str]]:
         """Each effect with its state and the reason, as stored in a run file."""
         return {
-            f.name: {"on": getattr(self, f.name), "reason": _REASONS[f.name][0 if getattr(self, f.name) else 1]}
+            f.name: {
+                "on": getattr(self, f.name),
+                "reason": _REASONS[f.name][0 if getattr(self, f.name) else 1],
+            }
             for f in fields(self)
         }

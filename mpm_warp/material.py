@@ -42,7 +42,9 @@ class Material:
             if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
                 raise SceneError(f"material.{name} is {value}; it must be a number above 0")
         if not 0.0 <= self.poissons_ratio < 0.5:
-            raise SceneError(f"material.poissons_ratio is {self.poissons_ratio}; allowed: 0 up to, not including, 0.5")
+            raise SceneError(
+                f"material.poissons_ratio is {self.poissons_ratio}; allowed: 0 up to, not including, 0.5"
+            )
         if not 0.0 < self.packing <= 1.0:
             raise SceneError(f"material.packing is {self.packing}; allowed: above 0, at most 1")
         if not self.static_friction > 0.0:

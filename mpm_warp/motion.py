@@ -7,7 +7,7 @@ import numpy as np
 from .errors import SceneError
 from .rotation import slerp
 
-__all__ = ["MOTIONS", "CUT_LENGTH", "RAMP_SPEED", "curved", "ramp", "sampled_poses"]
+__all__ = ["CUT_LENGTH", "MOTIONS", "RAMP_SPEED", "curved", "ramp", "sampled_poses"]
 
 MOTIONS = ("curved", "ramp", "rest", "path")
 
@@ -61,7 +61,9 @@ def sampled_poses(samples: np.ndarray, time: np.ndarray) -> np.ndarray:
         )
     bad = np.argwhere(~np.isfinite(samples))
     if len(bad):
-        raise SceneError(f"the path holds a value that is not finite in row {bad[0][0] + 1}, column {bad[0][1] + 1}")
+        raise SceneError(
+            f"the path holds a value that is not finite in row {bad[0][0] + 1}, column {bad[0][1] + 1}"
+        )
     if np.any(np.diff(samples[:, 0]) <= 0.0):
         row = int(np.argmax(np.diff(samples[:, 0]) <= 0.0)) + 2
         raise SceneError(f"the path's times must increase; row {row} does not come after the row before it")

@@ -47,9 +47,13 @@ class Bed:
         if len(self.size) != 3 or not all(math.isfinite(s) and s > 0 for s in self.size):
             raise SceneError(f"bed.size is {self.size}; it needs three lengths above 0 m")
         if not (math.isfinite(self.spacing) and 0 < self.spacing <= min(self.size) / 2):
-            raise SceneError(f"bed.spacing is {self.spacing} m; allowed: above 0, at most half the bin's smallest side")
+            raise SceneError(
+                f"bed.spacing is {self.spacing} m; allowed: above 0, at most half the bin's smallest side"
+            )
         if not 0 < self.particles_per_cell <= 64:
-            raise SceneError(f"bed.particles_per_cell is {self.particles_per_cell}; allowed: above 0, at most 64")
+            raise SceneError(
+                f"bed.particles_per_cell is {self.particles_per_cell}; allowed: above 0, at most 64"
+            )
         cells = np.prod(self.size) / self.spacing**3
         if cells * self.particles_per_cell > 2e7:
             raise SceneError(
@@ -59,7 +63,9 @@ class Bed:
         if self.arrangement not in ARRANGEMENTS:
             raise SceneError(f"bed.arrangement is {self.arrangement!r}; allowed: {', '.join(ARRANGEMENTS)}")
         if self.initial_stress not in INITIAL_STRESSES:
-            raise SceneError(f"bed.initial_stress is {self.initial_stress!r}; allowed: {', '.join(INITIAL_STRESSES)}")
+            raise SceneError(
+                f"bed.initial_stress is {self.initial_stress!r}; allowed: {', '.join(INITIAL_STRESSES)}"
+            )
         if not self.headroom > 0:
             raise SceneError(f"bed.headroom is {self.headroom} m; it must be above 0")
 
@@ -197,10 +203,14 @@ class Excavation(Scene):
             raise SceneError(f"scene.motion is {self.motion!r}; allowed: {', '.join(MOTIONS)}")
         if self.motion == "path":
             if self.path is None:
-                raise SceneError("scene.motion=path needs scene.path, a CSV file with columns t,x,y,z,qx,qy,qz,qw")
+                raise SceneError(
+                    "scene.motion=path needs scene.path, a CSV file with columns t,x,y,z,qx,qy,qz,qw"
+                )
             object.__setattr__(self, "path", tuple(tuple(float(v) for v in row) for row in self.path))
         elif self.path is not None:
-            raise SceneError(f"scene.path is given but scene.motion is {self.motion!r}; use scene.motion=path")
+            raise SceneError(
+                f"scene.path is given but scene.motion is {self.motion!r}; use scene.motion=path"
+            )
         if not (math.isfinite(self.depth) and self.depth >= 0):
             raise SceneError(f"scene.depth is {self.depth} m; it must be 0 or more")
         if not (math.isfinite(self.speed) and self.speed > 0):

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .contact import body_struct, grid_step
 from .constitutive import soil_struct
+from .contact import body_struct, grid_step
 from .effects import Effects
 from .errors import SceneError, SolverStopped
 from .rotation import angular_velocity, rotate
@@ -67,8 +67,12 @@ class Solver:
         if precision not in PRECISIONS:
             raise SceneError(f"precision is {precision!r}; allowed: {', '.join(PRECISIONS)}")
         wp.init()
-        if device not in {str(d) for d in wp.get_devices()} | {"cuda"} or (device == "cuda" and not wp.is_cuda_available()):
-            raise SceneError(f"device is {device!r}; allowed here: {', '.join(str(d) for d in wp.get_devices())}")
+        if device not in {str(d) for d in wp.get_devices()} | {"cuda"} or (
+            device == "cuda" and not wp.is_cuda_available()
+        ):
+            raise SceneError(
+                f"device is {device!r}; allowed here: {', '.join(str(d) for d in wp.get_devices())}"
+            )
         self.scene = scene
         self.effects = effects or Effects()
         self.device = wp.get_device(device)
@@ -124,7 +128,11 @@ class Solver:
         top = math.ceil((bed.size[2] + bed.headroom) / h) + _PADDING
         grid.origin = vec3(*origin)
         grid.spacing, grid.inverse_spacing = h, 1.0 / h
-        grid.nx, grid.ny, grid.nz = cells[0] + 2 * _PADDING + 1, cells[1] + 2 * _PADDING + 1, top + _PADDING + 1
+        grid.nx, grid.ny, grid.nz = (
+            cells[0] + 2 * _PADDING + 1,
+            cells[1] + 2 * _PADDING + 1,
+            top + _PADDING + 1,
+        )
         grid.dt, grid.gravity = self.time_step, scene.gravity
         grid.low = wp.vec3i(_PADDING, _PADDING, _PADDING)
         grid.high = wp.vec3i(_PADDING + cells[0], _PADDING + cells[1], 2**30)

@@ -103,21 +103,26 @@ def transfer(real: type, effects: Effects, atomic: bool) -> SimpleNamespace:
         wz = weights(f[2])
         h = grid.spacing
         # Affine momentum m C - dt V D^-1 tau, D = dx^2 / 4, times dx: momentum change per cell.
-        force = kirchhoff(e[p], ln_j[p], soil) * (real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing)
+        force = kirchhoff(e[p], ln_j[p], soil) * (
+            real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing
+        )
         q = c[p] * (grid.particle_mass * h) + force
         start = grid.particle_mass * v[p] - q * f
         qx = vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0))
         qy = vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0))
         qz = vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0))
         corner = vec4(start[0], start[1], start[2], grid.particle_mass)
+        plane = corner
         for i in range(3):
+            at = plane
             for j in range(3):
                 row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
-                at = corner + real(i) * qx + real(j) * qy
                 w = wx[i] * wy[j]
                 deposit(nodes, row, (w * wz[0]) * at)
                 deposit(nodes, row + 1, (w * wz[1]) * (at + qz))
                 deposit(nodes, row + 2, (w * wz[2]) * (at + real(2.0) * qz))
+                at += qy
+            plane += qx
 
     @wp.kernel(module="unique", enable_backward=False)
     def to_particles(

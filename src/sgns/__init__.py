@@ -1,0 +1,37 @@
+"""Granular flow under a moving tool: simulate, reduce, learn, roll out, report.
+
+The names below are loaded when they are first used, so that `import sgns` and the command line stay quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sgns.errors import UserError
+    from sgns.reduction import Basis, IncrementalPCA
+    from sgns.runfile import Run
+    from sgns.simulator import Simulator
+
+__all__ = ["Basis", "IncrementalPCA", "Run", "Simulator", "UserError", "__version__"]
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Basis": "sgns.reduction",
+    "IncrementalPCA": "sgns.reduction",
+    "Run": "sgns.runfile",
+    "Simulator": "sgns.simulator",
+    "UserError": "sgns.errors",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'sgns' has no attribute {name!r}; public names: {', '.join(__all__)}")
+    return getattr(importlib.import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,275 @@
+"""The subspace of the soil's motion: modes, what they explain, and the file they are kept in.
+
+Letters: n particles, r modes; "..." stands for any leading axes, such as frames.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import uuid
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgns.errors import UserError
+
+__all__ = ["CENTRINGS", "Basis"]
+
+CENTRINGS = ("scalar", "particle", "particle_axis")
+"""What is subtracted before modes are found: one number, a mean per particle, one per particle and axis."""
+
+_FORMAT = "sgns-basis"
+_FORMAT_VERSION = 1
+_ARRAYS = ("mean", "modes", "eigenvalues")
+_NUMBERS = ("total_variance", "displacement_variance", "residual_variance")
+_WORDS = ("centring", "arrangement_hash")
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Orthonormal modes of the soil and the variance each explains.
+
+    Attributes:
+        mean: What is subtracted before projecting [m], (n, 3) float64, whatever the centring.
+        modes: Modes, orthonormal columns, (n, r) float64; the largest entry of each is positive.
+        eigenvalues: Population variance along each mode over the (frame, axis) rows [m^2], decreasing,
+            (r,) float64.
+        total_variance: Sum of all eigenvalues, also those of modes not kept [m^2].
+        displacement_variance: The total variance when every particle is centred on every axis: the
+            motion alone [m^2].
+        centring: One of `CENTRINGS`.
+        arrangement_hash: The particle arrangement the modes belong to.
+        fitted_on: Names of the runs the basis was fitted on.
+        residual_variance: Variance outside the modes [m^2]; stored because `total_variance` minus the
+            eigenvalues cancels when the layout dwarfs the motion. None: computed by that difference.
+    """
+
+    mean: Tensor
+    modes: Tensor
+    eigenvalues: Tensor
+    total_variance: float
+    displacement_variance: float
+    centring: str
+    arrangement_hash: str = ""
+    fitted_on: list[str] | None = None
+    residual_variance: float | None = None
+
+    def __post_init__(self) -> None:
+        check_centring(self.centring)
+        shapes = [tuple(x.shape) for x in (self.mean, self.modes, self.eigenvalues)]
+        if self.modes.dim() != 2 or shapes[0] != (shapes[1][0], 3) or shapes[2] != (shapes[1][1],):
+            raise UserError(
+                f"basis arrays do not belong together: mean {shapes[0]}, modes {shapes[1]}, eigenvalues "
+                f"{shapes[2]}; expected (n, 3), (n, r) and (r,)"
+            )
+        if self.fitted_on is None:
+            object.__setattr__(self, "fitted_on", [])
+        if self.residual_variance is None:
+            rest = max(self.total_variance - float(self.eigenvalues.sum()), 0.0)
+            object.__setattr__(self, "residual_variance", rest)
+
+    @property
+    def num_modes(self) -> int:
+        """Number of modes r."""
+        return self.modes.shape[1]
+
+    @property
+    def num_particles(self) -> int:
+        """Number of particles n."""
+        return self.modes.shape[0]
+
+    def transform(self, positions: Tensor | np.ndarray) -> Tensor:
+        """Reduced positions [m] of `positions` [m]: (..., n, 3) -> (..., r, 3) float64.
+
+        Raises:
+            UserError: If the particle count differs from the basis.
+        """
+        x = self._input(positions, "positions", self.num_particles)
+        return ((x - self.mean).transpose(-1, -2) @ self.modes).transpose(-1, -2).contiguous()
+
+    def inverse(self, latent: Tensor | np.ndarray) -> Tensor:
+        """Particle positions [m] of reduced positions [m]: (..., r, 3) -> (..., n, 3) float64.
+
+        Raises:
+            UserError: If the mode count differs from the basis.
+        """
+        z = self._input(latent, "reduced positions", self.num_modes)
+        return (z.transpose(-1, -2) @ self.modes.T).transpose(-1, -2).contiguous().add_(self.mean)
+
+    def sliced(self, r: int) -> Basis:
+        """The basis of the first `r` modes, with the same mean and total variance."""
+        if not 1 <= r <= self.num_modes:
+            raise UserError(
+                f"cannot keep {r} modes; the basis has {self.num_modes}; allowed: 1 to {self.num_modes}"
+            )
+        return replace(
+            self,
+            modes=self.modes[:, :r].clone(),
+            eigenvalues=self.eigenvalues[:r].clone(),
+            residual_variance=float(self._residual()[r]),
+        )
+
+    def energy(self, r: int | None = None) -> float | Tensor:
+        """Share of the total variance in the first `r` modes: the paper's measure.
+
+        Args:
+            r: Number of modes, 0 to num_modes; None: all from 1 to num_modes, (num_modes,).
+        """
+        return self._explained(self.total_variance, r)
+
+    def displacement_energy(self, r: int | None = None) -> float | Tensor:
+        """One minus residual over displacement variance: the modes' share of the motion; r as in `energy`.
+
+        Negative when modes are so few that part of the static layout is lost too (`scalar`, `particle`).
+        """
+        return self._explained(self.displacement_variance, r)
+
+    def residual_mse(self, r: int | None = None) -> float | Tensor:
+        """Mean square of inverse(transform(x)) - x on the fitted data [m^2] per entry; r as in `energy`.
+
+        Exact if the stream never had more directions than were tracked, else an upper bound.
+        """
+        return self._at(self._residual() / self.num_particles, r)
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and plain Python values, fit for a checkpoint that loads under `weights_only`."""
+        values = {key: getattr(self, key) for key in (*_ARRAYS, *_NUMBERS, *_WORDS)}
+        return {"format_version": _FORMAT_VERSION, **values, "fitted_on": list(self.fitted_on or [])}
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any], where: str = "basis state") -> Basis:
+        """Basis of a dict made by `state`.
+
+        Args:
+            state: The dict.
+            where: What to call its origin in an error.
+
+        Raises:
+            UserError: If a key is missing, a value is not finite, shapes disagree or modes are askew.
+        """
+        try:
+            if state["format_version"] > _FORMAT_VERSION:
+                raise UserError(
+                    f"{where}: basis format {state['format_version']} is newer than this program reads "
+                    f"({_FORMAT_VERSION}); update sgns"
+                )
+            arrays = {k: torch.as_tensor(state[k]).to(torch.float64) for k in _ARRAYS}
+            numbers = {k: float(state[k]) for k in _NUMBERS}
+            names = [str(name) for name in state["fitted_on"]]
+            words = {k: str(state[k]) for k in _WORDS}
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise UserError(f"{where}: not a basis ({error!r}); fit it again with `sgns reduce`") from error
+        finite = [bool(x.isfinite().all()) for x in arrays.values()] + [*map(math.isfinite, numbers.values())]
+        if not all(finite):
+            raise UserError(
+                f"{where}: the basis holds values that are not finite; fit it again with `sgns reduce`"
+            )
+        basis = cls(**arrays, **numbers, **words, fitted_on=names)
+        deviation = orthonormality_error(basis.modes)
+        if deviation > 1e-6:
+            raise UserError(
+                f"{where}: modes are not orthonormal (off by {deviation:.1e}); fit again with `sgns reduce`"
+            )
+        return basis
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the basis to one HDF5 file; it appears complete or not at all.
+
+        Raises:
+            UserError: If the file cannot be written.
+        """
+        path = Path(path)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp")
+        try:
+            with h5py.File(temporary, "w") as file:
+                for key, value in self.state().items():
+                    if isinstance(value, Tensor):
+                        # Checksummed, so that a damaged file is an error and not a wrong basis.
+                        array = value.detach().cpu().numpy()
+                        file.create_dataset(key, data=array, chunks=True, fletcher32=True)
+                    elif isinstance(value, list):
+                        # A dataset, because an attribute holds 64 kB at most.
+                        file.create_dataset(key, data=json.dumps(value))
+                    else:
+                        file.attrs[key] = value
+                file.attrs["format"] = _FORMAT
+                file.attrs["si_unit"] = "mean: m; eigenvalues and variances: m2; modes: 1"
+            with temporary.open("r+b") as written:
+                os.fsync(written.fileno())
+            os.replace(temporary, path)
+        except OSError as error:
+            raise UserError(
+                f"cannot write the basis to {path}: {error}; choose a folder that exists and is writable"
+            ) from error
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Basis:
+        """Read a basis written by `save`.
+
+        Raises:
+            UserError: If the file is missing, truncated, damaged or not a basis.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise UserError(f"no basis file at {path}; make one with `sgns reduce`")
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("format") != _FORMAT:
+                    raise UserError(f"{path}: an HDF5 file but not a basis; make one with `sgns reduce`")
+                state = {key: value for key, value in file.attrs.items()}
+                state["fitted_on"] = json.loads(file["fitted_on"][()])
+                state.update((key, torch.from_numpy(file[key][()])) for key in _ARRAYS)
+        except (OSError, ValueError, TypeError, KeyError, RuntimeError, AttributeError) as error:
+            reason = " ".join(str(error).split())
+            raise UserError(
+                f"{path}: not a readable basis, truncated or damaged ({reason}); fit again with `sgns reduce`"
+            ) from error
+        return cls.from_state(state, where=str(path))
+
+    def _input(self, values: Tensor | np.ndarray, what: str, size: int) -> Tensor:
+        x = (values if isinstance(values, Tensor) else torch.tensor(np.asarray(values))).to(self.modes)
+        if x.dim() < 2 or tuple(x.shape[-2:]) != (size, 3):
+            raise UserError(f"{what} have shape {tuple(x.shape)}; this basis takes (..., {size}, 3)")
+        return x
+
+    def _residual(self) -> Tensor:
+        """Variance outside the first 0, ..., r modes [m^2], (r + 1,), summed so that nothing cancels."""
+        tail = torch.cat([self.eigenvalues, self.eigenvalues.new_tensor([self.residual_variance])])
+        return tail.flip(0).cumsum(0).flip(0)
+
+    def _explained(self, variance: float, r: int | None) -> float | Tensor:
+        residual = self._residual()
+        if variance > 0.0:
+            return self._at(1.0 - residual / variance, r)
+        # Nothing varies: all of it is explained once nothing is left over.
+        return self._at(torch.where(residual > 0.0, -math.inf, 1.0).to(residual), r)
+
+    def _at(self, values: Tensor, r: int | None) -> float | Tensor:
+        if r is None:
+            return values[1:]
+        if not 0 <= r <= self.num_modes:
+            raise UserError(
+                f"asked for {r} modes; the basis has {self.num_modes}; allowed: 0 to {self.num_modes}"
+            )
+        return float(values[r])
+
+
+def orthonormality_error(modes: Tensor) -> float:
+    """Largest entry of |modes^T modes - 1|."""
+    gram = modes.T @ modes
+    return float((gram - torch.eye(len(gram)).to(gram)).abs().max()) if len(gram) else 0.0
+
+
+def check_centring(centring: str) -> None:
+    """Raise UserError unless `centring` is one of `CENTRINGS`."""
+    if centring not in CENTRINGS:
+        raise UserError(f"unknown centring {centring!r}; allowed: {', '.join(CENTRINGS)}")

@@ -1,0 +1,179 @@
+"""A dataset: a folder of runs that share a bed, drawn from a grid of scenes and split by run.
+
+<folder>/dataset.yaml      what the runs are: base scene, draws, seed, split; written before the first run
+<folder>/runs/<name>.h5    one run each; a run that is there is complete
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from omegaconf import OmegaConf
+
+from mpm_warp import Scene
+
+from .errors import UserError
+
+__all__ = ["SPLITS", "Campaign", "Dataset", "plan"]
+
+SPLITS = ("train", "validation", "test")
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Runs to be made."""
+
+    name: str
+    path: Path
+    scenes: dict[str, Scene]
+    """Run name → scene."""
+    split: dict[str, str]
+    """Run name → train, validation or test."""
+    effects: dict[str, bool]
+    seed: int
+
+    def describe(self) -> dict[str, Any]:
+        """The contents of dataset.yaml."""
+        return {
+            "name": self.name,
+            "seed": self.seed,
+            "effects": dict(self.effects),
+            "split": {s: [n for n, where in self.split.items() if where == s] for s in SPLITS},
+            "scenes": {name: scene.to_dict() for name, scene in self.scenes.items()},
+        }
+
+    def file(self, name: str) -> Path:
+        """Where a run goes."""
+        return self.path / "runs" / f"{name}.h5"
+
+    def record(self) -> None:
+        """Write dataset.yaml, or check that the folder's own says the same."""
+        file = self.path / "dataset.yaml"
+        if file.exists():
+            if _read(file) != self.describe():
+                raise UserError(
+                    f"{self.path} holds a dataset made with other settings; give another dataset.path, or remove "
+                    "the folder to make this one"
+                )
+            return
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            temporary = file.with_name(f".{file.name}.{os.getpid()}")
+            temporary.write_text(yaml.safe_dump(self.describe(), sort_keys=False), encoding="utf-8")
+            os.replace(temporary, file)
+        except OSError as error:
+            raise UserError(f"cannot write {file}: {error.strerror}") from None
+
+
+def plan(
+    settings: Mapping[str, Any], base: Mapping[str, Any], effects: dict[str, bool], seed: int
+) -> Campaign:
+    """The runs of a campaign.
+
+    Args:
+        settings: the `dataset` group: name, path, set, draw, runs, split.
+        base: a scene as nested data; `set` and `draw` replace values in it.
+        effects: which physics.
+        seed: of the drawn combinations and the split.
+    """
+    for key in ("name", "path", "draw"):
+        if settings.get(key) is None:
+            raise UserError(f"dataset.{key} is missing; a campaign needs name, path and draw")
+    draw = settings["draw"]
+    for key, values in draw.items():
+        if not isinstance(values, list) or not values:
+            raise UserError(f"dataset.draw.{key} is {values!r}; it must be a list of at least one value")
+    combinations = list(itertools.product(*draw.values()))
+    count = settings.get("runs") or len(combinations)
+    if not 3 <= count <= len(combinations):
+        raise UserError(
+            f"dataset.runs is {count}; allowed: 3 to {len(combinations)}, the combinations of dataset.draw"
+        )
+    rng = np.random.default_rng(seed)
+    chosen = sorted(rng.choice(len(combinations), size=count, replace=False).tolist())
+    scenes: dict[str, Scene] = {}
+    for index in chosen:
+        data = OmegaConf.create(dict(base))
+        for key, value in [*settings.get("set", {}).items(), *zip(draw, combinations[index], strict=True)]:
+            OmegaConf.update(data, key, value, force_add=True)
+        label = "_".join(
+            f"{key.split('.')[-1]}-{value}" for key, value in zip(draw, combinations[index], strict=True)
+        )
+        scenes[f"{index:04d}_{label}"] = Scene.from_dict(OmegaConf.to_container(data, resolve=True))
+    return Campaign(
+        name=settings["name"],
+        path=Path(settings["path"]),
+        scenes=scenes,
+        split=_split(list(scenes), settings.get("split", [0.8, 0.1, 0.1]), rng),
+        effects=effects,
+        seed=seed,
+    )
+
+
+def _split(names: list[str], shares: list[float], rng: np.random.Generator) -> dict[str, str]:
+    """Each name's part, by chance; validation and test get at least one run if their share is above 0."""
+    if len(shares) != 3 or min(shares) < 0 or abs(sum(shares) - 1.0) > 1e-6:
+        raise UserError(
+            f"dataset.split is {shares}; it needs three shares (train, validation, test) that sum to 1"
+        )
+    counts = [max(round(s * len(names)), 1 if s > 0 else 0) for s in shares[1:]]
+    order = rng.permutation(len(names))
+    part = {}
+    for rank, index in enumerate(order):
+        part[names[index]] = "validation" if rank < counts[0] else "test" if rank < sum(counts) else "train"
+    return {name: part[name] for name in names}
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A campaign's runs on disk."""
+
+    name: str
+    path: Path
+    split: dict[str, list[str]]
+
+    @classmethod
+    def open(cls, folder: str | os.PathLike[str]) -> Dataset:
+        """The dataset in a folder.
+
+        Raises:
+            UserError: there is none, or it is not complete.
+        """
+        path = Path(folder)
+        file = path / "dataset.yaml"
+        if not file.exists():
+            raise UserError(
+                f"no dataset in {path}: dataset.yaml is missing; make one: sgns simulate dataset=quick"
+            )
+        content = _read(file)
+        split = content.get("split") if isinstance(content, dict) else None
+        if not isinstance(split, dict) or not all(isinstance(split.get(s), list) for s in SPLITS):
+            raise UserError(f"{file} has no split into {', '.join(SPLITS)}; it was not made by sgns simulate")
+        dataset = cls(name=str(content.get("name", path.name)), path=path, split=split)
+        missing = [run for s in SPLITS for run in dataset.runs(s) if not run.exists()]
+        if missing:
+            raise UserError(
+                f"{len(missing)} runs of {path} are missing, the first is {missing[0].name}; finish the dataset: "
+                f"sgns simulate dataset={dataset.name}"
+            )
+        return dataset
+
+    def runs(self, split: str) -> list[Path]:
+        """Files of one split: train, validation or test."""
+        if split not in SPLITS:
+            raise UserError(f"split is {split!r}; allowed: {', '.join(SPLITS)}")
+        return [self.path / "runs" / f"{name}.h5" for name in self.split[split]]
+
+
+def _read(file: Path) -> Any:
+    try:
+        return yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"cannot read {file}: {str(error).splitlines()[0]}") from None

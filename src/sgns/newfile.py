@@ -1,0 +1,189 @@
+"""A file that appears under its name only when it is complete.
+
+HDF5 writes through `NewFile` rather than to the disk itself: when the disk is full HDF5 can neither close a
+file nor give it up, and takes the whole process down. `NewFile` keeps the error to itself and lets the caller
+raise it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+from uuid import uuid4
+
+from sgns.errors import UserError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+__all__ = ["NewFile"]
+
+log = logging.getLogger(__name__)
+
+_SUFFIX = ".partial"
+T = TypeVar("T")
+
+
+class NewFile:
+    """A hidden file beside `path`, for `h5py.File(NewFile(path), "w")`; `complete` gives it its name.
+
+    Until then an existing file of that name stays as it is. Hidden files that killed processes of this
+    machine left for the same path are removed.
+
+    Args:
+        path: where the file goes; missing folders are made.
+
+    Raises:
+        UserError: the folder cannot be made or written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if os.path.isdir(path):  # unlike Path.is_dir, takes any name
+            raise UserError(f"{path} is a folder; give the name of a file, such as {path / 'run.h5'}")
+        self.path = path
+        self._error: BaseException | None = None
+        start = f".{path.name}.{socket.gethostname()}-"
+        self._temp = path.with_name(f"{start}{os.getpid()}-{uuid4().hex[:8]}{_SUFFIX}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _remove_leftovers(path.parent, start)
+            self._file = open(self._temp, "xb+", buffering=0)
+        except OSError as error:
+            raise _cannot_write(path, error) from error
+        if fcntl is not None:
+            with contextlib.suppress(OSError):  # some file systems have no locks
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def check(self) -> None:
+        """Raise what a read or write since the last check ran into."""
+        if self._error is None:
+            return
+        error = self._error
+        if isinstance(error, OSError):
+            raise _cannot_write(self.path, error) from error
+        raise error
+
+    def complete(self) -> None:
+        """Wait until the disk has everything, then give the file its name. Close the HDF5 file before.
+
+        Raises:
+            UserError: the disk did not take it; nothing is left behind.
+        """
+        try:
+            self.check()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            os.replace(self._temp, self.path)
+        except OSError as error:
+            self.discard()
+            raise _cannot_write(self.path, error) from error
+        except BaseException:
+            self.discard()
+            raise
+        if os.name == "posix":
+            with contextlib.suppress(OSError):  # the file is complete; some file systems cannot sync a folder
+                descriptor = os.open(self.path.parent, os.O_RDONLY)
+                try:
+                    os.fsync(descriptor)
+                finally:
+                    os.close(descriptor)
+
+    def discard(self) -> None:
+        """Remove the hidden file; does nothing the second time."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+        with contextlib.suppress(OSError):
+            self._temp.unlink(missing_ok=True)
+
+    # --- what h5py asks of a file: nothing of this may raise ----------------------------------------------
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Move; see io.IOBase."""
+        return self._kept(lambda: self._file.seek(offset, whence), 0)
+
+    def tell(self) -> int:
+        """Where we are; see io.IOBase."""
+        return self._kept(self._file.tell, 0)
+
+    def read(self, size: int = -1) -> bytes:
+        """Read; see io.RawIOBase."""
+        return self._kept(lambda: self._file.read(size), b"") or b""
+
+    def readinto(self, buffer: memoryview) -> int:
+        """Fill the buffer, with zeros where nothing can be read."""
+        view = memoryview(buffer).cast("B")
+        done = 0
+        while done < len(view):
+            count = self._kept(lambda part=view[done:]: self._file.readinto(part), 0)
+            if not count:
+                view[done:] = bytes(len(view) - done)
+                break
+            done += count
+        return len(view)
+
+    def write(self, data: memoryview) -> int:
+        """Write everything, or remember why not."""
+        view = memoryview(data).cast("B")
+        done = 0
+        while done < len(view) and self._error is None:
+            done += self._kept(lambda part=view[done:]: self._file.write(part), 0) or 0
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the length; see io.IOBase."""
+        return self._kept(lambda: self._file.truncate(size), 0)
+
+    def flush(self) -> None:
+        """Nothing is buffered here."""
+
+    def _kept(self, action: Callable[[], T], otherwise: T) -> T:
+        try:
+            return action()
+        except BaseException as error:  # also an interrupt: HDF5 must not see it half-way through a write
+            self._error = self._error or error
+            return otherwise
+
+
+def _remove_leftovers(folder: Path, start: str) -> None:
+    """Delete hidden files that begin with `start` and whose process on this machine was killed."""
+    if fcntl is None:
+        return
+    for found in folder.iterdir():
+        if not (found.name.startswith(start) and found.name.endswith(_SUFFIX)):
+            continue
+        pid = found.name[len(start) :].split("-")[0]
+        if not pid.isdecimal() or _alive(int(pid)):
+            continue
+        # A live process in a container may have a number that we cannot see; its lock shows that it is there.
+        with contextlib.suppress(OSError), found.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            found.unlink()
+            log.info("removed %s, left by a process that was killed", found)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def _cannot_write(path: Path, error: OSError) -> UserError:
+    """What a person can do about a failed write, in one line."""
+    reason = error.strerror or str(error)
+    advice = {
+        "No space left on device": "free some space or choose another output",
+        "Disk quota exceeded": "free some space or choose another output",
+        "File name too long": "choose a shorter name",
+    }.get(reason, "choose an output in a folder that you may write to")
+    return UserError(f"cannot write {path}: {reason}; nothing is kept; {advice}")

@@ -1,0 +1,141 @@
+"""Reader of the reduced runs published by the paper's authors.
+
+The files are TFRecords of protobuf `SequenceExample`s, the format of "Learning to Simulate" (Sanchez-Gonzalez
+et al. 2020); both are simple enough to be read here without TensorFlow. Numbers are mapped to this package's
+axes and signs: x forward, z up, forces by the soil on the body.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from .errors import UserError
+
+__all__ = ["PublishedRun", "excavation_case", "read_published"]
+
+_SUBSPACE = 6  # the particle type of a subspace node; all others are nodes of the rigid body
+_MARGIN = 0.1  # the authors' bin starts at this coordinate on each axis [m]
+
+DEPTHS = (0.02, 0.04, 0.05, 0.08, 0.10)  # [m]
+SPEEDS = (0.01, 0.04, 0.08, 0.10, 0.15)  # [m/s]
+RAKES = (0.0, 3.8, 10.0, 30.8, 45.0)  # [degrees]
+MOTIONS = ("ramp", "curved")
+
+
+@dataclass(frozen=True)
+class PublishedRun:
+    """One run. T frames at 60 Hz; the file's duplicated first frame is dropped."""
+
+    case: int
+    """Number of the run among all of its kind, from 1."""
+    body_points: np.ndarray
+    """Nodes of the rigid body [m], shape (T, M, 3)."""
+    latent: np.ndarray
+    """Subspace nodes in the authors' basis and axes (the basis itself is not published), shape (T, r, 3)."""
+    force: np.ndarray
+    """By the soil on the body [N], at the end of the frame, shape (T, 3)."""
+
+
+def excavation_case(case: int) -> dict[str, float | str]:
+    """Depth [m], speed [m/s], rake [degrees] and motion of a published excavation run, numbered from 1."""
+    grid = list(product(DEPTHS, SPEEDS, RAKES, MOTIONS))
+    if not 1 <= case <= len(grid):
+        raise UserError(f"published excavation case {case}: allowed are 1 to {len(grid)}")
+    return dict(zip(("depth", "speed", "rake", "motion"), grid[case - 1], strict=True))
+
+
+def read_published(folder: str | Path, bin_size: tuple[float, float, float], split: str = "valid") -> list[PublishedRun]:
+    """The runs of one folder with `<split>.tfrecord` and `metadata.json`.
+
+    Args:
+        bin_size: Lx, Ly, Lz of the soil bin [m].
+    """
+    folder = Path(folder)
+    try:
+        metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
+        cases = metadata["dataset_split"][split]
+        records = list(_records((folder / f"{split}.tfrecord").read_bytes()))
+    except (OSError, ValueError, KeyError, TypeError, struct.error) as error:
+        raise UserError(f"{folder} does not hold the published {split} runs: {error}") from None
+    if len(cases) != len(records):
+        raise UserError(f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {len(records)}")
+    try:
+        return [_run(case, record, bin_size) for case, record in zip(cases, records, strict=True)]
+    except (ValueError, KeyError, IndexError, struct.error) as error:
+        raise UserError(f"{folder}/{split}.tfrecord is not a file of published runs: {error}") from None
+
+
+def _run(case: int, record: bytes, bin_size: tuple[float, float, float]) -> PublishedRun:
+    context, frames = _sequence_example(record)
+    types = np.frombuffer(context["particle_type"], dtype="<i8")
+    nodes = np.array([np.frombuffer(f, dtype="<f4") for f in frames["position"]], dtype=float)
+    nodes = nodes.reshape(len(nodes), len(types), 3)[1:]
+    force = np.array([np.frombuffer(f, dtype="<f4") for f in frames["force"]], dtype=float).reshape(-1, 3)[1:]
+    soil = types == _SUBSPACE
+    lx, _, lz = bin_size
+    x, y, z = np.moveaxis(nodes[:, ~soil], -1, 0)
+    body = np.stack([_MARGIN + lx - x, z - _MARGIN, y - _MARGIN - lz], axis=-1)
+    return PublishedRun(case, body, nodes[:, soil], force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0])
+
+
+def _records(data: bytes) -> Iterator[bytes]:
+    """Payloads of a TFRecord file: length (8), check sum (4), payload, check sum (4)."""
+    at = 0
+    while at < len(data):
+        (length,) = struct.unpack_from("<Q", data, at)
+        if at + 16 + length > len(data):
+            raise ValueError("the file is cut short")
+        yield data[at + 12 : at + 12 + length]
+        at += 16 + length
+
+
+def _fields(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Number and content of a protobuf message's length-delimited fields."""
+    at = 0
+    while at < len(data):
+        key, at = _varint(data, at)
+        if key & 7 != 2:
+            raise ValueError(f"unexpected wire type {key & 7}")
+        length, at = _varint(data, at)
+        if at + length > len(data):
+            raise ValueError("a field is cut short")
+        yield key >> 3, data[at : at + length]
+        at += length
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = data[at]
+        value |= (byte & 0x7F) << shift
+        at += 1
+        shift += 7
+        if byte < 0x80:
+            return value, at
+
+
+def _entry(data: bytes) -> tuple[str, bytes]:
+    """Key and value of one entry of a protobuf map."""
+    parts = dict(_fields(data))
+    return parts[1].decode(), parts[2]
+
+
+def _first_bytes(feature: bytes) -> bytes:
+    """The first value of a Feature that holds a bytes list; empty for other kinds."""
+    lists = dict(_fields(feature))
+    return next((value for _, value in _fields(lists[1])), b"") if 1 in lists else b""
+
+
+def _sequence_example(record: bytes) -> tuple[dict[str, bytes], dict[str, list[bytes]]]:
+    """Context and per-frame features of a SequenceExample; only bytes are kept."""
+    parts = dict(_fields(record))
+    context = {key: _first_bytes(value) for key, value in (_entry(e) for _, e in _fields(parts[1]))}
+    lists = (_entry(e) for _, e in _fields(parts[2]))
+    return context, {key: [_first_bytes(f) for _, f in _fields(value)] for key, value in lists}

@@ -1,0 +1,266 @@
+"""What a run file holds and where: the H5MD 1.1 tree, its units and its root attributes.
+
+Letters: T frames, n soil particles, M body points.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import yaml
+
+from sgns.errors import UserError
+
+__all__ = [
+    "ATTRIBUTES",
+    "ELEMENTS",
+    "FORMAT",
+    "FORMAT_VERSION",
+    "PRODUCERS",
+    "Element",
+    "one_line",
+    "open_run",
+    "package_version",
+    "parse_yaml",
+    "read_attributes",
+    "structure_problems",
+    "write_text",
+]
+
+FORMAT = "sgns-run"
+"""Root attribute `format`: says that the file is ours."""
+FORMAT_VERSION = 1
+"""Root attribute `format_version`: raised when an older program could no longer read the file."""
+PRODUCERS = ("mpm", "rollout")
+"""Who may have made a run: the material point solver, or a trained network."""
+
+ATTRIBUTES = (
+    "format",
+    "format_version",
+    "package_version",
+    "producer",
+    "seed",
+    "frame_rate",
+    "wall_time_s",
+    "arrangement_hash",
+    "content_hash",
+    "scene",
+    "effects",
+    "extra",
+)
+"""Root attributes; `scene`, `effects` and `extra` are YAML text in UTF-8."""
+
+
+@dataclass(frozen=True)
+class Element:
+    """A time-dependent H5MD element: a group with `value`, `step` and `time`."""
+
+    path: str
+    tail: tuple[int | str, ...]
+    """Shape of one frame; "n" and "M" stand for the counts of this run."""
+    dtype: str
+    si_unit: str
+    description: str
+
+    def shape(self, counts: dict[str, int]) -> tuple[int, ...]:
+        """Shape of one frame when the letters have these values."""
+        return tuple(counts[size] if isinstance(size, str) else size for size in self.tail)
+
+
+# H5MD's own attribute `unit` is left unset on purpose: MDAnalysis refuses lengths in metres.
+ELEMENTS = {
+    "position": Element("particles/soil/position", ("n", 3), "<f4", "m", "soil particles, world frame"),
+    "velocity": Element("particles/soil/velocity", ("n", 3), "<f4", "m/s", "soil particles, world frame"),
+    "body_points": Element("particles/body/position", ("M", 3), "<f8", "m", "fixed to the body, world frame"),
+    "force": Element(
+        "observables/body/force", (3,), "<f8", "N", "by the soil on the body, world frame, mean of the frame"
+    ),
+    "torque": Element(
+        "observables/body/torque",
+        (3,),
+        "<f8",
+        "N m",
+        "by the soil on the body about its centre of mass, world frame, mean over the frame",
+    ),
+    "pose": Element(
+        "observables/body/pose",
+        (7,),
+        "<f8",
+        "m, 1",
+        "centre of mass x y z [m], then unit quaternion x y z w, body to world",
+    ),
+}
+
+
+def package_version() -> str:
+    """Version of the installed sgns, or 0+unknown when it runs from a bare source tree."""
+    try:
+        return metadata.version("sgns")
+    except metadata.PackageNotFoundError:
+        return "0+unknown"
+
+
+def read_attributes(file: h5py.File) -> dict[str, Any]:
+    """The root attributes; text as str."""
+    return {name: _text(value) for name, value in file.attrs.items() if name in ATTRIBUTES}
+
+
+def write_text(owner: h5py.Group | h5py.Dataset, name: str, text: str) -> None:
+    """Set a text attribute, in UTF-8 of fixed length.
+
+    H5MD asks for that, and HDF5 guards it by a checksum, unlike text of variable length.
+    """
+    data = text.encode("utf-8") or b" "  # HDF5 has no text of length 0
+    owner.attrs.create(name, data, dtype=h5py.string_dtype("utf-8", len(data)))
+
+
+def _text(value: Any) -> Any:
+    return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else value
+
+
+def one_line(error: object) -> str:
+    """An error's text without line breaks, for a one-line message."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def parse_yaml(text: str) -> Any:
+    """Plain data from YAML text; ValueError if it is none, or has tags that would build Python objects."""
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same in C, where PyYAML has it
+    try:
+        return yaml.load(text, Loader=loader)
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # the last three: damaged text
+        raise ValueError(one_line(error)) from error
+
+
+def open_run(path: str | os.PathLike[str]) -> h5py.File:
+    """The run file, open for reading; only that it is a run of ours is certain.
+
+    Raises:
+        UserError: missing, unreadable, not HDF5, cut short, written by something else or by a newer sgns.
+    """
+    path = Path(path)
+    if not os.path.exists(path):  # unlike Path.exists, takes any name
+        raise UserError(f"no such run file: {path}; check the path, or make one with `sgns simulate`")
+    if path.is_dir():
+        raise UserError(f"{path} is a folder, not a run file; give one of the .h5 files in it")
+    try:
+        with path.open("rb") as file:
+            file.read(1)
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}; check its permissions") from error
+    if not h5py.is_hdf5(path):
+        raise UserError(f"{path} is not an HDF5 file; give a run made by `sgns simulate` or `sgns rollout`")
+    try:
+        file = h5py.File(path, "r")
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        raise UserError(
+            f"{path} is cut short or damaged and cannot be opened ({_reason(error)}); "
+            "copy it again or repeat the run"
+        ) from error
+    try:
+        _require_ours(file, path)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _reason(error: Exception) -> str:
+    """The part of an HDF5 message that tells a person something."""
+    text = one_line(error)
+    if "truncated" in text:
+        return "the file is shorter than its header says"
+    if "already open for" in text:
+        return "its writer never closed it"
+    return text
+
+
+def _require_ours(file: h5py.File, path: Path) -> None:
+    try:
+        made_as = _text(file.attrs.get("format"))
+        version = file.attrs.get("format_version")
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        raise UserError(f"{path} is damaged ({_reason(error)}); copy it again or repeat the run") from error
+    if not isinstance(made_as, str) or made_as != FORMAT:
+        raise UserError(
+            f"{path} is HDF5 but not a run of sgns (root attribute `format` is not {FORMAT!r}); "
+            "give a file made by `sgns simulate` or `sgns rollout`"
+        )
+    if not isinstance(version, (int, np.integer)):
+        raise UserError(f"{path} has no whole number as root attribute `format_version`; repeat the run")
+    if version > FORMAT_VERSION:
+        raise UserError(
+            f"{path} has run format {version}, but sgns {package_version()} reads up to {FORMAT_VERSION}; "
+            "upgrade sgns"
+        )
+
+
+def structure_problems(file: h5py.File) -> list[str]:
+    """What is missing or has the wrong shape, in words; reads no bulk data.
+
+    A file without such problems can be read by `Run` without surprises.
+    """
+    problems = [f"root attribute {name!r} is missing" for name in ATTRIBUTES if name not in file.attrs]
+    problems += _attribute_problems(file)
+    counts: dict[str, int] = {}
+    for element in ELEMENTS.values():
+        problems += _element_problems(file, element, counts)
+    return problems
+
+
+def _attribute_problems(file: h5py.File) -> list[str]:
+    problems = []
+    values = read_attributes(file)
+    kinds = {
+        "producer": str,
+        "seed": (int, np.integer),
+        "frame_rate": (float, np.floating),
+        "wall_time_s": (float, np.floating),
+        "package_version": str,
+        "arrangement_hash": str,
+        "content_hash": str,
+        "scene": str,
+        "effects": str,
+        "extra": str,
+    }
+    for name, kind in kinds.items():
+        if name in values and not isinstance(values[name], kind):
+            problems.append(f"root attribute {name!r} has the wrong type ({type(values[name]).__name__})")
+    return problems
+
+
+def _element_problems(file: h5py.File, element: Element, counts: dict[str, int]) -> list[str]:
+    """Problems of one element; `counts` gathers T, n and M from the first element that shows them."""
+    datasets = {}
+    problems = []
+    for part in ("value", "step", "time"):
+        path = f"{element.path}/{part}"
+        found = file.get(path)
+        if not isinstance(found, h5py.Dataset):
+            problems.append(f"dataset /{path} is missing")
+        elif found.dtype.kind not in ("iu" if part == "step" else "f"):
+            problems.append(f"dataset /{path} has the wrong type {found.dtype}")
+        else:
+            datasets[part] = found
+    for part, found in datasets.items():
+        expected = ("T", *element.tail) if part == "value" else ("T",)
+        wanted = tuple(
+            counts.get(size, actual) if isinstance(size, str) else size
+            for size, actual in zip(expected, found.shape, strict=False)
+        )
+        if len(found.shape) != len(expected) or found.shape != wanted:
+            shown = ", ".join(str(counts.get(size, size)) for size in expected)  # a letter if not known yet
+            problems.append(f"dataset {found.name} has shape {found.shape}, expected ({shown})")
+            continue
+        if found.shape[0] == 0:
+            problems.append(f"dataset {found.name} holds no frame")
+        for size, actual in zip(expected, found.shape, strict=True):
+            if isinstance(size, str):
+                counts.setdefault(size, actual)
+    return problems

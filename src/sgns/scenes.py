@@ -1,0 +1,60 @@
+"""From conf to a scene of mpm_warp."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+from mpm_warp import Effects, Scene
+
+from .errors import UserError
+
+__all__ = ["effects_from_config", "read_path", "scene_from_config"]
+
+
+def scene_from_config(cfg: DictConfig) -> Scene:
+    """The scene in `cfg.scene` with the soil in `cfg.material`; a path file is read into the scene."""
+    data = OmegaConf.to_container(cfg.scene, resolve=True)
+    data["material"] = OmegaConf.to_container(cfg.material, resolve=True)
+    if isinstance(data.get("path"), str):
+        data["path"] = read_path(Path(data["path"]))
+    return Scene.from_dict(data)
+
+
+def effects_from_config(cfg: DictConfig) -> Effects:
+    """The effects in `cfg.effects`."""
+    data = OmegaConf.to_container(cfg.effects, resolve=True)
+    allowed = Effects().described()
+    for key, value in data.items():
+        if key not in allowed:
+            raise UserError(f"effects has no key {key!r}; allowed: {', '.join(allowed)}")
+        if not isinstance(value, bool):
+            raise UserError(f"effects.{key} is {value!r}; allowed: true, false")
+    return Effects(**data)
+
+
+def read_path(file: Path) -> list[list[float]]:
+    """Rows t, x, y, z, qx, qy, qz, qw of a CSV file with a header line."""
+    wanted = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.reader(stream))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"scene.path: cannot read {file}: {error}") from None
+    if not rows or [name.strip() for name in rows[0]] != wanted:
+        raise UserError(f"scene.path: the first line of {file} must be {','.join(wanted)}")
+    values = []
+    for number, row in enumerate(rows[1:], start=2):
+        try:
+            values.append([float(v) for v in row])
+        except ValueError:
+            raise UserError(
+                f"scene.path: line {number} of {file} holds something that is not a number"
+            ) from None
+        if len(row) != len(wanted):
+            raise UserError(
+                f"scene.path: line {number} of {file} has {len(row)} values instead of {len(wanted)}"
+            )
+    return values

@@ -1,0 +1,275 @@
+"""The trained thing a person holds: put a tool in, get soil, force and torque out.
+
+Letters: T frames, n particles, M body points, d history positions, r modes.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgns.basis import Basis
+from sgns.body import BodyTrack, body_track, check_poses, in_world_frame
+from sgns.errors import UserError
+from sgns.surrogate import Surrogate, load_surrogate
+
+__all__ = ["Rollout", "Simulator", "State"]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The bed and the tool at one frame.
+
+    Attributes:
+        frame: 0 at the reset.
+        latent: Modes [m], shape (r, 3).
+        force: By the soil on the tool over the last frame [N], world frame, shape (3,); zero at the reset.
+        torque: About the tool's centre of mass [N m], shape (3,).
+        pose: Tool's centre of mass [m] and quaternion x, y, z, w, shape (7,).
+    """
+
+    frame: int
+    latent: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    pose: np.ndarray
+    _basis: Basis = field(repr=False)
+
+    def soil(self) -> np.ndarray:
+        """Positions of all particles [m], shape (n, 3); decoded when asked for."""
+        return self._basis.inverse(self.latent).numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A whole tool path.
+
+    Attributes:
+        latent: Modes [m], shape (T, r, 3), float64.
+        force: By the soil on the tool [N], shape (T, 3).
+        torque: About its centre of mass [N m], shape (T, 3).
+        poses: Of the tool, shape (T, 7).
+        body_points: World frame [m], shape (T, M, 3).
+        wall_time_s: Time of the network's steps, force included, decoding not [s].
+    """
+
+    latent: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    poses: np.ndarray
+    body_points: np.ndarray
+    wall_time_s: float
+
+
+class Simulator:
+    """Steps a bed of soil in a few modes under a tool whose poses are given.
+
+    Args:
+        surrogate: Network, basis and start.
+        device: "cpu" or "cuda".
+    """
+
+    def __init__(self, surrogate: Surrogate, device: str = "cpu") -> None:
+        try:
+            self.device = torch.device(device)
+            self._surrogate = surrogate.to(self.device).eval()
+        except (RuntimeError, AssertionError) as error:
+            raise UserError(
+                f"device={device} cannot be used: {str(error).splitlines()[0]}; use device=cpu"
+            ) from error
+        self._dynamics = surrogate.dynamics
+        self.basis = surrogate.basis
+        self.start_positions = surrogate.start_positions.cpu().numpy()
+        self.body_points = surrogate.body_points.cpu().numpy()
+        self._start_latent = surrogate.start_latent
+        self.reset()
+
+    @classmethod
+    def load(cls, path: str | Path, device: str = "cpu") -> Simulator:
+        """From a checkpoint written by `sgns train`.
+
+        Raises:
+            UserError: The file is missing, truncated or not such a checkpoint.
+        """
+        return cls(load_surrogate(path), device)
+
+    @property
+    def frame_rate(self) -> float:
+        """Steps per second of simulated time [Hz]."""
+        return self._surrogate.frame_rate
+
+    @property
+    def history(self) -> int:
+        """d, positions the network looks back on."""
+        return self._dynamics.history
+
+    @property
+    def num_modes(self) -> int:
+        """r, modes of the soil."""
+        return self._dynamics.num_modes
+
+    @property
+    def arrangement_hash(self) -> str:
+        """Of the particle arrangement it knows."""
+        return self.basis.arrangement_hash
+
+    @property
+    def scene(self) -> dict[str, Any]:
+        """Scene of one of the training runs, as plain data: its bed is the bed it knows."""
+        return self._surrogate.card["scene"]
+
+    @property
+    def card(self) -> dict[str, Any]:
+        """Where it comes from: settings, runs, versions."""
+        return self._surrogate.card
+
+    @property
+    def step_count(self) -> int:
+        """Steps taken since the last reset."""
+        return self._frame
+
+    def reset(self, scene: Any = None, history: tuple[np.ndarray, np.ndarray] | None = None) -> State:
+        """Start again.
+
+        Args:
+            scene: An `mpm_warp.Scene`, whose first pose and body points are taken; or a pose, shape (7,), or
+                poses, shape (T, 7), of which the first is taken. None: the tool is where the first `step`
+                puts it.
+            history: Latent positions (d, r, 3) [m] and tool poses (d, 7) to go on from, oldest first; None:
+                the bed at rest at its common start.
+
+        Returns:
+            The state at frame 0.
+
+        Raises:
+            UserError: The scene has another bed, or a pose is bad.
+        """
+        points, pose = self.body_points, None
+        if scene is not None and hasattr(scene, "body_poses"):
+            if scene.arrangement_hash != self.arrangement_hash:
+                raise UserError(
+                    f"the scene's particles ({scene.arrangement_hash}) are not those of the checkpoint "
+                    f"({self.arrangement_hash}); use the bed of simulator.scene"
+                )
+            points, pose = np.asarray(scene.body_points()), scene.body_poses()[0]
+        elif scene is not None:
+            pose = np.atleast_2d(np.asarray(scene, dtype=np.float64))[0]
+        self._frame, self._points = 0, points
+        self._poses: list[np.ndarray] = []
+        if history is None:
+            latent = self._start_latent.expand(self.history, -1, -1)
+            if pose is not None:
+                self._poses = [check_poses(pose, "first pose")[0]] * self.history
+        else:
+            latent = self._checked_history(history[0])
+            self._poses = list(check_poses(history[1], "history of poses"))
+            if len(self._poses) != self.history:
+                raise UserError(
+                    f"the history has {len(self._poses)} poses; this network looks back on {self.history}"
+                )
+        self._latent = latent.clone()[None].to(self.device)
+        nothing = np.zeros(3)
+        return State(0, self._newest(), nothing, nothing.copy(), self._pose_now(), self.basis)
+
+    def step(self, tool_pose: np.ndarray) -> State:
+        """Move the tool to its next pose and the soil with it.
+
+        Args:
+            tool_pose: Centre of mass [m] and unit quaternion x, y, z, w one frame from now, shape (7,).
+
+        Returns:
+            The state after the step.
+
+        Raises:
+            UserError: The pose is not finite or its quaternion not of unit length.
+        """
+        pose = check_poses(tool_pose, f"tool pose of frame {self._frame + 1}")[0]
+        if not self._poses:
+            self._poses = [pose] * self.history
+        # One frame more than the network sees, because the first motion needs a frame before it.
+        window = np.stack([*self._poses, pose])
+        body = self._track(window, in_world_frame(window, self._points)).frames(slice(1, None))
+        with torch.inference_mode():
+            following, force, torque = self._dynamics.advance(self._latent, body)
+            self._latent = torch.cat([self._latent[:, 1:], following[:, None]], dim=1)
+        self._poses = [*self._poses[1:], pose]
+        self._frame += 1
+        return State(
+            self._frame, self._newest(), force[0].cpu().numpy(), torque[0].cpu().numpy(), pose, self.basis
+        )
+
+    def rollout(
+        self,
+        poses: np.ndarray,
+        body_points: np.ndarray | None = None,
+        latent_history: np.ndarray | Tensor | None = None,
+        force_history: np.ndarray | None = None,
+        torque_history: np.ndarray | None = None,
+    ) -> Rollout:
+        """Follow a whole tool path; the same as stepping along it. Leaves `reset` and `step` alone.
+
+        Args:
+            poses: Tool at every frame, shape (T, 7).
+            body_points: In the body frame [m], shape (M, 3); None: those of the training runs.
+            latent_history: The first d frames [m], shape (d, r, 3); frames d to T - 1 are predicted. None:
+                the soil is at rest at its common start in frame 0, and frames 1 to T - 1 are predicted.
+            force_history: Force of the first d frames [N], shape (d, 3), copied; zero if None.
+            torque_history: Torque of the first d frames [N m], likewise.
+
+        Returns:
+            The rollout.
+
+        Raises:
+            UserError: A pose is bad, or the path is shorter than the history.
+        """
+        poses = check_poses(poses)
+        points = self.body_points if body_points is None else np.asarray(body_points, dtype=np.float64)
+        d = self.history
+        if latent_history is None:
+            padding, latent = d - 1, self._start_latent.expand(d, -1, -1)
+        else:
+            padding, latent = 0, self._checked_history(latent_history)
+            if len(poses) < d:
+                raise UserError(
+                    f"the path has {len(poses)} frames; with a given history it needs at least {d}"
+                )
+        world = in_world_frame(poses, points)
+        track = self._track(np.concatenate([poses[:1].repeat(padding, 0), poses]),
+                            np.concatenate([world[:1].repeat(padding, 0), world]))  # fmt: skip
+        began = time.perf_counter()
+        with torch.inference_mode():
+            states, force, torque = self._dynamics.unroll(latent[None].to(self.device), track)
+            states, force, torque = (part[0, padding:].cpu().numpy() for part in (states, force, torque))
+        wall_time = time.perf_counter() - began
+        if latent_history is not None:
+            for part, given in ((force, force_history), (torque, torque_history)):
+                if given is not None:
+                    part[:d] = np.asarray(given)[:d]
+        return Rollout(states, force, torque, poses, world, wall_time)
+
+    def _track(self, poses: np.ndarray, points: np.ndarray) -> BodyTrack:
+        track = body_track(poses, points, self._dynamics.settings.body_nodes)
+        return BodyTrack(*(part[None].to(self.device) for part in track))
+
+    def _checked_history(self, latent: np.ndarray | Tensor) -> Tensor:
+        latent = torch.as_tensor(latent).double().cpu()
+        expected = (self.history, self.num_modes, 3)
+        if tuple(latent.shape) != expected:
+            raise UserError(
+                f"the latent history has shape {tuple(latent.shape)}; this network needs {expected}"
+            )
+        if not bool(torch.isfinite(latent).all()):
+            raise UserError("the latent history holds values that are not finite; every value must be")
+        return latent
+
+    def _newest(self) -> np.ndarray:
+        return self._latent[0, -1].cpu().numpy().copy()
+
+    def _pose_now(self) -> np.ndarray:
+        return self._poses[-1] if self._poses else np.full(7, np.nan)

@@ -1,0 +1,230 @@
+"""The solver against cases with known answers (physics that must hold whatever the parameters)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import warp as wp
+from beds import block, cut
+
+from mpm_warp import Bed, Effects, Material, Scene, SceneError, Solver, SolverStopped
+
+ELASTIC = Effects(yielding=False, rate_dependence=False, separation=False)
+
+
+def momenta(solver):
+    """Linear and angular momentum of the particles, the affine part (C dx^2 / 4) included."""
+    mass = solver._grid.particle_mass
+    x, v, c = solver._x.numpy(), solver._v.numpy(), solver._c.numpy()
+    spin = np.stack([c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], axis=-1)
+    angular = mass * (np.cross(x, v) + spin * solver.scene.bed.spacing**2 / 4)
+    return mass * v.sum(axis=0), angular.sum(axis=0)
+
+
+def test_free_fall_is_exact():
+    """Symplectic Euler: after n steps v = -g n dt and the drop is g dt^2 n (n + 1) / 2."""
+    scene = block(gravity=9.81)
+    solver = Solver(scene, precision="float64")
+    start = solver._x.numpy().copy()
+    for _ in solver.frames():
+        pass
+    n = (scene.frame_count - 1) * solver.substeps_per_frame
+    dt = solver.time_step
+    np.testing.assert_allclose(solver._v.numpy()[:, 2], -9.81 * n * dt, rtol=1e-12)
+    drop = solver._x.numpy() - start
+    np.testing.assert_allclose(drop[:, 2], -9.81 * dt**2 * n * (n + 1) / 2, rtol=1e-12)
+    np.testing.assert_allclose(drop[:, :2], 0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("effects", [ELASTIC, Effects()])
+def test_momentum_is_conserved(effects):
+    """A free block thrown about: linear and (APIC) angular momentum to round-off."""
+    solver = Solver(block(), effects, precision="float64")
+    rng = np.random.default_rng(0)
+    x = solver._x.numpy()
+    turning = np.cross([3.0, -2.0, 5.0], x - x.mean(axis=0)) + [0.3, 0.1, -0.2]
+    solver._v.assign(turning + 0.2 * rng.normal(size=turning.shape))
+    before = momenta(solver)
+    for _ in solver.frames():
+        pass
+    after = momenta(solver)
+    size = solver._grid.particle_mass * np.abs(solver._v.numpy()).sum()
+    np.testing.assert_allclose(after[0], before[0], atol=1e-12 * size)
+    np.testing.assert_allclose(after[1], before[1], atol=1e-12 * size)
+    assert np.linalg.norm(before[1]) > 1e-3 * size * 0.1  # there was something to conserve
+
+
+@pytest.fixture(scope="module")
+def shaken_column():
+    """Elastic soil under its weight, let go from the stress-free state, watched in the middle of a wide bin."""
+    bed = Bed(size=(0.72, 0.72, 0.1), spacing=0.01, initial_stress="none", headroom=0.05)
+    scene = Scene(bed=bed, duration=0.018, frame_rate=3000.0, courant=0.4)
+    solver = Solver(scene, ELASTIC)
+    start = scene.initial_positions()
+    middle = np.all(np.abs(start[:, :2] - 0.36) < 0.03, axis=1)
+    heights = start[middle, 2] + 0.1
+    layers = np.unique(heights.round(6))
+    sink, stress = [], []
+    for _ in solver.frames():
+        now = solver._x.numpy()[middle, 2] + 0.1 - heights
+        sink.append([now[np.isclose(heights, h, atol=1e-5)].mean() for h in layers])
+        g, k = scene.material.shear_modulus, scene.material.bulk_modulus
+        e, ln_j = solver._e.numpy()[middle], solver._ln_j.numpy()[middle]
+        stress.append([np.mean(2 * g * e[:, 0] + k * ln_j), np.mean(2 * g * e[:, 2] + k * ln_j)])
+    return scene, layers, np.array(sink), np.array(stress)
+
+
+def test_wave_speed(shaken_column):
+    """A column let go sinks and comes back after 4 L / c_p, c_p^2 = (K + 4 G / 3) / rho."""
+    scene, _, sink, _ = shaken_column
+    top = sink[:, -1]
+    back = 10 + int(np.argmax(top[10:]))  # the highest point after the start is the first return
+    assert scene.times()[back] == pytest.approx(4 * 0.1 / scene.material.wave_speed, rel=0.05)
+
+
+def test_settling(shaken_column):
+    """Mean over one period = at rest: sinking rho g (L h - h^2 / 2) / (K + 4 G / 3) at height h."""
+    scene, layers, sink, _ = shaken_column
+    period = round(4 * 0.1 / scene.material.wave_speed * scene.frame_rate)
+    stiffness = scene.material.wave_speed**2 * scene.material.bulk_density
+    exact = -scene.material.bulk_density * scene.gravity * (0.1 * layers - layers**2 / 2) / stiffness
+    np.testing.assert_allclose(sink[:period].mean(axis=0), exact, rtol=0.06)
+
+
+def test_stress_at_rest(shaken_column):
+    """K0 = nu / (1 - nu)."""
+    scene, _, _, stress = shaken_column
+    period = round(4 * 0.1 / scene.material.wave_speed * scene.frame_rate)
+    ratio = stress[:period, 0].mean() / stress[:period, 1].mean()
+    assert ratio == pytest.approx(scene.material.lateral_stress_ratio, rel=0.02)
+
+
+def test_bed_in_geostatic_state_stays_still():
+    """The bed starts in balance: no settling spike, no creep."""
+    scene = cut(motion="rest", clearance=0.05, duration=0.5)
+    for frame in Solver(scene).frames():
+        pass
+    assert np.abs(frame.position - scene.initial_positions()).max() < 2e-4
+    assert np.abs(frame.velocity).max() < 0.01
+    assert np.linalg.norm(frame.force) == 0.0
+
+
+def diagonal_path(dy: float, shift: float = 0.0, spin: float = 0.0):
+    """A plate that starts in the soil and moves along x and y."""
+    rows = []
+    for t in (0.0, 0.02):
+        angle = 0.5 * spin * t
+        rows.append([t, 0.2 + 0.3 * t + shift, 0.2 + dy * t, 0.04, 0, 0, math.sin(angle), math.cos(angle)])
+    return tuple(tuple(r) for r in rows)
+
+
+def last_frame(scene, precision="float64"):
+    for frame in Solver(scene, precision=precision).frames():
+        pass
+    return frame
+
+
+def test_mirrored_scene_mirrors_the_force():
+    """Mirrored in y: F_x, F_z and T_y stay, F_y, T_x and T_z change sign."""
+    kw = {"motion": "path", "duration": 0.02, "frame_rate": 100.0}
+    one = last_frame(cut(path=diagonal_path(0.2, spin=1.0), **kw))
+    two = last_frame(cut(path=diagonal_path(-0.2, spin=-1.0), **kw))
+    size = np.linalg.norm(one.force)
+    assert size > 1.0
+    assert abs(one.force[1]) > 0.01 * size
+    np.testing.assert_allclose(two.force, one.force * [1, -1, 1], atol=1e-8 * size)
+    np.testing.assert_allclose(two.torque, one.torque * [-1, 1, -1], atol=1e-8 * size)
+
+
+def test_shift_by_whole_cells_changes_nothing():
+    """Before a wave can reach a wall, a cut three cells further on feels the same force."""
+    kw = {"motion": "path", "duration": 0.004, "frame_rate": 1000.0, "blade": cut().blade}
+    one = last_frame(cut(path=diagonal_path(0.1), **kw))
+    two = last_frame(cut(path=diagonal_path(0.1, shift=0.06), **kw))
+    assert np.linalg.norm(one.force) > 1.0
+    np.testing.assert_allclose(two.force, one.force, atol=1e-8 * np.linalg.norm(one.force))
+    np.testing.assert_allclose(two.torque, one.torque, atol=1e-8 * np.linalg.norm(one.force))
+
+
+def test_a_symmetric_cut_has_no_lateral_force():
+    frames = list(Solver(cut(), precision="float64").frames())
+    force = np.array([f.force for f in frames[1:]])
+    assert np.abs(force[:, 0]).max() > 5.0
+    assert np.abs(force[:, 1]).max() < 1e-8 * np.abs(force[:, 0]).max()
+    # Soil that resists forward motion pushes the blade back.
+    assert force[len(force) // 2 :, 0].mean() < 0.0
+
+
+def test_impulse_on_the_body_is_the_soils_momentum():
+    """A plate hits a free block: what the soil gains the body loses, and likewise the moments."""
+    path = ((0.0, 0.08, 0.15, -0.15, 0, 0, 0, 1), (1.0, 1.08, 0.15, -0.15, 0, 0, 0, 1))
+    free = block(duration=0.05)
+    scene = cut(bed=free.bed, gravity=0.0, motion="path", path=path, duration=0.05, frame_rate=200.0)
+    solver = Solver(scene, precision="float64")
+    impulse = sum(f.force for f in solver.frames()) / scene.frame_rate
+    gained, _ = momenta(solver)
+    assert gained[0] > 1e-3
+    np.testing.assert_allclose(impulse, -gained, atol=1e-12 * abs(gained[0]))
+
+
+def test_torque_is_about_the_centre_of_mass():
+    """Force and torque of a thin slice of contact: T = r x F for soil on one side only."""
+    frame = last_frame(cut(motion="path", path=diagonal_path(0.0), duration=0.02, frame_rate=100.0))
+    # The soil pushes below the centre of mass against the motion: T_y = r_z F_x - r_x F_z > 0 with r_z < 0.
+    assert frame.force[0] < 0.0
+    assert frame.torque[1] > 0.0
+    assert abs(frame.torque[1]) < 0.2 * np.linalg.norm(frame.force)  # the arm is shorter than the plate
+
+
+def test_stops_at_a_value_that_is_not_finite():
+    solver = Solver(cut(duration=0.1))
+    frames = solver.frames()
+    next(frames)
+    v = solver._v.numpy()
+    v[17, 1] = np.nan
+    solver._v.assign(v)
+    with pytest.raises(SolverStopped, match=r"particle \d+ at .* frame 1: its speed is not finite"):
+        next(frames)
+    assert np.isfinite(solver._x.numpy()).all()
+
+
+def test_stops_when_soil_leaves_the_grid():
+    scene = block(duration=0.2)
+    solver = Solver(scene)
+    frames = solver.frames()
+    next(frames)
+    solver._v.assign(np.tile([0.0, 0.0, 4.0], (solver.particle_count, 1)))
+    with pytest.raises(SolverStopped, match="headroom"):
+        list(frames)
+
+
+def test_precisions_agree():
+    one, two = (last_frame(cut(duration=0.1), p) for p in ("float32", "float64"))
+    np.testing.assert_allclose(one.force, two.force, atol=0.01 * np.linalg.norm(two.force))
+    assert np.abs(one.position - two.position).max() < 1e-4
+
+
+def test_same_scene_twice_is_bit_equal():
+    one, two = (last_frame(cut(duration=0.1), "float32") for _ in range(2))
+    np.testing.assert_array_equal(one.position, two.position)
+    np.testing.assert_array_equal(one.force, two.force)
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
+def test_cuda_agrees_with_the_cpu():
+    one, two = (list(Solver(cut(duration=0.1), device=d).frames())[-1] for d in ("cpu", "cuda"))
+    np.testing.assert_allclose(one.force, two.force, atol=0.01 * np.linalg.norm(one.force))
+    assert np.abs(one.position - two.position).max() < 1e-4
+
+
+def test_step_follows_the_wave_speed():
+    slow, fast = (Solver(cut(material=Material(youngs_modulus=e))) for e in (1e6, 4e6))
+    assert fast.substeps_per_frame == pytest.approx(2 * slow.substeps_per_frame, abs=2)
+
+
+@pytest.mark.parametrize(("key", "value"), [("device", "tpu"), ("precision", "float16")])
+def test_unknown_device_or_precision(key, value):
+    with pytest.raises(SceneError, match=f"{key} is '{value}'; allowed"):
+        Solver(cut(), **{key: value})

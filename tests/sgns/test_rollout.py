@@ -1,0 +1,133 @@
+import numpy as np
+import pytest
+from surrogates import FakeSimulator, fitted, small_dataset
+
+from sgns import rollout as rollout_module
+from sgns.errors import UserError
+from sgns.rollout import (
+    RolloutTiming,
+    bed_differences,
+    require_known_bed,
+    rollout_scene,
+    unlearned,
+    write_rollout,
+)
+from sgns.runfile import Run, check_run
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return small_dataset(tmp_path_factory.mktemp("data"), frames=12)
+
+
+@pytest.fixture
+def simulator(dataset):
+    return FakeSimulator(fitted(dataset.runs("train"), 4), dataset.runs("train"))
+
+
+class FakeScene:
+    """The parts of a scene that a rollout asks for."""
+
+    frame_rate = 60.0
+
+    def __init__(self, simulator, arrangement_hash=None, bed=None):
+        self.poses = simulator.known[0][0]
+        self.scene = dict(simulator.scene) | ({"bed": bed} if bed else {})
+        self.arrangement_hash = arrangement_hash or simulator.arrangement_hash
+
+    def body_poses(self):
+        return self.poses
+
+    def body_points(self):
+        return np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
+
+    def to_dict(self):
+        return self.scene
+
+
+def test_file_is_a_complete_run_with_decoded_soil(simulator, tmp_path):
+    path = tmp_path / "out" / "rollout.h5"
+    scene = FakeScene(simulator)
+    timing = rollout_scene(simulator, scene, path)
+    assert check_run(path) == []
+    with Run(path) as run:
+        assert run.producer == "rollout"
+        assert run.frame_count == len(scene.poses)
+        expected = simulator.basis.inverse(simulator.known[0][1]).numpy()
+        assert run.positions() == pytest.approx(expected.astype(np.float32), abs=1e-6)
+        assert run.force == pytest.approx(simulator.known[0][2], rel=1e-5, abs=1e-5)
+        assert run.pose == pytest.approx(scene.poses)
+    assert timing.simulated == pytest.approx((len(scene.poses) - 1) / 60.0)
+    assert timing.complete_rate > timing.stepping_rate > 0.0
+
+
+def test_velocities_are_differences_of_positions(simulator, tmp_path, monkeypatch):
+    scene = FakeScene(simulator)
+    rollout_scene(simulator, scene, tmp_path / "a.h5")
+    monkeypatch.setattr(rollout_module, "CHUNK_BYTES", 1.0)  # one frame at a time
+    rollout_scene(simulator, scene, tmp_path / "b.h5")
+    with Run(tmp_path / "a.h5") as a, Run(tmp_path / "b.h5") as b:
+        velocity, position = a.velocities(), a.positions().astype(np.float64)
+        assert (velocity[0] == 0.0).all()
+        assert velocity[1:] == pytest.approx(60.0 * np.diff(position, axis=0), abs=1e-4)
+        assert a.content_hash == b.content_hash
+
+
+def test_true_start_replaces_its_reconstruction(simulator, tmp_path):
+    scene = FakeScene(simulator)
+    rollout = simulator.rollout(scene.body_poses(), scene.body_points())
+    start = simulator.start_positions
+    path = write_rollout(tmp_path / "a.h5", simulator, scene, rollout, start=start, extra={"note": "x"})
+    with Run(path) as run:
+        assert run.positions(slice(0, 1))[0] == pytest.approx(start.astype(np.float32))
+        assert run.extra["note"] == "x"
+
+
+def test_unknown_bed_is_refused_in_one_line_that_names_it(simulator):
+    bed = dict(simulator.scene["bed"]) | {"spacing": 0.01}
+    with pytest.raises(UserError) as caught:
+        require_known_bed(simulator, FakeScene(simulator, "other", bed), "best.ckpt")
+    text = str(caught.value)
+    assert "best.ckpt" in text and "spacing 0.02 (here 0.01)" in text
+    assert "\n" not in text
+
+
+def test_other_frame_rate_is_refused(simulator):
+    scene = FakeScene(simulator)
+    scene.frame_rate = 30.0
+    with pytest.raises(UserError, match=r"scene\.frame_rate is 30 Hz"):
+        require_known_bed(simulator, scene, "best.ckpt")
+    scene.frame_rate = 60.0
+    require_known_bed(simulator, scene, "best.ckpt")
+
+
+def test_differences_of_equal_beds_still_say_something():
+    assert "arrangement" in bed_differences({"bed": {"spacing": 1}}, {"bed": {"spacing": 1}})
+
+
+def test_rollout_that_runs_away_leaves_nothing_behind(simulator, tmp_path):
+    def explode(latent, history):
+        latent[7:] = np.inf
+        return latent
+
+    simulator.mistake = explode
+    target = tmp_path / "out"
+    with pytest.raises(UserError, match="not finite from frame 7"):
+        rollout_scene(simulator, FakeScene(simulator), target / "r.h5")
+    assert not target.exists() or not list(target.iterdir())
+
+
+def test_rates_are_per_simulated_second():
+    timing = RolloutTiming(simulated=4.0, stepping=2.0, writing=6.0)
+    assert timing.stepping_rate == 0.5
+    assert timing.complete_rate == 2.0
+
+
+def test_changes_that_the_network_cannot_feel_are_named():
+    known = {"gravity": 9.81, "blade": {"length": 0.3, "width": 0.4}, "depth": 0.1}
+    asked = {"gravity": 1.62, "blade": {"length": 0.3, "width": 0.2}, "depth": 0.2}
+    assert unlearned(known, asked) == [
+        "gravity 1.62 (trained with 9.81)",
+        "blade.width 0.2 (trained with 0.4)",
+    ]
+    assert unlearned(known, known | {"depth": 0.3}) == []

@@ -1,0 +1,153 @@
+"""The simulator a person holds: stepping, rolling out, loading, refusing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tiny import MODEL, TRAINING, reduced
+
+from sgns.errors import UserError
+from sgns.simulator import Simulator
+from sgns.training import train
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Reduced data and checkpoints, one for each kind of body node."""
+    folder = tmp_path_factory.mktemp("tiny")
+    data = reduced(folder)
+    for kind in ("pose", "points"):
+        model = MODEL | {"body_nodes": kind}
+        train(data, num_modes=4, model=model, training=TRAINING, output=folder / kind)
+    return data, folder
+
+
+@pytest.mark.parametrize("kind", ["pose", "points"])
+def test_rollout_is_stepping(trained, kind) -> None:
+    data, folder = trained
+    run = data.runs("test")[0]
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    rollout = simulator.rollout(run.pose)
+    assert rollout.latent.shape == (14, 4, 3) and rollout.latent.dtype == np.float64
+    state = simulator.reset(run.pose)
+    np.testing.assert_array_equal(state.latent, rollout.latent[0])
+    for t in range(1, 14):
+        state = simulator.step(run.pose[t])
+        np.testing.assert_array_equal(state.latent, rollout.latent[t])
+        np.testing.assert_array_equal(state.force, rollout.force[t])
+        np.testing.assert_array_equal(state.torque, rollout.torque[t])
+    assert simulator.step_count == 13
+
+
+def test_rollout_from_true_frames_is_stepping_from_them(trained) -> None:
+    data, folder = trained
+    run = data.runs("test")[0]
+    simulator = Simulator.load(folder / "pose" / "best.ckpt")
+    history = run.latent[:3, :4]
+    rollout = simulator.rollout(run.pose, latent_history=history, force_history=run.force[:3])
+    np.testing.assert_array_equal(rollout.latent[:3], history)
+    np.testing.assert_array_equal(rollout.force[:3], run.force[:3])
+    simulator.reset(history=(history, run.pose[:3]))
+    for t in range(3, 14):
+        state = simulator.step(run.pose[t])
+        # The oldest motion of the first window lies before the given poses, so the first step may not use it.
+        assert state.latent.shape == (4, 3)
+    again = simulator.rollout(run.pose, latent_history=history)
+    np.testing.assert_array_equal(again.latent, rollout.latent)
+    assert not again.force[:3].any()
+
+
+def test_soil_is_decoded_from_the_modes(trained) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / "pose" / "best.ckpt")
+    state = simulator.reset(data.runs("test")[0].pose[0])
+    np.testing.assert_array_equal(state.soil(), simulator.basis.inverse(state.latent).numpy())
+    np.testing.assert_array_equal(simulator.start_positions, data.start_positions)
+    # At rest the soil is the common start, as far as four modes can say it.
+    error = np.abs(state.soil() - data.start_positions).max()
+    assert error <= np.abs(data.start_positions - data.basis.mean.numpy()).max() + 1e-9
+
+
+def test_reloading_gives_the_same_rollout_to_the_bit(trained) -> None:
+    data, folder = trained
+    run = data.runs("test")[0]
+    first, second = (Simulator.load(folder / "pose" / "best.ckpt").rollout(run.pose) for _ in range(2))
+    np.testing.assert_array_equal(first.latent, second.latent)
+    np.testing.assert_array_equal(first.force, second.force)
+
+
+def test_it_knows_where_it_comes_from(trained) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / "pose" / "best.ckpt")
+    assert simulator.arrangement_hash == data.arrangement_hash
+    assert simulator.scene == data.runs("train")[0].scene
+    assert (simulator.num_modes, simulator.history, simulator.frame_rate) == (4, 3, 60.0)
+    assert simulator.basis.fitted_on == ["a", "b", "c", "d"]
+    points = simulator.rollout(data.runs("train")[0].pose).body_points
+    np.testing.assert_allclose(points, data.runs("train")[0].body_points, atol=1e-6)
+
+
+def test_another_number_of_body_points_can_be_rolled_out(trained) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / "points" / "best.ckpt")
+    rollout = simulator.rollout(data.runs("test")[0].pose, simulator.body_points[:6])
+    assert rollout.body_points.shape == (14, 6, 3) and np.isfinite(rollout.latent).all()
+
+
+class OtherBed:
+    """A scene of another bed."""
+
+    arrangement_hash = "another"
+
+    def body_poses(self) -> np.ndarray:
+        return np.zeros((3, 7))
+
+
+def test_bad_input_is_named(trained) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / "pose" / "best.ckpt")
+    poses = data.runs("test")[0].pose.copy()
+    poses[7, 2] = np.nan
+    with pytest.raises(UserError, match="frame 7"):
+        simulator.rollout(poses)
+    simulator.reset(poses)
+    simulator.step(poses[1])
+    with pytest.raises(UserError, match="frame 2"):
+        simulator.step(np.full(7, np.inf))
+    with pytest.raises(UserError, match="particles"):
+        simulator.reset(OtherBed())
+    with pytest.raises(UserError, match="history"):
+        simulator.rollout(poses[:5], latent_history=np.zeros((2, 4, 3)))
+    with pytest.raises(UserError, match="at least 3"):
+        simulator.rollout(poses[:2], latent_history=np.zeros((3, 4, 3)))
+
+
+def test_bad_checkpoints_are_named(trained, tmp_path) -> None:
+    _, folder = trained
+    whole = (folder / "pose" / "best.ckpt").read_bytes()
+    for name, content in (
+        ("truncated", whole[: len(whole) // 2]),
+        ("empty", b""),
+        ("text", b"hello"),
+    ):
+        path = tmp_path / f"{name}.ckpt"
+        path.write_bytes(content)
+        with pytest.raises(UserError, match=f"{name}.ckpt"):
+            Simulator.load(path)
+    torch.save({"state_dict": {}, "hyper_parameters": {"lr": 1.0}}, tmp_path / "foreign.ckpt")
+    with pytest.raises(UserError, match="not a checkpoint of sgns"):
+        Simulator.load(tmp_path / "foreign.ckpt")
+    with pytest.raises(UserError, match="no checkpoint"):
+        Simulator.load(tmp_path / "absent.ckpt")
+
+    content = torch.load(folder / "pose" / "best.ckpt", weights_only=True)
+    content["hyper_parameters"]["format_version"] = 99
+    torch.save(content, tmp_path / "future.ckpt")
+    with pytest.raises(UserError, match="newer"):
+        Simulator.load(tmp_path / "future.ckpt")
+    content["hyper_parameters"]["format_version"] = 1
+    del content["state_dict"]["surrogate.basis_modes"]
+    torch.save(content, tmp_path / "incomplete.ckpt")
+    with pytest.raises(UserError, match="fit together"):
+        Simulator.load(tmp_path / "incomplete.ckpt")

@@ -1,0 +1,62 @@
+"""A tiny dataset and small settings, so that learning can be tested in seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from synthetic import make_run
+
+from sgns.campaign import Dataset
+from sgns.reduced import ReducedDataset, reduce_dataset
+
+# Matrices this small are slower on several threads, and results must not depend on the number of cores.
+torch.set_num_threads(1)
+
+__all__ = ["MODEL", "REDUCTION", "TRAINING", "make_dataset", "reduced"]
+
+MODEL: dict[str, Any] = {
+    "history": 3,
+    "body_nodes": "pose",
+    "hidden_width": 16,
+    "hidden_layers": 2,
+    "message_passing_steps": 1,
+    "layer_norm": False,
+    "residual": False,
+    "activation": "relu",
+    "identity_width": 4,
+}
+TRAINING: dict[str, Any] = {
+    "max_steps": 20,
+    "batch_size": 8,
+    "learning_rate": 1e-3,
+    "final_learning_rate": 1e-5,
+    "warmup_steps": 2,
+    "schedule": "cosine",
+    "weight_decay": 0.0,
+    "gradient_clip": 1.0,
+    "noise": 0.1,
+    "normalisation_floor": 0.01,
+    "loss": {"acceleration": 1.0, "force": 1.0, "torque": 0.1},
+    "validate_every": 10,
+    "log_every": 5,
+    "resume": "auto",
+    "threads": None,
+}
+REDUCTION: dict[str, Any] = {"num_modes": 4, "max_modes": 6, "centring": "particle_axis"}
+
+
+def make_dataset(folder: Path, frames: int = 14, **kw: Any) -> Dataset:
+    """Four training runs, two validation runs (one shorter) and one test run of synthetic soil."""
+    split = {"train": ["a", "b", "c", "d"], "validation": ["e", "f"], "test": ["g"]}
+    for seed, name in enumerate(name for names in split.values() for name in names):
+        make_run(folder / "runs" / f"{name}.h5", frames=frames - 2 * (name == "f"), seed=seed, **kw)
+    (folder / "dataset.yaml").write_text(yaml.safe_dump({"name": "tiny", "split": split}))
+    return Dataset.open(folder)
+
+
+def reduced(folder: Path, **kw: Any) -> ReducedDataset:
+    """The tiny dataset in its basis."""
+    return reduce_dataset(make_dataset(folder, **kw), REDUCTION, progress=False)
