@@ -5,8 +5,13 @@ State per particle: the deviatoric part e of the elastic spatial log (Hencky) st
 keeps volume, so the elastic volume strain is ln J itself and the pressure is p = -K ln J. Both are small
 numbers stored as such, which is what keeps float32 accurate: a bed at rest strains by 1e-4.
 
-The trial strain is half the log of b = (I + A) exp(2 e) (I + A)^T with A = dt L. It is evaluated from b - I
-by short series, no decomposition, and exactly by eigenvalues where b - I is too large for the series.
+The trial strain is half the log of b = (I + A) exp(2 e) (I + A)^T with A = dt L, without a decomposition on the
+hot path. There are three ranges, by the size s of e and A (Frobenius norm of both):
+
+- s up to 0.01: the expansion of the log to second order, e + d + w e - e w + A A^T / 2 - d^2 with d and w the
+  symmetric and skew parts of A. What is left out is of third order, s^2 times the step.
+- b - I up to 0.05: series of exp and log to fourth order, from b - I itself, so nothing cancels.
+- beyond: eigenvalues.
 """
 
 from functools import cache
@@ -18,6 +23,8 @@ from .effects import Effects
 
 __all__ = ["constitutive", "soil_struct"]
 
+SECOND_ORDER_LIMIT = 0.01
+"""Size of strain and step up to which the second-order expansion is used: it misses at most 1e-4 of the step."""
 SERIES_LIMIT = 0.05
 """Frobenius norm of b - I up to which the four-term log series is used: its relative error is then below 2e-6."""
 
@@ -54,6 +61,7 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
     vec7 = wp.types.vector(7, real)
     mat33 = wp.types.matrix((3, 3), real)
     Soil = soil_struct(real)
+    second_order_limit = wp.constant(SECOND_ORDER_LIMIT**2)
     series_limit = wp.constant(SERIES_LIMIT**2)
 
     @wp.func
@@ -119,7 +127,43 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
         return real(2.0) * e + real(2.0) * e2 + real(4.0) / real(3.0) * e3
 
     @wp.func
+    def second_order(e: vec6, a: mat33):
+        d0 = a[0, 0]
+        d1 = a[1, 1]
+        d2 = a[2, 2]
+        d3 = real(0.5) * (a[0, 1] + a[1, 0])
+        d4 = real(0.5) * (a[0, 2] + a[2, 0])
+        d5 = real(0.5) * (a[1, 2] + a[2, 1])
+        w3 = a[0, 1] - d3
+        w4 = a[0, 2] - d4
+        w5 = a[1, 2] - d5
+        # Sum of d and twice the spin term's sources: (w e + (w e)^T) for e, half of it for d.
+        f0 = e[0] + real(0.5) * d0
+        f1 = e[1] + real(0.5) * d1
+        f2 = e[2] + real(0.5) * d2
+        f3 = e[3] + real(0.5) * d3
+        f4 = e[4] + real(0.5) * d4
+        f5 = e[5] + real(0.5) * d5
+        # A A^T / 2 - d^2 = (w d - d w - d^2 - w^2) / 2
+        return vec6(
+            e[0] + d0 + real(2.0) * (w3 * f3 + w4 * f4)
+            - real(0.5) * (d0 * d0 + d3 * d3 + d4 * d4 - w3 * w3 - w4 * w4),
+            e[1] + d1 + real(2.0) * (w5 * f5 - w3 * f3)
+            - real(0.5) * (d1 * d1 + d3 * d3 + d5 * d5 - w3 * w3 - w5 * w5),
+            e[2] + d2 - real(2.0) * (w4 * f4 + w5 * f5)
+            - real(0.5) * (d2 * d2 + d4 * d4 + d5 * d5 - w4 * w4 - w5 * w5),
+            e[3] + d3 + w3 * (f1 - f0) + w4 * f5 + w5 * f4
+            - real(0.5) * (d0 * d3 + d3 * d1 + d4 * d5 - w4 * w5),
+            e[4] + d4 + w4 * (f2 - f0) + w3 * f5 - w5 * f3
+            - real(0.5) * (d0 * d4 + d3 * d5 + d4 * d2 + w3 * w5),
+            e[5] + d5 + w5 * (f2 - f1) - w3 * f4 - w4 * f3
+            - real(0.5) * (d3 * d4 + d1 * d5 + d5 * d2 - w3 * w4),
+        )  # fmt: skip
+
+    @wp.func
     def strain_trial(e: vec6, a: mat33):
+        if norm_squared(e) + wp.ddot(a, a) < real(second_order_limit):
+            return deviator(second_order(e, a))
         # b - I = M + Y + Y^T + Y A^T with M = exp(2 e) - I and Y = A (I + M): no cancellation.
         m6 = exp_twice_minus_one(e)
         m = full(m6)

@@ -78,8 +78,8 @@ def plan(
     """The runs of a campaign.
 
     Args:
-        settings: the `dataset` group: name, path, set, draw, runs, split.
-        base: a scene as nested data; `set` and `draw` replace values in it.
+        settings: the `dataset` group: name, path, draw, runs, split.
+        base: a scene as nested data; `draw` replaces values in it.
         effects: which physics.
         seed: of the drawn combinations and the split.
     """
@@ -101,7 +101,7 @@ def plan(
     scenes: dict[str, Scene] = {}
     for index in chosen:
         data = OmegaConf.create(dict(base))
-        for key, value in [*settings.get("set", {}).items(), *zip(draw, combinations[index], strict=True)]:
+        for key, value in zip(draw, combinations[index], strict=True):
             OmegaConf.update(data, key, value, force_add=True)
         label = "_".join(
             f"{key.split('.')[-1]}-{value}" for key, value in zip(draw, combinations[index], strict=True)

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hydra import compose
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
@@ -216,6 +218,16 @@ def _done(file: Path, scene: Scene) -> bool:
         return False
 
 
+def _base_scene(settings: dict[str, Any]) -> dict[str, Any]:
+    """The scene a campaign names, with the command's own overrides of scene.* and material.*."""
+    overrides = HydraConfig.get().overrides.task
+    if any(o.startswith("scene=") for o in overrides):
+        raise UserError(f"dataset={settings['name']} brings its own scene; leave out scene=")
+    kept = [o for o in overrides if not o.lstrip("+~").startswith("dataset")]
+    cfg = compose("simulate", [f"scene={settings['scene']}", *kept])
+    return scene_from_config(cfg).to_dict()
+
+
 def main(cfg: DictConfig) -> float | None:
     """Simulate `cfg.scene` into `cfg.output`, or the campaign `cfg.dataset`.
 
@@ -224,10 +236,8 @@ def main(cfg: DictConfig) -> float | None:
     """
     effects = effects_from_config(cfg)
     if cfg.get("dataset") is not None:  # `dataset: null` in a defaults list leaves no key
-        scene = OmegaConf.to_container(cfg.scene, resolve=True)
-        scene["material"] = OmegaConf.to_container(cfg.material, resolve=True)
         settings = OmegaConf.to_container(cfg.dataset, resolve=True)
-        campaign = plan(settings, scene, asdict(effects), cfg.seed)
+        campaign = plan(settings, _base_scene(settings), asdict(effects), cfg.seed)
         simulate_campaign(campaign, device=cfg.device, precision=cfg.solver.precision)
         return None
     scene = scene_from_config(cfg)

@@ -1,0 +1,119 @@
+"""Solver and surrogate at the paper's scale, timed in turn on the same core in one process.
+
+    python experiments/speed/run.py
+
+Times the paper's excavation scene (29 700 particles, E = 1 MPa) with the solver, and the same tool path with a network
+of default size and 8 modes whose basis was fitted on a short run of that bed. The network is trained for a few steps
+only: its speed does not depend on how good it is. Writes table.csv and bars.png beside this script.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import logging
+import os
+import statistics
+import tempfile
+from pathlib import Path
+
+import matplotlib
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from mpm_warp import Effects
+from sgns.campaign import Dataset, plan
+from sgns.provenance import cpu_model
+from sgns.reduced import reduce_dataset
+from sgns.rollout import rollout_scene
+from sgns.scenes import scene_from_config
+from sgns.simulate import simulate_campaign, simulate_scene
+from sgns.simulator import Simulator
+from sgns.training import train
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+HERE = Path(__file__).parent
+
+
+def make_simulator(config, folder: Path) -> Simulator:
+    """A network of default size on the paper's bed."""
+    short = OmegaConf.to_container(config.scene, resolve=True)
+    short |= {"material": OmegaConf.to_container(config.material), "duration": 0.25}
+    settings = {"name": "speed", "path": folder / "data", "draw": {"depth": [0.03, 0.05, 0.08]}}
+    campaign = plan(settings, short, OmegaConf.to_container(config.effects), seed=0)
+    simulate_campaign(campaign, device="cpu", precision="float32", workers=1)
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        learning = OmegaConf.to_container(compose("train", ["training.max_steps=20"]), resolve=False)
+    reduced = reduce_dataset(Dataset.open(campaign.path), learning["reduction"], progress=False)
+    train(reduced, num_modes=8, model=learning["model"], training=learning["training"], output=folder / "training")
+    return Simulator.load(folder / "training" / "best.ckpt")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args()
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    torch.set_num_threads(1)
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        config = compose("simulate", ["scene=excavation", "scene.depth=0.08", "scene.speed=0.10", "scene.rake=10"])
+    scene = scene_from_config(config)
+    effects = Effects(**OmegaConf.to_container(config.effects))
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        simulator = make_simulator(config, folder)
+        rollout_scene(simulator, scene, folder / "warm.h5")
+        solver, stepping, complete, rates = [], [], [], []
+        for _ in range(options.repeats):
+            timing = simulate_scene(scene, folder / "truth.h5", effects=effects)
+            solver.append(timing.per_simulated_second)
+            rates.append(timing.rate)
+            # Three rollouts for each solver run: they are short, and their median is what counts.
+            for _ in range(3):
+                rollout = rollout_scene(simulator, scene, folder / "rollout.h5")
+                stepping.append(rollout.stepping_rate)
+                complete.append(rollout.complete_rate)
+    reference = statistics.median(solver)
+    rows = []
+    for what, included, values in (
+        ("solver", "all substeps, frames written", solver),
+        ("surrogate with soil", "steps with force, every frame decoded and written", complete),
+        ("surrogate", "steps with force and torque", stepping),
+    ):
+        median = statistics.median(values)
+        rows.append(
+            {
+                "what": what,
+                "included": included,
+                "s_per_simulated_s": f"{median:.4g}",
+                "min": f"{min(values):.4g}",
+                "max": f"{max(values):.4g}",
+                "repeats": len(values),
+                "times_faster_than_solver": f"{reference / median:.4g}",
+                "machine": f"one core of {cpu_model()}",
+            }
+        )
+    with (HERE / "table.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    figure, axis = plt.subplots(figsize=(7, 2.2), layout="constrained")
+    names, times = [r["what"] for r in rows], [float(r["s_per_simulated_s"]) for r in rows]
+    bars = axis.barh(names, times, color=["0.3", "C0", "C0"])
+    axis.bar_label(bars, [f" {t:.3g} s" for t in times])
+    axis.axvline(1.0, color="C3", ls="--", lw=1)
+    axis.text(1.05, 2.35, "real time", color="C3", fontsize=8, va="top")
+    axis.set(xscale="log", xlabel="wall seconds per simulated second, one core", xlim=(None, 4 * max(times)))
+    axis.invert_yaxis()
+    figure.savefig(HERE / "bars.png", dpi=130)
+    for row in rows:
+        print(*(row[key] for key in ("what", "s_per_simulated_s", "times_faster_than_solver")), sep="  ")
+    print(f"solver: {statistics.median(rates) / 1e6:.2f} M particle-steps/s")
+
+
+if __name__ == "__main__":
+    main()
