@@ -41,11 +41,8 @@ def arrange(
         # Sampled on a larger box and trimmed: points crowd at the edge of the box they were sampled in.
         radius = POISSON_RADIUS * spacing
         margin = 2.0 * radius
-        points = poisson_disk(tuple(s + 2.0 * margin for s in size), radius, seed) + [
-            -margin,
-            -margin,
-            margin,
-        ]
+        points = poisson_disk(tuple(s + 2.0 * margin for s in size), radius, seed)
+        points += [-margin, -margin, margin]
         inside = (points >= [0.0, 0.0, -size[2]]) & (points <= [size[0], size[1], 0.0])
         return points[inside.all(axis=1)], spacing**3
     raise SceneError(f"bed.arrangement is {kind!r}; allowed: {', '.join(ARRANGEMENTS)}")

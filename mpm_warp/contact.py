@@ -16,7 +16,7 @@ def body_struct(real: type) -> type:
 
     @wp.struct
     class Body:
-        half_size: vec3  # [m]
+        half_size: vec3  # with the contact margin [m]
         reach: real  # radius of the sphere around the box [m]
         friction: real
         position: wp.array(dtype=vec3)  # of the centre of mass at the start of each substep [m]

@@ -99,6 +99,8 @@ class Scene:
     """[s]."""
     frame_rate: float = 60.0
     """Recorded frames per second [Hz]."""
+    contact_margin: float = 0.0
+    """How far from its surface the body acts on the soil [m]; grid nodes within it take part in contact."""
     courant: float = 0.6
     """Time step as a share of spacing / wave speed."""
 
@@ -109,6 +111,10 @@ class Scene:
             raise SceneError(f"scene.frame_rate is {self.frame_rate} Hz; it must be above 0")
         if not (math.isfinite(self.duration) and self.duration * self.frame_rate >= 1.0):
             raise SceneError(f"scene.duration is {self.duration} s; it must last at least one frame")
+        if not 0.0 <= self.contact_margin <= 2.0 * self.bed.spacing:
+            raise SceneError(
+                f"scene.contact_margin is {self.contact_margin} m; allowed: 0 to two grid spacings"
+            )
         if not 0.0 < self.courant <= 1.0:
             raise SceneError(f"scene.courant is {self.courant}; allowed: above 0, at most 1")
 

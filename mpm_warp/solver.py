@@ -168,8 +168,12 @@ class Solver:
 
         body, plate, m = body_struct(real)(), scene.plate, self.substeps_per_frame
         if plate is not None:
-            body.half_size = vec3(*plate.half_size)
-            body.reach, body.friction = float(np.linalg.norm(plate.half_size)), plate.friction
+            half = plate.half_size + scene.contact_margin
+            body.half_size, body.reach, body.friction = (
+                vec3(*half),
+                float(np.linalg.norm(half)),
+                plate.friction,
+            )
         body.position = wp.zeros(m, dtype=vec3, **new)
         body.rotation = wp.zeros(m, dtype=wp.types.quaternion(real), **new)
         body.velocity = wp.zeros(m, dtype=vec3, **new)

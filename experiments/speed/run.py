@@ -48,7 +48,13 @@ def make_simulator(config, folder: Path) -> Simulator:
     with initialize_config_module("sgns.conf", version_base="1.3"):
         learning = OmegaConf.to_container(compose("train", ["training.max_steps=20"]), resolve=False)
     reduced = reduce_dataset(Dataset.open(campaign.path), learning["reduction"], progress=False)
-    train(reduced, num_modes=8, model=learning["model"], training=learning["training"], output=folder / "training")
+    train(
+        reduced,
+        num_modes=8,
+        model=learning["model"],
+        training=learning["training"],
+        output=folder / "training",
+    )
     return Simulator.load(folder / "training" / "best.ckpt")
 
 
@@ -60,7 +66,9 @@ def main() -> None:
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     torch.set_num_threads(1)
     with initialize_config_module("sgns.conf", version_base="1.3"):
-        config = compose("simulate", ["scene=excavation", "scene.depth=0.08", "scene.speed=0.10", "scene.rake=10"])
+        config = compose(
+            "simulate", ["scene=excavation", "scene.depth=0.08", "scene.speed=0.10", "scene.rake=10"]
+        )
     scene = scene_from_config(config)
     effects = Effects(**OmegaConf.to_container(config.effects))
     with tempfile.TemporaryDirectory() as temporary:

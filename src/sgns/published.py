@@ -51,7 +51,9 @@ def excavation_case(case: int) -> dict[str, float | str]:
     return dict(zip(("depth", "speed", "rake", "motion"), grid[case - 1], strict=True))
 
 
-def read_published(folder: str | Path, bin_size: tuple[float, float, float], split: str = "valid") -> list[PublishedRun]:
+def read_published(
+    folder: str | Path, bin_size: tuple[float, float, float], split: str = "valid"
+) -> list[PublishedRun]:
     """The runs of one folder with `<split>.tfrecord` and `metadata.json`.
 
     Args:
@@ -65,7 +67,9 @@ def read_published(folder: str | Path, bin_size: tuple[float, float, float], spl
     except (OSError, ValueError, KeyError, TypeError, struct.error) as error:
         raise UserError(f"{folder} does not hold the published {split} runs: {error}") from None
     if len(cases) != len(records):
-        raise UserError(f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {len(records)}")
+        raise UserError(
+            f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {len(records)}"
+        )
     try:
         return [_run(case, record, bin_size) for case, record in zip(cases, records, strict=True)]
     except (ValueError, KeyError, IndexError, struct.error) as error:

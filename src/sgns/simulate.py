@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -180,6 +181,13 @@ _frames_done: Any = None  # shared counter, set once in each worker process
 def _start_worker(counter: Any) -> None:
     global _frames_done
     _frames_done = counter
+
+    def leave_with_parent() -> None:
+        # Without this a worker would go on alone after its parent was killed.
+        multiprocessing.parent_process().join()
+        os._exit(1)
+
+    threading.Thread(target=leave_with_parent, daemon=True).start()
 
 
 def _count_frame() -> None:

@@ -12,13 +12,14 @@ from mpm_warp import Effects, Material
 from mpm_warp.constitutive import constitutive, soil_struct
 
 SAND = Material(youngs_modulus=15e6)
+ALL = Effects()
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 class Point:
     """Runs the Warp functions on many single points."""
 
-    def __init__(self, real=wp.float64, effects=Effects(), material=SAND):
+    def __init__(self, real=wp.float64, effects=ALL, material=SAND):
         law, Soil = constitutive(real, effects), soil_struct(real)
         vec6, mat33 = law.vec6, law.mat33
         update, trial, volume = law.update, law.strain_trial, law.volume_step

@@ -1,0 +1,104 @@
+"""Campaigns and datasets: what is drawn, how it is split, what is on disk."""
+
+from __future__ import annotations
+
+import pytest
+
+from mpm_warp import Scene
+from sgns.campaign import SPLITS, Dataset, plan
+from sgns.errors import UserError
+
+BASE = {
+    "kind": "excavation",
+    "duration": 0.05,
+    "blade": {"length": 0.1, "width": 0.1, "thickness": 0.08},
+    "bed": {"size": [0.4, 0.2, 0.16], "spacing": 0.04},
+}
+EFFECTS = {"yielding": True, "rate_dependence": True, "separation": True}
+
+
+def campaign(tmp_path, seed=0, **change):
+    settings = {
+        "name": "tiny",
+        "path": tmp_path / "tiny",
+        "draw": {"rake": [0.0, 10.0], "depth": [0.02, 0.04, 0.05], "blade.friction": [0.1, 0.3]},
+        "runs": 10,
+    }
+    return plan(settings | change, BASE, EFFECTS, seed)
+
+
+def test_runs_are_different_scenes_of_the_grid(tmp_path):
+    scenes = list(campaign(tmp_path).scenes.values())
+    drawn = {(s.rake, s.depth, s.blade.friction) for s in scenes}
+    assert len(drawn) == 10
+    assert {d for _, d, _ in drawn} <= {0.02, 0.04, 0.05}
+    assert len({s.arrangement_hash for s in scenes}) == 1
+
+
+def test_seed_decides_draw_and_split(tmp_path):
+    one, two, other = campaign(tmp_path), campaign(tmp_path), campaign(tmp_path, seed=1)
+    assert one == two
+    assert (list(one.scenes), one.split) != (list(other.scenes), other.split)
+
+
+def test_every_run_is_in_one_split(tmp_path):
+    c = campaign(tmp_path)
+    counts = [list(c.split.values()).count(s) for s in SPLITS]
+    assert counts == [8, 1, 1]
+    assert list(campaign(tmp_path, split=[0.9, 0.0, 0.1]).split.values()).count("validation") == 0
+
+
+def test_all_combinations_when_no_number_is_given(tmp_path):
+    assert len(campaign(tmp_path, runs=None).scenes) == 12
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"runs": 13}, "allowed: 3 to 12"),
+        ({"draw": {"rake": 3.0}}, "dataset.draw.rake is 3.0"),
+        ({"draw": None}, "dataset.draw is missing"),
+        ({"split": [0.8, 0.1]}, "three shares"),
+        ({"split": [0.8, 0.1, 0.2]}, "sum to 1"),
+    ],
+)
+def test_settings_it_refuses(tmp_path, change, words):
+    with pytest.raises(UserError, match=words):
+        campaign(tmp_path, **change)
+
+
+def test_record_once_and_open(tmp_path):
+    c = campaign(tmp_path)
+    c.record()
+    c.record()  # the same again is fine
+    with pytest.raises(UserError, match="made with other settings"):
+        campaign(tmp_path, seed=1).record()
+    with pytest.raises(UserError, match=r"10 runs of .* are missing"):
+        Dataset.open(c.path)
+    (c.path / "runs").mkdir()
+    for name in c.scenes:
+        c.file(name).touch()
+    dataset = Dataset.open(c.path)
+    assert dataset.name == "tiny"
+    assert sum(len(dataset.runs(s)) for s in SPLITS) == 10
+    assert all(run.exists() for run in dataset.runs("train"))
+    with pytest.raises(UserError, match="allowed: train, validation, test"):
+        dataset.runs("valid")
+
+
+def test_scenes_are_recorded_completely(tmp_path):
+    c = campaign(tmp_path)
+    name, scene = next(iter(c.scenes.items()))
+    assert Scene.from_dict(c.describe()["scenes"][name]) == scene
+
+
+@pytest.mark.parametrize("text", ["split: [", "- 1", "!!python/object/apply:os.system [ls]"])
+def test_a_foreign_dataset_file_is_refused(tmp_path, text):
+    (tmp_path / "dataset.yaml").write_text(text)
+    with pytest.raises(UserError):
+        Dataset.open(tmp_path)
+
+
+def test_no_dataset(tmp_path):
+    with pytest.raises(UserError, match="sgns simulate dataset=quick"):
+        Dataset.open(tmp_path / "nothing")

@@ -1,0 +1,109 @@
+"""`sgns simulate`: one run and a campaign, resumed; what goes wrong leaves nothing behind."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+from test_campaign import campaign
+
+from mpm_warp import Effects, SolverStopped
+from sgns.errors import UserError
+from sgns.runfile import Run, check_run
+from sgns.simulate import simulate_campaign, simulate_scene
+
+SMALL = [
+    "scene.duration=0.05",
+    "scene.bed.size=[0.4,0.2,0.16]",
+    "scene.bed.spacing=0.04",
+    "scene.blade={length: 0.1, width: 0.1, thickness: 0.08, friction: 0.3}",
+]
+
+
+def sgns(folder, *arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "sgns", *arguments], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+def test_command_writes_a_complete_run(tmp_path):
+    done = sgns(tmp_path, "simulate", *SMALL, "scene.rake=5", "output=run.h5")
+    assert done.returncode == 0, done.stderr
+    assert "particle-steps/s" in done.stdout
+    assert check_run(tmp_path / "run.h5") == []
+    with Run(tmp_path / "run.h5") as run:
+        assert run.producer == "mpm"
+        assert run.scene["rake"] == 5.0
+        assert run.effects["separation"]["on"] is True
+        assert run.effects["separation"]["reason"]
+        assert run.frame_count == 4
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert file["particles/soil/position/value"].shape == (4, 10 * 5 * 4, 3)
+    assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("scene.depth=0.5", "leaves the bin"),
+        ("scene.bed.colour=red", "colour"),
+        ("effects.gravity=true", "effects"),
+        ("solver.precision=float16", "allowed: float32, float64"),
+        ("device=tpu", "device is 'tpu'"),
+        ("scene.depth=deep", "scene.depth is 'deep'"),
+        ("scene.path=nowhere.csv", "scene.path"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, override, words):
+    done = sgns(tmp_path, "simulate", *SMALL, override)
+    assert done.returncode == 2
+    lines = [line for line in done.stderr.splitlines() if "Warp CUDA" not in line]
+    assert len(lines) == 1
+    assert words in lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nan_in_a_path(tmp_path):
+    (tmp_path / "path.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0.1,0.1,0.1,0,0,0,1\n1,nan,0.1,0.1,0,0,0,1\n")
+    done = sgns(tmp_path, "simulate", *SMALL, "scene.motion=path", "scene.path=path.csv")
+    assert done.returncode == 2
+    assert "not finite in row 2, column 2" in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["path.csv"]
+
+
+def test_campaign_is_resumed(tmp_path):
+    c = campaign(tmp_path, runs=3)
+    simulate_campaign(c, device="cpu", precision="float32", workers=2)
+    files = [c.file(name) for name in c.scenes]
+    assert all(check_run(f) == [] for f in files)
+    before = [f.stat().st_mtime_ns for f in files]
+    force = Run(files[1]).force
+    files[1].unlink()
+    files[2].write_bytes(files[2].read_bytes()[:5000])  # a torn file is made again
+    simulate_campaign(c, device="cpu", precision="float32", workers=1)
+    after = [f.stat().st_mtime_ns for f in files]
+    assert after[0] == before[0]
+    assert check_run(files[2]) == []
+    np.testing.assert_array_equal(Run(files[1]).force, force)
+
+
+def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
+    scene = next(iter(campaign(tmp_path).scenes.values()))
+
+    def stops(self):
+        raise SolverStopped("particle 1 went wrong")
+        yield
+
+    monkeypatch.setattr("sgns.simulate.Solver.frames", stops)
+    with pytest.raises(SolverStopped):
+        simulate_scene(scene, tmp_path / "run.h5", effects=Effects())
+    assert not list(tmp_path.glob("*"))
+
+
+def test_output_that_is_a_folder(tmp_path):
+    scene = next(iter(campaign(tmp_path).scenes.values()))
+    with pytest.raises(UserError, match="is a folder"):
+        simulate_scene(scene, tmp_path, effects=Effects())
