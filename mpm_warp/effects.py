@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+from .errors import SceneError
+
 __all__ = ["Effects"]
 
 _REASONS = {
@@ -26,6 +28,13 @@ class Effects:
     """mu(I) instead of a constant mu_s. Needs `yielding`."""
     separation: bool = True
     """A stress-free state below the critical density; off: the soil can carry tension."""
+
+    def __post_init__(self) -> None:
+        if self.rate_dependence and not self.yielding:
+            raise SceneError(
+                "effects.rate_dependence needs effects.yielding: soil that does not yield has no friction that could "
+                "depend on the rate; set effects.rate_dependence=false"
+            )
 
     def described(self) -> dict[str, dict[str, bool | str]]:
         """Each effect with its state and the reason, as stored in a run file."""

@@ -15,6 +15,7 @@ from .effects import Effects
 from .errors import SceneError, SolverStopped
 from .rotation import angular_velocity, rotate
 from .scene import Scene
+from .start import start_warp
 from .transfer import grid_struct, transfer
 
 __all__ = ["PRECISIONS", "Frame", "Solver"]
@@ -66,7 +67,7 @@ class Solver:
     ) -> None:
         if precision not in PRECISIONS:
             raise SceneError(f"precision is {precision!r}; allowed: {', '.join(PRECISIONS)}")
-        wp.init()
+        start_warp()
         if device not in {str(d) for d in wp.get_devices()} | {"cuda"} or (
             device == "cuda" and not wp.is_cuda_available()
         ):

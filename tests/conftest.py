@@ -6,8 +6,10 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # figures without a screen, in child processes too
+torch.set_num_threads(1)  # the tests' networks are so small that more threads only wait for each other
 
 
 @pytest.fixture

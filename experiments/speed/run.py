@@ -43,8 +43,8 @@ def make_simulator(config, folder: Path) -> Simulator:
     short = OmegaConf.to_container(config.scene, resolve=True)
     short |= {"material": OmegaConf.to_container(config.material), "duration": 0.25}
     settings = {"name": "speed", "path": folder / "data", "draw": {"depth": [0.03, 0.05, 0.08]}}
-    campaign = plan(settings, short, OmegaConf.to_container(config.effects), seed=0)
-    simulate_campaign(campaign, device="cpu", precision="float32", workers=1)
+    campaign = plan(settings, short, OmegaConf.to_container(config.effects), "float32", seed=0)
+    simulate_campaign(campaign, device="cpu", workers=1)
     with initialize_config_module("sgns.conf", version_base="1.3"):
         learning = OmegaConf.to_container(compose("train", ["training.max_steps=20"]), resolve=False)
     reduced = reduce_dataset(Dataset.open(campaign.path), learning["reduction"], progress=False)

@@ -37,6 +37,7 @@ class Campaign:
     split: dict[str, str]
     """Run name → train, validation or test."""
     effects: dict[str, bool]
+    precision: str
     seed: int
 
     def describe(self) -> dict[str, Any]:
@@ -45,6 +46,7 @@ class Campaign:
             "name": self.name,
             "seed": self.seed,
             "effects": dict(self.effects),
+            "precision": self.precision,
             "split": {s: [n for n, where in self.split.items() if where == s] for s in SPLITS},
             "scenes": {name: scene.to_dict() for name, scene in self.scenes.items()},
         }
@@ -73,7 +75,7 @@ class Campaign:
 
 
 def plan(
-    settings: Mapping[str, Any], base: Mapping[str, Any], effects: dict[str, bool], seed: int
+    settings: Mapping[str, Any], base: Mapping[str, Any], effects: dict[str, bool], precision: str, seed: int
 ) -> Campaign:
     """The runs of a campaign.
 
@@ -81,16 +83,13 @@ def plan(
         settings: the `dataset` group: name, path, draw, runs, split.
         base: a scene as nested data; `draw` replaces values in it.
         effects: which physics.
+        precision: float32 or float64.
         seed: of the drawn combinations and the split.
     """
     for key in ("name", "path", "draw"):
         if settings.get(key) is None:
             raise UserError(f"dataset.{key} is missing; a campaign needs name, path and draw")
-    draw = settings["draw"]
-    for key, values in draw.items():
-        if not isinstance(values, list) or not values:
-            raise UserError(f"dataset.draw.{key} is {values!r}; it must be a list of at least one value")
-    combinations = list(itertools.product(*draw.values()))
+    combinations = _combinations(settings["draw"])
     count = settings.get("runs") or len(combinations)
     if not 3 <= count <= len(combinations):
         raise UserError(
@@ -101,11 +100,9 @@ def plan(
     scenes: dict[str, Scene] = {}
     for index in chosen:
         data = OmegaConf.create(dict(base))
-        for key, value in zip(draw, combinations[index], strict=True):
+        for key, value in combinations[index].items():
             OmegaConf.update(data, key, value, force_add=True)
-        label = "_".join(
-            f"{key.split('.')[-1]}-{value}" for key, value in zip(draw, combinations[index], strict=True)
-        )
+        label = "_".join(f"{key.split('.')[-1]}-{value}" for key, value in combinations[index].items())
         scenes[f"{index:04d}_{label}"] = Scene.from_dict(OmegaConf.to_container(data, resolve=True))
     return Campaign(
         name=settings["name"],
@@ -113,8 +110,24 @@ def plan(
         scenes=scenes,
         split=_split(list(scenes), settings.get("split", [0.8, 0.1, 0.1]), rng),
         effects=effects,
+        precision=precision,
         seed=seed,
     )
+
+
+def _combinations(draw: Any) -> list[dict[str, Any]]:
+    """Every combination of one grid (key → values) or of each of several."""
+    combinations = []
+    for grid in draw if isinstance(draw, list) else [draw]:
+        if not isinstance(grid, Mapping) or not grid:
+            raise UserError(
+                f"dataset.draw holds {grid!r}; it must be a grid, key: [values], or a list of such grids"
+            )
+        for key, values in grid.items():
+            if not isinstance(values, list) or not values:
+                raise UserError(f"dataset.draw.{key} is {values!r}; it must be a list of at least one value")
+        combinations += [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+    return combinations
 
 
 def _split(names: list[str], shares: list[float], rng: np.random.Generator) -> dict[str, str]:

@@ -18,19 +18,24 @@ REPORT = OUTPUT / "evaluation" / "report.html"
 # A blade path that no run of the dataset contains: its rake, depth and speed are between those of the runs.
 NEW_SCENE = ["scene.rake=20", "scene.depth=0.06", "scene.speed=0.12", "scene.motion=curved"]
 
+NEW_ROLLOUT = [
+    "rollout",
+    "scene=quick_excavation",
+    *NEW_SCENE,
+    f"checkpoint={CHECKPOINT}",
+    f"output={NEW_PATH}",
+]
+EVALUATION = ["evaluate", "dataset=quick", f"checkpoint={CHECKPOINT}", f"new_rollouts=[{NEW_PATH}]"]
 STEPS = [
     ("simulate the runs of dataset=quick", ["simulate", "dataset=quick"]),
     ("fit the basis and train", ["train", "dataset=quick", f"output={OUTPUT}"]),
-    ("roll out a new blade path", ["rollout", "scene=quick_excavation", *NEW_SCENE, f"checkpoint={CHECKPOINT}", f"output={NEW_PATH}"]),
-    (
-        "roll out and judge the test runs",
-        ["evaluate", f"checkpoint={CHECKPOINT}", "dataset=quick", f"new_rollouts=[{NEW_PATH}]", f"output={REPORT.parent}"],
-    ),
-]  # fmt: skip
+    ("roll out a new blade path", NEW_ROLLOUT),
+    ("roll out and judge the test runs", [*EVALUATION, f"output={REPORT.parent}"]),
+]
 
 
 def main() -> int:
-    """Run the steps; each reuses what an earlier demo completed. Returns the exit status of the first that fails."""
+    """Run the steps, reusing what an earlier demo completed; returns the status of the first that fails, or 0."""
     begin = time.perf_counter()
     for number, (title, arguments) in enumerate(STEPS, start=1):
         sys.stdout.write(f"\n[{number}/{len(STEPS)}] {title}\n    sgns {shlex.join(arguments)}\n")

@@ -8,6 +8,7 @@ import os
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -108,7 +109,7 @@ def simulate_scene(
     )
 
 
-def simulate_campaign(campaign: Campaign, *, device: str, precision: str, workers: int | None = None) -> None:
+def simulate_campaign(campaign: Campaign, *, device: str, workers: int | None = None) -> None:
     """Make every run of a campaign that is not there yet, one process per core.
 
     Raises:
@@ -129,9 +130,8 @@ def simulate_campaign(campaign: Campaign, *, device: str, precision: str, worker
         "%d particles, %d frames, about %.1f GB of disk", particles, frames, frames * particles * 24 / 1e9
     )
     effects = Effects(**campaign.effects)
-    Solver(
-        first, effects, device, precision
-    )  # compiles the kernels once; the processes find them in the cache
+    # Compiles the kernels once; the processes find them in the cache.
+    Solver(first, effects, device, campaign.precision)
     workers = workers or (1 if device != "cpu" else len(os.sched_getaffinity(0)))
     context = multiprocessing.get_context("spawn")
     done = context.Value("q", 0)
@@ -150,7 +150,7 @@ def simulate_campaign(campaign: Campaign, *, device: str, precision: str, worker
                 asdict(effects),
                 campaign.seed,
                 device,
-                precision,
+                campaign.precision,
             ): name
             for name, scene in missing.items()
         }
@@ -163,6 +163,11 @@ def simulate_campaign(campaign: Campaign, *, device: str, precision: str, worker
             for job in as_completed(jobs):
                 if message := job.result():
                     failed[jobs[job]] = message
+        except BrokenProcessPool:
+            raise UserError(
+                f"a process that simulated died, perhaps for lack of memory; the complete runs are kept in "
+                f"{campaign.path}; the same command goes on"
+            ) from None
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
@@ -245,8 +250,8 @@ def main(cfg: DictConfig) -> float | None:
     effects = effects_from_config(cfg)
     if cfg.get("dataset") is not None:  # `dataset: null` in a defaults list leaves no key
         settings = OmegaConf.to_container(cfg.dataset, resolve=True)
-        campaign = plan(settings, _base_scene(settings), asdict(effects), cfg.seed)
-        simulate_campaign(campaign, device=cfg.device, precision=cfg.solver.precision)
+        campaign = plan(settings, _base_scene(settings), asdict(effects), cfg.solver.precision, cfg.seed)
+        simulate_campaign(campaign, device=cfg.device)
         return None
     scene = scene_from_config(cfg)
     for warning in scene.warnings():

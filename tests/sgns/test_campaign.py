@@ -24,7 +24,7 @@ def campaign(tmp_path, seed=0, **change):
         "draw": {"rake": [0.0, 10.0], "depth": [0.02, 0.04, 0.05], "blade.friction": [0.1, 0.3]},
         "runs": 10,
     }
-    return plan(settings | change, BASE, EFFECTS, seed)
+    return plan(settings | change, BASE, EFFECTS, "float32", seed)
 
 
 def test_runs_are_different_scenes_of_the_grid(tmp_path):
@@ -48,6 +48,17 @@ def test_every_run_is_in_one_split(tmp_path):
     assert list(campaign(tmp_path, split=[0.9, 0.0, 0.1]).split.values()).count("validation") == 0
 
 
+def test_several_grids_are_joined(tmp_path):
+    grids = [
+        {"motion": ["curved"], "depth": [0.02, 0.04]},
+        {"motion": ["ramp"], "depth": [0.02], "speed": [0.1, 0.2]},
+    ]
+    scenes = campaign(tmp_path, draw=grids, runs=None).scenes.values()
+    assert sorted((s.motion, s.depth, s.speed) for s in scenes) == [
+        ("curved", 0.02, 0.1), ("curved", 0.04, 0.1), ("ramp", 0.02, 0.1), ("ramp", 0.02, 0.2)
+    ]  # fmt: skip
+
+
 def test_all_combinations_when_no_number_is_given(tmp_path):
     assert len(campaign(tmp_path, runs=None).scenes) == 12
 
@@ -58,6 +69,7 @@ def test_all_combinations_when_no_number_is_given(tmp_path):
         ({"runs": 13}, "allowed: 3 to 12"),
         ({"draw": {"rake": 3.0}}, "dataset.draw.rake is 3.0"),
         ({"draw": None}, "dataset.draw is missing"),
+        ({"draw": [3]}, "must be a grid"),
         ({"split": [0.8, 0.1]}, "three shares"),
         ({"split": [0.8, 0.1, 0.2]}, "sum to 1"),
     ],

@@ -60,7 +60,6 @@ def test_command_writes_a_complete_run(tmp_path):
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, override, words):
     done = sgns(tmp_path, "simulate", *SMALL, override)
     assert done.returncode == 2
-    lines = [line for line in done.stderr.splitlines() if "Warp CUDA" not in line]
     assert len(lines) == 1
     assert words in lines[0]
     assert list(tmp_path.iterdir()) == []
@@ -76,14 +75,14 @@ def test_nan_in_a_path(tmp_path):
 
 def test_campaign_is_resumed(tmp_path):
     c = campaign(tmp_path, runs=3)
-    simulate_campaign(c, device="cpu", precision="float32", workers=2)
+    simulate_campaign(c, device="cpu", workers=2)
     files = [c.file(name) for name in c.scenes]
     assert all(check_run(f) == [] for f in files)
     before = [f.stat().st_mtime_ns for f in files]
     force = Run(files[1]).force
     files[1].unlink()
     files[2].write_bytes(files[2].read_bytes()[:5000])  # a torn file is made again
-    simulate_campaign(c, device="cpu", precision="float32", workers=1)
+    simulate_campaign(c, device="cpu", workers=1)
     after = [f.stat().st_mtime_ns for f in files]
     assert after[0] == before[0]
     assert check_run(files[2]) == []

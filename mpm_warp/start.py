@@ -1,0 +1,52 @@
+"""Starting Warp without noise."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+
+import warp as wp
+
+__all__ = ["start_warp"]
+
+
+@cache
+def start_warp() -> None:
+    """Initialise Warp once, without its banner and, where there is no CUDA driver, without saying so."""
+    # Warp announces every kernel it loads; here only its warnings are of use.
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    if _has_cuda_driver():
+        wp.init()
+    else:
+        with _silent_stderr():
+            wp.init()
+
+
+def _has_cuda_driver() -> bool:
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
+@contextmanager
+def _silent_stderr() -> Iterator[None]:
+    # The warning comes from native code, past Python's sys.stderr.
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is no stderr
+        yield
+        return
+    silent = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(silent, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(silent)
