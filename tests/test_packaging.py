@@ -36,8 +36,13 @@ def imports_of(path: Path) -> set[str]:
 
 def test_every_folder_with_code_is_a_package_that_is_installed(project: dict) -> None:
     with_code = {path.parent for folder in FOLDERS.values() for path in folder.rglob("*.py")}
-    assert with_code == set(FOLDERS.values())
-    assert set(project["tool"]["setuptools"]["packages"]) == set(FOLDERS)
+    names = {
+        ".".join([name, *path.relative_to(folder).parts])
+        for path in with_code
+        for name, folder in FOLDERS.items()
+        if path.is_relative_to(folder)
+    }
+    assert set(project["tool"]["setuptools"]["packages"]) == names
 
 
 def test_the_installed_package_is_of_this_version() -> None:

@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 
 from sgns.campaign import Campaign
 from sgns.published import excavation_case, read_published
-from sgns.runfile import Run
+from sgns.runs import Run
 from sgns.scenes import scene_from_config
 from sgns.simulate import simulate_campaign
 

@@ -24,13 +24,13 @@ from omegaconf import OmegaConf
 
 from mpm_warp import Effects
 from sgns.campaign import Dataset, plan
-from sgns.provenance import cpu_model
-from sgns.reduced import reduce_dataset
+from sgns.evaluation.provenance import cpu_model
+from sgns.learning.training import train
+from sgns.reduction.reduced import reduce_dataset
 from sgns.rollout import rollout_scene
 from sgns.scenes import scene_from_config
 from sgns.simulate import simulate_campaign, simulate_scene
 from sgns.simulator import Simulator
-from sgns.training import train
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sgns.errors import UserError
     from sgns.reduction import Basis, IncrementalPCA
-    from sgns.runfile import Run
+    from sgns.runs import Run
     from sgns.simulator import Simulator
 
 __all__ = ["Basis", "IncrementalPCA", "Run", "Simulator", "UserError", "__version__"]
@@ -21,7 +21,7 @@ __version__ = "0.1.0"
 _HOME = {
     "Basis": "sgns.reduction",
     "IncrementalPCA": "sgns.reduction",
-    "Run": "sgns.runfile",
+    "Run": "sgns.runs",
     "Simulator": "sgns.simulator",
     "UserError": "sgns.errors",
 }

@@ -18,8 +18,7 @@ import yaml
 from omegaconf import OmegaConf
 
 from mpm_warp import Scene
-
-from .errors import UserError
+from sgns.errors import UserError
 
 __all__ = ["SPLITS", "Campaign", "Dataset", "plan"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sgns.errors import UserError
-from sgns.runfile import check_run
+from sgns.runs import check_run
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

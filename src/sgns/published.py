@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import UserError
+from sgns.errors import UserError
 
 __all__ = ["PublishedRun", "excavation_case", "read_published"]
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from sgns.errors import UserError
-from sgns.runfile import RunWriter
+from sgns.runs import RunWriter
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -8,8 +8,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from mpm_warp import Effects, Scene
-
-from .errors import UserError
+from sgns.errors import UserError
 
 __all__ = ["effects_from_config", "read_path", "scene_from_config"]
 

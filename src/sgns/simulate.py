@@ -20,12 +20,10 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from mpm_warp import Effects, Scene, SceneError, Solver, SolverStopped
-
-from .campaign import Campaign, plan
-from .errors import UserError
-from .runfile import Run
-from .runwriter import RunWriter
-from .scenes import effects_from_config, scene_from_config
+from sgns.campaign import Campaign, plan
+from sgns.errors import UserError
+from sgns.runs import Run, RunWriter
+from sgns.scenes import effects_from_config, scene_from_config
 
 __all__ = ["Timing", "main", "simulate_campaign", "simulate_scene"]
 

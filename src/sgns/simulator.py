@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sgns.basis import Basis
-from sgns.body import BodyTrack, body_track, check_poses, in_world_frame
 from sgns.errors import UserError
-from sgns.surrogate import Surrogate, load_surrogate
+from sgns.learning.body import BodyTrack, body_track, check_poses, in_world_frame
+from sgns.learning.surrogate import Surrogate, load_surrogate
+from sgns.reduction.basis import Basis
 
 __all__ = ["Rollout", "Simulator", "State"]
 

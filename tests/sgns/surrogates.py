@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from synthetic import make_run
 
-from sgns.body import in_world_frame
+from sgns.learning.body import in_world_frame
 from sgns.reduction import Basis, IncrementalPCA
-from sgns.runfile import Run
+from sgns.runs import Run
 
 
 @dataclass

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sgns.runfile import RunWriter
+from sgns.runs import RunWriter
 
 __all__ = ["BED", "PLATE", "make_run", "make_writer", "random_frame", "start_positions"]
 

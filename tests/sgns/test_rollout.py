@@ -12,7 +12,7 @@ from sgns.rollout import (
     unlearned,
     write_rollout,
 )
-from sgns.runfile import Run, check_run
+from sgns.runs import Run, check_run
 
 
 @pytest.fixture(scope="module")

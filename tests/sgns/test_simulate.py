@@ -12,7 +12,7 @@ from test_campaign import campaign
 
 from mpm_warp import Effects, SolverStopped
 from sgns.errors import UserError
-from sgns.runfile import Run, check_run
+from sgns.runs import Run, check_run
 from sgns.simulate import simulate_campaign, simulate_scene
 
 SMALL = [
@@ -60,6 +60,7 @@ def test_command_writes_a_complete_run(tmp_path):
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, override, words):
     done = sgns(tmp_path, "simulate", *SMALL, override)
     assert done.returncode == 2
+    lines = done.stderr.splitlines()
     assert len(lines) == 1
     assert words in lines[0]
     assert list(tmp_path.iterdir()) == []

@@ -8,8 +8,8 @@ import torch
 from tiny import MODEL, TRAINING, reduced
 
 from sgns.errors import UserError
+from sgns.learning.training import train
 from sgns.simulator import Simulator
-from sgns.training import train
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,1 @@
+"""A trained simulator against true runs: metrics, baselines, figures and the report."""

@@ -1,0 +1,291 @@
+"""How far a predicted run is from a simulated one: positions, surface, force and torque.
+
+Both runs are files of the same kind and are read in chunks of frames, so memory does not grow with the
+length of a run. The frames of the history, which the prediction was given, count in no metric.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+
+from sgns.errors import UserError
+from sgns.evaluation.surface import SurfaceGrid, height_map
+
+__all__ = [
+    "FORCE_COMPONENTS",
+    "TORQUE_COMPONENTS",
+    "PositionErrors",
+    "VectorErrors",
+    "mean_prediction",
+    "position_errors",
+    "reconstruction_curve",
+    "skill",
+]
+
+# Reported names of the world axes x, y, z. Draft is −F_x; every relative metric is the same for −F_x and F_x.
+FORCE_COMPONENTS = {"draft": 0, "lateral": 1, "vertical": 2}
+TORQUE_COMPONENTS = {"roll": 0, "pitch": 1, "yaw": 2}
+
+# A component this small beside the whole vector (RMS) is zero by symmetry, up to noise of the truth:
+# dividing by it says nothing, so relative metrics are left out (NaN).
+NEGLIGIBLE_SHARE = 0.05
+
+# Decoded positions held at one time [bytes, float64].
+CHUNK_BYTES = 32e6
+
+
+@dataclass(frozen=True)
+class PositionErrors:
+    """Mean-square position errors of one run at every frame after the history.
+
+    Attributes:
+        time: time of the frames [s], shape (t,).
+        reduction: PCA⁻¹PCA(truth) − truth [m²], shape (t,).
+        network: prediction − PCA⁻¹PCA(truth) [m²], shape (t,); the paper's figure.
+        total: prediction − truth [m²], shape (t,).
+        frozen: last frame of the history, kept − truth [m²], shape (t,).
+        constant_velocity: last step of the history, continued − truth [m²], shape (t,).
+        surface: height map of the prediction − of the truth [m²], shape (t,).
+        surface_frozen: height map of the last frame of the history − of the truth [m²], shape (t,).
+    """
+
+    time: np.ndarray
+    reduction: np.ndarray
+    network: np.ndarray
+    total: np.ndarray
+    frozen: np.ndarray
+    constant_velocity: np.ndarray
+    surface: np.ndarray
+    surface_frozen: np.ndarray
+
+    def mse(self, name: str) -> float:
+        """Mean over frames of one of the errors [m²]."""
+        return float(np.mean(getattr(self, name)))
+
+    def rmse_mm(self, name: str) -> float:
+        """Root of the mean over frames of one of the errors [mm]."""
+        return 1e3 * math.sqrt(self.mse(name)) if self.mse(name) >= 0.0 else math.nan
+
+    def skill(self, baseline: str = "frozen") -> float:
+        """1 − total MSE / MSE of a baseline (`frozen` or `constant_velocity`)."""
+        return skill([self.mse("total")], [self.mse(baseline)])
+
+
+@dataclass(frozen=True)
+class VectorErrors:
+    """Sums from which every metric of a predicted force or torque follows; sums of runs add up.
+
+    Attributes:
+        samples: number of frames.
+        absolute: Σ |prediction − truth| per world axis, shape (3,).
+        squared: Σ (prediction − truth)², shape (3,).
+        truth_squared: Σ truth², shape (3,).
+        truth_sum: Σ truth, shape (3,).
+        prediction_sum: Σ prediction, shape (3,).
+    """
+
+    samples: int
+    absolute: np.ndarray
+    squared: np.ndarray
+    truth_squared: np.ndarray
+    truth_sum: np.ndarray
+    prediction_sum: np.ndarray
+
+    @classmethod
+    def compare(cls, truth: np.ndarray, prediction: np.ndarray) -> VectorErrors:
+        """Errors of a predicted history.
+
+        Args:
+            truth: true vectors [N or N m], shape (t, 3).
+            prediction: predicted vectors, shape (t, 3), or (3,) for a constant.
+        """
+        truth = np.asarray(truth, dtype=np.float64)
+        prediction = np.broadcast_to(np.asarray(prediction, dtype=np.float64), truth.shape)
+        difference = prediction - truth
+        return cls(
+            samples=len(truth),
+            absolute=np.abs(difference).sum(axis=0),
+            squared=(difference**2).sum(axis=0),
+            truth_squared=(truth**2).sum(axis=0),
+            truth_sum=truth.sum(axis=0),
+            prediction_sum=prediction.sum(axis=0),
+        )
+
+    def __add__(self, other: VectorErrors) -> VectorErrors:
+        return VectorErrors(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+
+    @property
+    def mae(self) -> np.ndarray:
+        """Mean absolute error per axis [N or N m], shape (3,)."""
+        return self.absolute / self.samples
+
+    @property
+    def rms_truth(self) -> float:
+        """Root mean square of the truth's length [N or N m]."""
+        return math.sqrt(self.truth_squared.sum() / self.samples)
+
+    @property
+    def nrmse(self) -> np.ndarray:
+        """RMS error / RMS of the truth per axis, shape (3,); NaN where the truth is negligible."""
+        significant = self.truth_squared > NEGLIGIBLE_SHARE**2 * self.truth_squared.sum()
+        ratio = np.full(3, np.nan)
+        np.divide(self.squared, self.truth_squared, out=ratio, where=significant)
+        return np.sqrt(ratio)
+
+    @property
+    def overall_nrmse(self) -> float:
+        """RMS length of the error vector / RMS length of the true vector; NaN for a truth of zeros."""
+        scale = float(self.truth_squared.sum())
+        return math.sqrt(float(self.squared.sum()) / scale) if scale > 0.0 else math.nan
+
+    @property
+    def mpe(self) -> np.ndarray:
+        """100 (mean prediction − mean truth) / mean truth per axis [%], shape (3,), signed.
+
+        NaN where the mean of the truth is negligible beside the RMS length of the vector.
+        """
+        significant = np.abs(self.truth_sum) / self.samples > NEGLIGIBLE_SHARE * self.rms_truth
+        ratio = np.full(3, np.nan)
+        np.divide(self.prediction_sum - self.truth_sum, self.truth_sum, out=ratio, where=significant)
+        return 100.0 * ratio
+
+
+def skill(mse: Sequence[float], baseline: Sequence[float]) -> float:
+    """1 − Σ MSE / Σ MSE of the baseline over runs: 1 is perfect, 0 no better, negative is worse.
+
+    NaN if the baseline makes no error at all.
+    """
+    reference = float(np.sum(baseline))
+    return 1.0 - float(np.sum(mse)) / reference if reference > 0.0 else math.nan
+
+
+def mean_prediction(histories: Iterable[np.ndarray], history: int) -> np.ndarray:
+    """Mean force (or torque) of the training split, the simplest prediction of one.
+
+    Args:
+        histories: force of every training run [N], shape (T, 3) each.
+        history: frames to leave out at the start, as in every metric.
+
+    Returns:
+        Mean over all frames of all runs [N], shape (3,).
+    """
+    total, count = np.zeros(3), 0
+    for values in histories:
+        values = np.asarray(values, dtype=np.float64)[history:]
+        total, count = total + values.sum(axis=0), count + len(values)
+    return total / max(count, 1)
+
+
+def frame_chunks(first: int, last: int, particle_count: int) -> Iterable[slice]:
+    """Slices of at least one frame that cover first … last − 1 with bounded memory."""
+    step = max(1, int(CHUNK_BYTES / (24.0 * max(particle_count, 1))))
+    for start in range(first, last, step):
+        yield slice(start, min(start + step, last))
+
+
+def require_comparable(truth: Any, prediction: Any, history: int) -> None:
+    """Refuses pairs of runs that cannot be compared frame by frame and particle by particle."""
+    for what, a, b in (
+        ("particles", truth.particle_count, prediction.particle_count),
+        ("frames", truth.frame_count, prediction.frame_count),
+        ("arrangement", truth.arrangement_hash, prediction.arrangement_hash),
+    ):
+        if a != b:
+            raise UserError(
+                f"{prediction.path} cannot be compared with {truth.path}: {what} {b} against {a}; "
+                "compare runs of the same scene"
+            )
+    if truth.frame_count <= history:
+        raise UserError(
+            f"{truth.path} has {truth.frame_count} frames, the network needs {history} as its history; "
+            "nothing is left to compare: use a longer run"
+        )
+
+
+def position_errors(
+    truth: Any, prediction: Any, basis: Any, history: int, grid: SurfaceGrid
+) -> PositionErrors:
+    """Position errors of a predicted run at every frame after the history.
+
+    With orthonormal modes the network's error needs no decoding: it is ‖Uᵀ(prediction − truth)‖² / 3n, for a
+    prediction that lies in the subspace.
+
+    Args:
+        truth: the simulated `Run`.
+        prediction: the predicted `Run` of the same scene.
+        basis: `Basis` the prediction was decoded with.
+        history: number of frames d that the prediction was given.
+        grid: columns of the height map.
+    """
+    require_comparable(truth, prediction, history)
+    last = np.asarray(truth.positions(slice(history - 1, history)), dtype=np.float64)[0]
+    before = np.asarray(truth.positions(slice(max(history - 2, 0), max(history - 1, 1))), dtype=np.float64)[0]
+    step = last - before
+    last_heights = height_map(last, grid)
+    names = [f.name for f in fields(PositionErrors) if f.name != "time"]
+    collected: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    for frames in frame_chunks(history, truth.frame_count, truth.particle_count):
+        true = np.asarray(truth.positions(frames), dtype=np.float64)
+        predicted = np.asarray(prediction.positions(frames), dtype=np.float64)
+        latent = basis.transform(torch.from_numpy(true))
+        difference = basis.transform(torch.from_numpy(predicted)) - latent
+        elapsed = np.arange(frames.start, frames.stop) - (history - 1)
+        collected["reduction"].append(mean_square(basis.inverse(latent).numpy() - true))
+        collected["network"].append(
+            difference.square().sum(dim=(-2, -1)).numpy() / (3 * truth.particle_count)
+        )
+        collected["total"].append(mean_square(predicted - true))
+        collected["frozen"].append(mean_square(last - true))
+        collected["constant_velocity"].append(mean_square(last + elapsed[:, None, None] * step - true))
+        heights = [height_map(frame, grid) for frame in true]
+        guess = [height_map(frame, grid) for frame in predicted]
+        collected["surface"].append(
+            np.array([height_error(a, b) for a, b in zip(guess, heights, strict=True)])
+        )
+        collected["surface_frozen"].append(np.array([height_error(last_heights, b) for b in heights]))
+    values = {name: np.concatenate(parts) for name, parts in collected.items()}
+    return PositionErrors(time=np.asarray(truth.time)[history:], **values)
+
+
+def mean_square(difference: np.ndarray) -> np.ndarray:
+    """Mean over particles and axes of squared differences (t, n, 3) [m], shape (t,) [m²]."""
+    return np.mean(difference**2, axis=(1, 2))
+
+
+def height_error(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean-square difference [m²] of two height maps (nx, ny) [m] over the columns that both fill."""
+    both = np.isfinite(a) & np.isfinite(b)
+    return float(np.mean((a[both] - b[both]) ** 2)) if both.any() else math.nan
+
+
+def reconstruction_curve(runs: Iterable[Any], basis: Any) -> np.ndarray:
+    """Reduction MSE of runs for every number of modes, in one pass.
+
+    Orthonormal modes take away their share one after the other: the residual with r modes is
+    ‖S − S̄‖² less the squared first r coordinates.
+
+    Args:
+        runs: `Run`s to reconstruct, each read in chunks.
+        basis: `Basis` with R modes.
+
+    Returns:
+        Mean over frames, particles and axes [m²] for r = 0 … R, shape (R + 1,).
+    """
+    total, taken, count = 0.0, np.zeros(basis.num_modes), 0
+    for run in runs:
+        for frames in frame_chunks(0, run.frame_count, run.particle_count):
+            centred = torch.from_numpy(np.asarray(run.positions(frames), dtype=np.float64))
+            latent = basis.transform(centred)
+            total += float((centred - basis.mean).square().sum())
+            taken += latent.square().sum(dim=(0, 2)).numpy()
+            count += centred.numel()
+    if count == 0:
+        return np.full(basis.num_modes + 1, np.nan)
+    residual = total - np.concatenate([[0.0], np.cumsum(taken)])
+    return np.maximum(residual, 0.0) / count

@@ -1,0 +1,182 @@
+"""An evaluation in plain words: which words are used follows from the numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from sgns.evaluation.scores import Scores
+
+if TYPE_CHECKING:
+    from sgns.evaluation.evaluate import Evaluation
+
+__all__ = [
+    "describe",
+    "fixed",
+    "force_note",
+    "number",
+    "short_names",
+    "soil_note",
+    "summary",
+    "time_note",
+    "titled",
+]
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number with so many significant digits, no exponent where it can be helped; – if it means nothing."""
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    size = abs(value)
+    if size >= 1e5 or 0.0 < size < 1e-4:
+        text = f"{value:.{digits - 1}e}"
+    else:
+        decimals = digits if size == 0.0 else max(0, digits - 1 - math.floor(math.log10(size)))
+        text = f"{float(f'{value:.{digits}g}') if size >= 1000 else value:.{min(decimals, 6)}f}"
+    return text.replace("-", "−")
+
+
+def fixed(value: float, decimals: int = 2, sign: bool = False) -> str:
+    """A number with so many decimals; – if it means nothing."""
+    if not math.isfinite(value):
+        return number(value)
+    value = round(value, decimals) + 0.0  # no minus before a zero
+    return f"{value:{'+' if sign else ''}.{decimals}f}".replace("-", "−")
+
+
+def describe(scene: Mapping[str, Any]) -> str:
+    """A blade's scene in a few words; empty for other scenes."""
+    keys = ("depth", "speed", "rake", "motion")
+    if not all(key in scene for key in keys):
+        return ""
+    depth, speed, rake, motion = (scene[key] for key in keys)
+    return f"{100 * depth:.3g} cm deep, {100 * speed:.3g} cm/s, rake {rake:.3g}°, {motion} motion"
+
+
+def titled(name: str, scene: Mapping[str, Any]) -> str:
+    """A run's name with its scene in a few words."""
+    words = describe(scene)
+    return f"{name}: {words}" if words else name
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """The part of every name before its first underscore, if that still tells the names apart."""
+    short = [name.partition("_")[0] or name for name in names]
+    return short if len(set(short)) == len(set(names)) else list(names)
+
+
+def soil_words(total: Scores) -> str:
+    """What the skill against the two baselines means, as a sentence."""
+    skill = total.skill("frozen")
+    numbers = (
+        f"Its particles are off by {number(total.rmse_mm('total'))} mm (RMS per axis); a bed in which "
+        f"nothing moves is off by {number(total.rmse_mm('frozen'))} mm"
+    )
+    if math.isnan(skill):
+        return "How well it predicts the soil cannot be said: nothing moved in these runs."
+    if skill >= 0.9:
+        verdict = "It follows the motion of the soil closely"
+    elif skill >= 0.5:
+        verdict = "It follows most of the motion of the soil"
+    elif skill > 0.0:
+        verdict = "It follows the soil only roughly"
+    else:
+        verdict = "It does not predict the soil: it is no better than assuming that nothing moves"
+    sentence = f"{verdict}. {numbers} (skill {fixed(skill)}, where 1 is perfect and 0 is no better)."
+    steady = total.skill("constant_velocity")
+    if not math.isnan(steady) and steady <= 0.0:
+        sentence += " It is worse than letting every particle go on at the speed it had at the start."
+    share = total.mse["reduction"] / total.mse["total"] if total.mse["total"] > 0.0 else math.nan
+    if share >= 0.5:
+        sentence += f" Of the squared error {100 * share:.0f} % is the subspace's, not the network's."
+    return sentence
+
+
+def force_words(total: Scores) -> str:
+    """What the force error means beside the mean force of the training split."""
+    own, mean = total.force.overall_nrmse, total.mean_force.overall_nrmse
+    if math.isnan(own) or math.isnan(mean):
+        return "How well it predicts the force cannot be said: there was none in these runs."
+    ratio = own / mean if mean > 0.0 else math.inf
+    if ratio < 0.5:
+        verdict = "clearly better than"
+    elif ratio < 0.9:
+        verdict = "better than"
+    elif ratio < 1.0:
+        verdict = "hardly better than"
+    else:
+        verdict = "no better than"
+    return (
+        f"Its force is off by {100 * own:.0f} % of the force's RMS size, {verdict} always answering the "
+        f"training runs' mean force ({100 * mean:.0f} %)."
+    )
+
+
+def time_words(evaluation: Evaluation) -> str:
+    """How fast the network is beside the solver."""
+    own, solver = evaluation.timing.stepping, evaluation.total.solver_rate
+    sentence = f"One simulated second takes the network {number(own, 2)} s on one thread"
+    if math.isnan(solver) or solver <= 0.0:
+        return sentence + "; the solver's time is not recorded."
+    ratio = solver / own
+    compared = f"{number(ratio, 2)} times less" if ratio >= 1.0 else f"{number(1.0 / ratio, 2)} times more"
+    return f"{sentence}, {compared} than the solver's {number(solver, 2)} s."
+
+
+def summary(evaluation: Evaluation) -> str:
+    """The result in one paragraph of plain words."""
+    count = len(evaluation.runs)
+    seen = {
+        "train": "on which it was trained, so this is no test",
+        "validation": "that it was not trained on, but that chose its checkpoint",
+        "test": "that it never saw",
+    }.get(evaluation.split, "of this split")
+    return (
+        "A graph network learned the soil's motion and the force on the tool from material point "
+        f"simulations, in a subspace of {evaluation.num_modes} modes instead of "
+        f"{evaluation.particle_count} particles. It was given the tool's path and the first "
+        f"{evaluation.history} frames of {count} run{'s' if count != 1 else ''} {seen}, and predicted the "
+        f"rest. {soil_words(evaluation.total)} {force_words(evaluation.total)} {time_words(evaluation)}"
+    )
+
+
+# --- what the columns of the tables mean ------------------------------------------------------------------
+
+
+def soil_note(evaluation: Evaluation) -> str:
+    """Under the table of position errors."""
+    return (
+        f"Root-mean-square errors per axis over all frames after the first {evaluation.history}, which the "
+        "network was given. Total: prediction against truth. Network: the part of it within the subspace. "
+        "Reduction: what the subspace leaves out. Frozen: nothing moves after the given frames. Constant "
+        "velocity: every particle goes on at its last given speed. Skill: 1 − squared error / squared "
+        "error of the baseline, for all runs of the sums over runs. Surface: height of the highest "
+        "particle of every column of the bed."
+    )
+
+
+def force_note(evaluation: Evaluation) -> str:
+    """Under the table of force errors."""
+    x, y, z = (fixed(float(value), 1) for value in evaluation.mean_force)
+    draft, vertical = (fixed(evaluation.total.absolute_mpe[name], 1) for name in ("draft", "vertical"))
+    return (
+        "Force by the soil on the tool, mean over a frame; draft is −Fx, vertical Fz. MAE: mean absolute "
+        "error. NRMSE: RMS error / RMS of the truth, of the whole vector where no component is named. "
+        "MPE: difference of the means in percent, signed, so that errors cancel; the mean of |MPE| over "
+        f"runs, where they do not, is {draft} % for the draft and {vertical} % for the vertical force. – "
+        "stands where the truth is negligible beside the whole force, as it is for a component that "
+        f"symmetry makes zero. Mean force: always answering the mean of the training runs, ({x}, {y}, {z}) "
+        "N. Torque is about the tool's centre of mass."
+    )
+
+
+def time_note(evaluation: Evaluation) -> str:
+    """Under the table of times."""
+    return (
+        f"Network: median of {evaluation.timing.repeats} warm repeats on one thread along run "
+        f"{evaluation.timing.run}; nothing is written to disk. Solver: what its run files say, on the "
+        "machine that made them."
+    )

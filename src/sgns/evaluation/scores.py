@@ -1,0 +1,194 @@
+"""All metrics of one predicted run, or of several together, as one row of a table."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sgns.evaluation.metrics import FORCE_COMPONENTS, TORQUE_COMPONENTS, PositionErrors, VectorErrors, skill
+
+__all__ = ["Scores", "aggregate", "run_scores", "write_csv", "write_json"]
+
+POSITION_ERRORS = ("reduction", "network", "total", "frozen", "constant_velocity")
+SURFACE_ERRORS = ("surface", "surface_frozen")
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Errors of a prediction and of the baselines.
+
+    Attributes:
+        name: of the run, or of the group of runs.
+        frames: number of frames that count (the history does not).
+        mse: mean-square errors [m²] by the names of `PositionErrors`.
+        force: errors of the force [N].
+        torque: errors of the torque about the centre of mass [N m].
+        mean_force: errors of the mean force of the training split [N].
+        mean_torque: errors of the mean torque of the training split [N m].
+        solver_rate: wall seconds per simulated second of the solver; NaN if not recorded.
+        absolute_mpe: mean over runs of |MPE| [%] by component of the force.
+    """
+
+    name: str
+    frames: int
+    mse: Mapping[str, float]
+    force: VectorErrors
+    torque: VectorErrors
+    mean_force: VectorErrors
+    mean_torque: VectorErrors
+    solver_rate: float
+    absolute_mpe: Mapping[str, float]
+
+    def rmse_mm(self, name: str) -> float:
+        """Root of a mean-square error [mm]."""
+        return 1e3 * math.sqrt(self.mse[name]) if self.mse[name] >= 0.0 else math.nan
+
+    def skill(self, baseline: str = "frozen", error: str = "total") -> float:
+        """1 − MSE / MSE of a baseline; for several runs 1 − Σ MSE / Σ MSE of the baseline."""
+        return skill([self.mse[error]], [self.mse[baseline]])
+
+    def row(self) -> dict[str, Any]:
+        """Everything as plain numbers by column name; the unit is the end of the name."""
+        row: dict[str, Any] = {"run": self.name, "frames": self.frames}
+        row |= {f"mse_{name}_m2": self.mse[name] for name in POSITION_ERRORS}
+        row |= {f"rmse_{name}_mm": self.rmse_mm(name) for name in POSITION_ERRORS}
+        row |= {
+            "skill_frozen": self.skill("frozen"),
+            "skill_constant_velocity": self.skill("constant_velocity"),
+        }
+        row |= {f"{name}_rmse_mm": self.rmse_mm(name) for name in SURFACE_ERRORS}
+        for prefix, errors in (("", self.force), ("mean_force_", self.mean_force)):
+            row |= columns(errors, FORCE_COMPONENTS, prefix, "force", "N")
+        row |= {f"{name}_abs_mpe_percent": value for name, value in self.absolute_mpe.items()}
+        for prefix, errors in (("", self.torque), ("mean_torque_", self.mean_torque)):
+            row |= columns(errors, TORQUE_COMPONENTS, prefix, "torque", "Nm")
+        row["solver_wall_s_per_s"] = self.solver_rate
+        return row
+
+
+def columns(
+    errors: VectorErrors, components: Mapping[str, int], prefix: str, vector: str, unit: str
+) -> dict[str, float]:
+    """MAE, NRMSE and MPE of every component and the NRMSE of the whole vector."""
+    values: dict[str, float] = {}
+    for name, axis in components.items():
+        values[f"{prefix}{name}_mae_{unit}"] = float(errors.mae[axis])
+        values[f"{prefix}{name}_nrmse"] = float(errors.nrmse[axis])
+        values[f"{prefix}{name}_mpe_percent"] = float(errors.mpe[axis])
+    values[f"{prefix}{vector}_nrmse" if not prefix else f"{prefix}nrmse"] = errors.overall_nrmse
+    return values
+
+
+def run_scores(
+    name: str,
+    positions: PositionErrors,
+    truth: Any,
+    prediction: Any,
+    history: int,
+    mean_force: np.ndarray,
+    mean_torque: np.ndarray,
+) -> Scores:
+    """Scores of one run.
+
+    Args:
+        name: of the run.
+        positions: its position errors.
+        truth: the simulated `Run`.
+        prediction: the predicted `Run`.
+        history: frames at the start that count in no metric.
+        mean_force: mean force of the training split [N], shape (3,).
+        mean_torque: mean torque of the training split [N m], shape (3,).
+    """
+    force = VectorErrors.compare(truth.force[history:], prediction.force[history:])
+    simulated = float(truth.time[-1] - truth.time[0])
+    wall = truth.wall_time_s
+    return Scores(
+        name=name,
+        frames=len(positions.time),
+        mse={key: positions.mse(key) for key in POSITION_ERRORS + SURFACE_ERRORS},
+        force=force,
+        torque=VectorErrors.compare(truth.torque[history:], prediction.torque[history:]),
+        mean_force=VectorErrors.compare(truth.force[history:], mean_force),
+        mean_torque=VectorErrors.compare(truth.torque[history:], mean_torque),
+        solver_rate=float(wall) / simulated if wall else math.nan,
+        absolute_mpe={key: abs(float(force.mpe[axis])) for key, axis in FORCE_COMPONENTS.items()},
+    )
+
+
+def aggregate(runs: Sequence[Scores], name: str = "all runs") -> Scores:
+    """Scores of several runs together.
+
+    Position errors are means over runs, so that skill is 1 − Σ MSE / Σ MSE of the baseline; forces are pooled
+    over all frames; |MPE| and the solver's time are means over the runs that have them.
+    """
+    first = runs[0]
+
+    def pooled(field: str) -> VectorErrors:
+        return sum((getattr(run, field) for run in runs[1:]), start=getattr(first, field))
+
+    return Scores(
+        name=name,
+        frames=sum(run.frames for run in runs),
+        mse={key: float(np.mean([run.mse[key] for run in runs])) for key in first.mse},
+        force=pooled("force"),
+        torque=pooled("torque"),
+        mean_force=pooled("mean_force"),
+        mean_torque=pooled("mean_torque"),
+        solver_rate=mean_of_known([run.solver_rate for run in runs]),
+        absolute_mpe={
+            key: mean_of_known([run.absolute_mpe[key] for run in runs]) for key in first.absolute_mpe
+        },
+    )
+
+
+def mean_of_known(values: Sequence[float]) -> float:
+    """Mean of the values that are numbers; NaN if none is."""
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) / len(known) if known else math.nan
+
+
+def write_csv(path: Path, scores: Sequence[Scores]) -> None:
+    """One line per `Scores` under a line of column names; a metric without meaning is left empty."""
+    rows = [score.row() for score in scores]
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    with temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({key: "" if is_nan(value) else value for key, value in row.items()})
+    os.replace(temporary, path)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Nested plain values as JSON that every reader takes: numbers that are not finite become null."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(json.dumps(strict(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def strict(value: Any) -> Any:
+    """The value with every number that is not finite replaced by None."""
+    if isinstance(value, Mapping):
+        return {str(key): strict(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [strict(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return strict(value.tolist())
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value
+
+
+def is_nan(value: Any) -> bool:
+    """Whether a value is the number NaN."""
+    return isinstance(value, float) and math.isnan(value)

@@ -1,0 +1,1 @@
+"""The latent dynamics: graph, network, windows of training data, training and its validation."""

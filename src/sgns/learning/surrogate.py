@@ -1,0 +1,153 @@
+"""What a checkpoint holds: the latent dynamics with all that is needed to step a bed, and nothing to look up
+elsewhere.
+
+A checkpoint is Lightning's `.ckpt`, loaded with `weights_only`: tensors in its state dict (weights,
+normalisation, basis, common start, body points) and plain Python values, the card, as its hyperparameters.
+"""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from sgns.errors import UserError
+from sgns.learning.dynamics import LatentDynamics, ModelSettings
+from sgns.reduction.basis import Basis
+
+__all__ = ["Surrogate", "load_surrogate", "read_checkpoint"]
+
+_FORMAT = "sgns-surrogate"
+_FORMAT_VERSION = 1
+_PREFIX = "surrogate."
+# Whatever the bytes are, reading them as a checkpoint may fail in any of these ways.
+_UNREADABLE = (
+    pickle.UnpicklingError,
+    RuntimeError,
+    EOFError,
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    IndexError,
+    ImportError,
+)
+
+
+class Surrogate(nn.Module):
+    """Latent dynamics, the basis they live in, and where they start.
+
+    Args:
+        dynamics: The network with its statistics.
+        basis: Modes of the soil; as many as the dynamics has.
+        start_positions: Common start of the soil at rest [m], shape (n, 3).
+        body_points: Body points in the body frame [m], shape (M, 3).
+        card: Plain values: frame_rate [Hz], scene, and any provenance.
+    """
+
+    basis_mean: Tensor
+    basis_modes: Tensor
+    basis_eigenvalues: Tensor
+    start_positions: Tensor
+    body_points: Tensor
+
+    def __init__(
+        self,
+        dynamics: LatentDynamics,
+        basis: Basis,
+        start_positions: Tensor,
+        body_points: Tensor,
+        card: dict[str, Any],
+    ) -> None:
+        super().__init__()
+        if basis.num_modes != dynamics.num_modes:
+            raise UserError(
+                f"the basis has {basis.num_modes} modes and the network {dynamics.num_modes}; they must agree"
+            )
+        self.dynamics = dynamics
+        self.basis = basis
+        state = basis.state()
+        for name in ("mean", "modes", "eigenvalues"):
+            self.register_buffer(f"basis_{name}", state.pop(name))
+        self.register_buffer("start_positions", start_positions.double())
+        self.register_buffer("body_points", body_points.double())
+        self.card = dict(card) | {
+            "format": _FORMAT,
+            "format_version": _FORMAT_VERSION,
+            "model": dynamics.settings.to_dict(),
+            "num_modes": dynamics.num_modes,
+            "basis": state,
+        }
+
+    @property
+    def frame_rate(self) -> float:
+        """Steps per second [Hz]."""
+        return float(self.card["frame_rate"])
+
+    @property
+    def start_latent(self) -> Tensor:
+        """The common start in the basis [m], shape (r, 3), float64."""
+        return self.basis.transform(self.start_positions.cpu())
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """A checkpoint's content, with its card under "hyper_parameters".
+
+    Raises:
+        UserError: Missing, truncated, or not a checkpoint of this project, or of a newer one.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(
+            f"no checkpoint at {path}; train one with: sgns train output=<folder>, then use "
+            "<folder>/best.ckpt"
+        )
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except _UNREADABLE as error:
+        raise UserError(
+            f"{path} cannot be read as a checkpoint; it is truncated or something else; train again"
+        ) from error
+    card = content.get("hyper_parameters") if isinstance(content, dict) else None
+    if not isinstance(card, dict) or card.get("format") != _FORMAT or "state_dict" not in content:
+        raise UserError(
+            f"{path} is not a checkpoint of sgns; use best.ckpt or last.ckpt of an output of sgns train"
+        )
+    if int(card.get("format_version", 0)) > _FORMAT_VERSION:
+        raise UserError(
+            f"{path} has format {card['format_version']}, newer than this program reads "
+            f"({_FORMAT_VERSION}); update sgns"
+        )
+    return content
+
+
+def load_surrogate(path: str | Path) -> Surrogate:
+    """The surrogate in a checkpoint, on the CPU.
+
+    Raises:
+        UserError: As `read_checkpoint`, or its parts do not fit together.
+    """
+    content = read_checkpoint(path)
+    card = content["hyper_parameters"]
+    state = {
+        key.removeprefix(_PREFIX): value
+        for key, value in content["state_dict"].items()
+        if key.startswith(_PREFIX)
+    }
+    try:
+        tensors = {name: state[f"basis_{name}"] for name in ("mean", "modes", "eigenvalues")}
+        basis = Basis.from_state(card["basis"] | tensors, where=str(path))
+        dynamics = LatentDynamics(ModelSettings(**card["model"]), int(card["num_modes"]))
+        surrogate = Surrogate(dynamics, basis, state["start_positions"], state["body_points"], card)
+        surrogate.load_state_dict(state)
+        surrogate.frame_rate  # noqa: B018  (present and a number)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(
+            f"{path} is a checkpoint whose parts do not fit together ({reason}); train again"
+        ) from error
+    return surrogate.eval().requires_grad_(False)

@@ -1,0 +1,294 @@
+"""`sgns train`: fit the latent dynamics to a dataset's reduced runs.
+
+`output` holds `best.ckpt` (highest validation skill), `last.ckpt` (to go on from), `tensorboard/` and, once
+complete, `training.json`. The same command with the same `output` goes on where it stopped, or answers from
+what is there.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lightning as L
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from omegaconf import OmegaConf
+
+import sgns
+from sgns.errors import UserError
+from sgns.learning.body import in_body_frame
+from sgns.learning.data import TrainingWindows, WindowDataModule, fit_normalisation
+from sgns.learning.dynamics import LatentDynamics, ModelSettings
+from sgns.learning.monitoring import RolloutValidation, StepProgress, flattened
+from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint
+from sgns.learning.trainee import SurrogateTraining, TrainingSettings
+from sgns.learning.validation import ValidationRollouts
+from sgns.reduction.reduced import ReducedDataset, reduce_dataset
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+__all__ = ["main", "train"]
+
+log = logging.getLogger(__name__)
+
+# Settings that change speed or reporting, not the result.
+_NO_MATTER = ("threads", "log_every", "resume")
+
+
+def main(cfg: DictConfig) -> float:
+    """The `sgns train` command; returns the rollout skill on the validation runs."""
+    from sgns.campaign import Dataset
+
+    reduced = reduce_dataset(Dataset.open(cfg.dataset.path), cfg.reduction)
+    plain = OmegaConf.to_container(cfg, resolve=True)
+    preset = plain.get("preset") or {}
+    return train(
+        reduced,
+        num_modes=int(cfg.reduction.num_modes),
+        model=plain["model"],
+        training=plain["training"],
+        output=Path(cfg.output),
+        seed=int(cfg.seed),
+        device=str(cfg.get("device") or "cpu"),
+        start_from=cfg.get("checkpoint"),
+        provenance={
+            "preset": str(preset.get("name", "default")),
+            "dataset": str(plain["dataset"].get("name", "")),
+        },
+    )
+
+
+def train(
+    reduced: ReducedDataset,
+    *,
+    num_modes: int,
+    model: Mapping[str, Any],
+    training: Mapping[str, Any],
+    output: Path,
+    seed: int = 0,
+    device: str = "cpu",
+    start_from: str | Path | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> float:
+    """Train, or go on training, or take what is complete.
+
+    Args:
+        reduced: The dataset in its basis.
+        num_modes: r, modes used of the basis.
+        model: Values of `conf/model`.
+        training: Values of `conf/training`.
+        output: Folder for checkpoints and logs.
+        seed: Of weights, noise and order.
+        device: "cpu" or "cuda".
+        start_from: Checkpoint whose weights and normalisation to start from.
+        provenance: More plain values for the checkpoint.
+
+    Returns:
+        Skill of the best checkpoint's rollouts on the validation runs.
+
+    Raises:
+        UserError: Bad settings, a loss that is not finite, or an `output` of another training.
+    """
+    settings = TrainingSettings.from_dict(training)
+    model_settings = ModelSettings(**dict(model))
+    if settings.threads is not None:
+        torch.set_num_threads(settings.threads)
+    validation_runs = reduced.runs("validation")
+    if not validation_runs:
+        log.warning("the validation split is empty; the checkpoint is chosen by rollouts of training runs")
+        validation_runs = reduced.runs("train")[:4]
+    card = {
+        "settings": {
+            "num_modes": num_modes,
+            "model": model_settings.to_dict(),
+            "training": {k: v for k, v in settings.to_dict().items() if k not in _NO_MATTER},
+            "seed": seed,
+            "basis": reduced.folder.name,
+            "validation_runs": [run.name for run in validation_runs],
+            "start_from": None if start_from is None else str(start_from),
+            **(provenance or {}),
+        },
+        "frame_rate": float(reduced.frame_rate),
+        "scene": reduced.runs("train")[0].scene,
+        "package_version": sgns.__version__,
+    }
+    resumed = what_is_there(output, card["settings"], settings.resume)
+    if resumed == "complete":
+        summary = json.loads((output / "training.json").read_text())
+        log.info(
+            "%s is complete: %d steps, validation skill %.3f", output, summary["steps"], summary["skill"]
+        )
+        return float(summary["skill"])
+
+    torch.manual_seed(seed)
+    surrogate, data, noise_scale = prepared(
+        reduced, num_modes, model_settings, settings, seed, card, start_from
+    )
+    rollouts = ValidationRollouts(
+        validation_runs, num_modes, model_settings.history, model_settings.body_nodes
+    )
+    watch = RolloutValidation(rollouts, output, settings)
+    trainer = make_trainer(output, settings, device, [watch, StepProgress(settings.max_steps)])
+    began = time.perf_counter()
+    fit(
+        trainer,
+        SurrogateTraining(surrogate, settings, noise_scale),
+        data,
+        output / "last.ckpt" if resumed else None,
+    )
+    seconds = time.perf_counter() - began
+
+    score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
+    metrics = {"skill": score.skill, "skill_at_rest": score.skill_at_rest, "force_nrmse": score.force_nrmse}
+    trainer.logger.log_hyperparams(
+        flattened(card["settings"]), {f"final/{key}": value for key, value in metrics.items()}
+    )
+    trainer.logger.finalize("success")
+    summary = {"steps": settings.max_steps, **metrics, "seconds": round(seconds, 1)}
+    write_whole(output / "training.json", json.dumps(summary, indent=2) + "\n")
+    log.info(
+        "trained %d steps in %.0f s; best checkpoint on %d validation runs: skill %.3f (from "
+        "rest %.3f), force NRMSE %.3f; %s",
+        settings.max_steps,
+        seconds,
+        len(validation_runs),
+        score.skill,
+        score.skill_at_rest,
+        score.force_nrmse,
+        output / "best.ckpt",
+    )
+    return score.skill
+
+
+def prepared(
+    reduced: ReducedDataset,
+    num_modes: int,
+    model: ModelSettings,
+    settings: TrainingSettings,
+    seed: int,
+    card: dict[str, Any],
+    start_from: str | Path | None,
+) -> tuple[Surrogate, WindowDataModule, torch.Tensor]:
+    """The untrained surrogate with its statistics, its data, and the noise deviation [m], shape (r, 3)."""
+    runs = reduced.runs("train")
+    windows = TrainingWindows(runs, num_modes, model.history, model.body_nodes, seed)
+    dynamics = LatentDynamics(model, num_modes)
+    noise_scale = fit_normalisation(dynamics, windows, settings.noise, settings.normalisation_floor)
+    if start_from is not None:
+        given = load_surrogate(start_from)
+        if given.dynamics.settings != model or given.basis.arrangement_hash != reduced.arrangement_hash:
+            raise UserError(
+                f"{start_from} has another model or another bed; use the same model.* and "
+                "dataset, or checkpoint=null"
+            )
+        if not torch.equal(given.basis.modes, reduced.basis.modes[:, :num_modes]):
+            raise UserError(
+                f"{start_from} belongs to another basis; use the dataset it was trained on, or "
+                "checkpoint=null"
+            )
+        dynamics = given.dynamics.requires_grad_(True).train()
+    points = torch.as_tensor(in_body_frame(runs[0].pose[0], runs[0].body_points[0]))
+    surrogate = Surrogate(
+        dynamics, reduced.basis.sliced(num_modes), torch.as_tensor(reduced.start_positions), points, card
+    )
+    return surrogate, WindowDataModule(windows, settings.batch_size, noise_scale), noise_scale
+
+
+def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> str:
+    """ "" (nothing), "partial" or "complete"; with resume=false what is there is removed.
+
+    Raises:
+        UserError: A training with other settings is there.
+    """
+    names = ("best.ckpt", "last.ckpt", "training.json")
+    if resume is False:
+        for name in names:
+            (output / name).unlink(missing_ok=True)
+        shutil.rmtree(output / "tensorboard", ignore_errors=True)
+        return ""
+    if not (output / "last.ckpt").exists():
+        return ""
+    there = read_checkpoint(output / "last.ckpt")["hyper_parameters"].get("settings", {})
+    a, b = flattened(there), flattened(asked)
+    different = [key for key in a | b if a.get(key) != b.get(key)]
+    if different:
+        key = different[0]
+        raise UserError(
+            f"{output} holds a training with other settings: {key} is {a.get(key)!r} there and "
+            f"{b.get(key)!r} here"
+            f"{f' (and {len(different) - 1} more)' if len(different) > 1 else ''}; "
+            "use another output, or training.resume=false to overwrite it"
+        )
+    complete = all((output / name).exists() for name in names)
+    return "complete" if complete else "partial"
+
+
+def make_trainer(
+    output: Path, settings: TrainingSettings, device: str, callbacks: list[L.Callback]
+) -> L.Trainer:
+    """Lightning's trainer: by steps, one device, no validation loop of its own (see `RolloutValidation`)."""
+    if device not in ("cpu", "cuda"):
+        raise UserError(f"device is {device!r}; allowed: cpu, cuda")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device is cuda but torch finds no CUDA device; use device=cpu")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"cannot make the folder {output}: {error.strerror}; choose another output"
+        ) from error
+    return L.Trainer(
+        accelerator="gpu" if device == "cuda" else "cpu",
+        devices=1,
+        max_steps=settings.max_steps,
+        max_epochs=-1,
+        logger=TensorBoardLogger(output, name="", version="tensorboard", default_hp_metric=False),
+        callbacks=callbacks,
+        log_every_n_steps=settings.log_every,
+        gradient_clip_val=settings.gradient_clip,
+        num_sanity_val_steps=0,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+
+
+def fit(
+    trainer: L.Trainer, module: L.LightningModule, data: L.LightningDataModule, last: Path | None
+) -> None:
+    """Run the trainer; an interruption stays one."""
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    handler = signal.getsignal(signal.SIGINT) if in_main_thread else None
+    with warnings.catch_warnings():
+        # Everything is in memory: there is nothing for worker processes to do.
+        warnings.filterwarnings("ignore", ".*does not have many workers.*")
+        warnings.filterwarnings("ignore", ".*GPU available but not used.*")
+        # Lightning's own use of torch, not ours.
+        warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.*")
+        path = None if last is None else str(last)
+        try:
+            trainer.fit(module, datamodule=data, ckpt_path=path, weights_only=True)
+        except SystemExit as error:
+            # Lightning turns Ctrl-C into an exit of its own.
+            raise KeyboardInterrupt from error
+        finally:
+            if in_main_thread and handler is not None:
+                signal.signal(signal.SIGINT, handler)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a small file that is complete or absent."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary.write_text(text)
+    os.replace(temporary, path)

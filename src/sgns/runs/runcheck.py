@@ -1,0 +1,218 @@
+"""Checking a run file: every problem, in words.
+
+Letters: T frames, n soil particles, M body points.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+
+import h5py
+import numpy as np
+
+from sgns.errors import UserError
+from sgns.runs.runlayout import (
+    ELEMENTS,
+    PRODUCERS,
+    one_line,
+    open_run,
+    parse_yaml,
+    read_attributes,
+    structure_problems,
+)
+from sgns.runs.runwriter import ContentHash
+from sgns.runs.vtkhdf import view_problems
+
+__all__ = ["check_run"]
+
+RIGID_TOLERANCE = 1e-4
+"""How far a body point may be from where the pose puts it [m]."""
+QUATERNION_TOLERANCE = 1e-5
+"""How far a quaternion's length may be from 1."""
+INTERVAL_TOLERANCE = 1e-2
+"""How far the time between frames may be from 1 / frame_rate, as a share of it."""
+
+_BROKEN = (OSError, RuntimeError, KeyError, ValueError, TypeError)  # what h5py raises on damaged files
+
+
+def check_run(path: str | os.PathLike[str]) -> list[str]:
+    """Everything that is wrong with a run file, in words; an empty list means it is good.
+
+    Reads every dataset, a frame of soil at a time.
+    """
+    try:
+        file = open_run(path)
+    except UserError as error:
+        return [str(error)]
+    with file, np.errstate(all="ignore"):  # damaged numbers may be huge
+        try:
+            problems = structure_problems(file)
+        except _BROKEN as error:
+            return [f"the file is damaged ({one_line(error)})"]
+        checks = [_check_h5md, _check_attributes]
+        if not problems:  # the rest relies on complete datasets of the right shapes
+            checks += [_check_times, _check_body, _check_view, _check_frames]
+        for check in checks:
+            try:
+                problems += check(file)
+            except _BROKEN as error:
+                problems.append(f"the file is damaged ({one_line(error)})")
+    return problems
+
+
+def _check_h5md(file: h5py.File) -> list[str]:
+    problems = []
+    h5md = file.get("h5md")
+    if not isinstance(h5md, h5py.Group):
+        return ["group /h5md is missing"]
+    if tuple(np.atleast_1d(h5md.attrs.get("version", ()))) != (1, 1):
+        problems.append("attribute version of /h5md is not (1, 1)")
+    for group, key in (("author", "name"), ("creator", "name"), ("creator", "version")):
+        if group not in h5md or key not in h5md[group].attrs:
+            problems.append(f"attribute {key} of /h5md/{group} is missing")
+    for group in ("soil", "body"):
+        box = file.get(f"particles/{group}/box")
+        if box is None or "dimension" not in box.attrs or "boundary" not in box.attrs:
+            problems.append(f"group /particles/{group}/box with dimension and boundary is missing")
+    return problems
+
+
+def _check_attributes(file: h5py.File) -> list[str]:
+    problems = []
+    values = read_attributes(file)
+    for name in ("scene", "effects", "extra"):
+        text = values.get(name)
+        if not isinstance(text, str):
+            continue  # reported with the structure
+        try:
+            data = parse_yaml(text)
+        except ValueError as error:
+            problems.append(f"root attribute {name!r} is not YAML ({one_line(error)})")
+            continue
+        if not isinstance(data, dict):
+            problems.append(f"root attribute {name!r} is not a group of keys")
+        elif name == "effects":
+            problems += [
+                f"effect {key!r} does not say whether it is on and why"
+                for key, effect in data.items()
+                if not _says_why(effect)
+            ]
+    producer = values.get("producer")
+    if isinstance(producer, str) and producer not in PRODUCERS:
+        problems.append(f"producer is {producer!r}; allowed: {', '.join(PRODUCERS)}")
+    frame_rate = values.get("frame_rate")
+    if isinstance(frame_rate, float) and not (math.isfinite(frame_rate) and frame_rate > 0):
+        problems.append(f"frame_rate is {frame_rate}; it must be above 0 Hz")
+    wall_time = values.get("wall_time_s")
+    if isinstance(wall_time, float) and not (math.isfinite(wall_time) and wall_time >= 0):
+        problems.append(f"wall_time_s is {wall_time}; it must be 0 s or more")
+    return problems
+
+
+def _says_why(effect: object) -> bool:
+    return isinstance(effect, dict) and isinstance(effect.get("on"), bool) and bool(effect.get("reason"))
+
+
+def _check_times(file: h5py.File) -> list[str]:
+    problems = []
+    time = file[f"{ELEMENTS['position'].path}/time"][...]
+    step = file[f"{ELEMENTS['position'].path}/step"][...]
+    for element in ELEMENTS.values():
+        for part, expected in (("time", time), ("step", step)):
+            if not np.array_equal(file[f"{element.path}/{part}"][...], expected, equal_nan=part == "time"):
+                problems.append(f"dataset /{element.path}/{part} differs from that of the soil positions")
+    if not np.isfinite(time).all():
+        return [*problems, f"time is not finite at frame {np.flatnonzero(~np.isfinite(time))[0]}"]
+    if not (np.diff(step) > 0).all():
+        problems.append(f"step does not increase at frame {np.flatnonzero(np.diff(step) <= 0)[0] + 1}")
+    interval = np.diff(time)
+    if not (interval > 0).all():
+        return [*problems, f"time does not increase at frame {np.flatnonzero(interval <= 0)[0] + 1}"]
+    wrong = ~(np.abs(interval * float(file.attrs["frame_rate"]) - 1.0) <= INTERVAL_TOLERANCE)
+    if wrong.any():
+        frame = np.flatnonzero(wrong)[0] + 1
+        problems.append(
+            f"time before frame {frame} advances by {interval[frame - 1]:.6g} s, "
+            f"not by 1 / frame_rate = {1.0 / float(file.attrs['frame_rate']):.6g} s"
+        )
+    return problems
+
+
+def _check_body(file: h5py.File) -> list[str]:
+    problems = []
+    data = {
+        name: file[f"{ELEMENTS[name].path}/value"][...].astype(float)
+        for name in ("pose", "force", "torque", "body_points")
+    }
+    for name, values in data.items():
+        frame = _first(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
+        if frame is not None:
+            problems.append(f"{name} is not finite at frame {frame}")
+    if problems:
+        return problems
+    pose, points = data["pose"], data["body_points"]
+    length = np.linalg.norm(pose[:, 3:], axis=1)
+    frame = _first(~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE))
+    if frame is not None:
+        return [f"the quaternion of frame {frame} has length {length[frame]:.6g}, not 1"]
+    rotation = _matrices(pose[:, 3:])  # (T, 3, 3)
+    body_frame = (points - pose[:, None, :3]) @ rotation  # rows times R = R^T applied to each point
+    error = np.linalg.norm(body_frame - body_frame[:1], axis=2)
+    frame = _first(~(error <= RIGID_TOLERANCE).all(axis=1))
+    if frame is not None:
+        point = int(error[frame].argmax())
+        problems.append(
+            f"body point {point} of frame {frame} is {error[frame, point]:.3g} m from where the pose puts it "
+            f"(allowed {RIGID_TOLERANCE:g} m)"
+        )
+    return problems
+
+
+def _check_view(file: h5py.File) -> list[str]:
+    frames, particles, _ = file[f"{ELEMENTS['position'].path}/value"].shape
+    return view_problems(file, frames, particles)
+
+
+def _check_frames(file: h5py.File) -> list[str]:
+    """Finite soil, the same numbers through /VTKHDF, and the content hash; memory for a frame only."""
+    values = {name: file[f"{element.path}/value"] for name, element in ELEMENTS.items()}
+    small = {name: values[name][...] for name in values if name not in ("position", "velocity")}
+    small["time"] = file[f"{ELEMENTS['position'].path}/time"][...]
+    views = {"position": file.get("VTKHDF/Points"), "velocity": file.get("VTKHDF/PointData/velocity")}
+    frames, particles, _ = values["position"].shape
+    found: dict[str, str] = {}  # the first problem of each kind
+    content = ContentHash()
+    for frame in range(frames):
+        arrays = {name: series[frame] for name, series in small.items()}
+        for name, view in views.items():
+            arrays[name] = soil = values[name][frame]
+            finite = np.isfinite(soil).all(axis=1)
+            if not finite.all():
+                found.setdefault(
+                    f"{name} finite", f"{name} of particle {_first(~finite)} is not finite at frame {frame}"
+                )
+            if isinstance(view, h5py.Dataset) and view.shape == (frames * particles, 3):
+                seen = view[frame * particles : (frame + 1) * particles]
+                if not np.array_equal(seen, soil, equal_nan=True):
+                    found.setdefault(f"{name} view", f"/VTKHDF shows another {name} at frame {frame}")
+        content.update(arrays)
+    if content.hexdigest() != read_attributes(file)["content_hash"]:
+        found["hash"] = "the data do not match content_hash: they were changed or damaged after the run"
+    return list(found.values())
+
+
+def _first(wrong: np.ndarray) -> int | None:
+    """Index of the first True, or None."""
+    return int(np.argmax(wrong)) if wrong.any() else None
+
+
+def _matrices(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation matrices (T, 3, 3), body to world, of unit quaternions x y z w (T, 4)."""
+    x, y, z, w = quaternion.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)

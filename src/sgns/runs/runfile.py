@@ -1,0 +1,209 @@
+"""Reading a run, whether the solver or a network made it.
+
+Letters: T frames, n soil particles, M body points.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sgns.errors import UserError
+from sgns.runs.runcheck import check_run
+from sgns.runs.runlayout import ELEMENTS, one_line, open_run, parse_yaml, read_attributes, structure_problems
+from sgns.runs.runwriter import RunWriter
+
+__all__ = ["Run", "RunWriter", "check_run"]
+
+
+class Run:
+    """A run file, open for reading; soil is read only when asked for.
+
+    Opening reads attributes and shapes only. Close it, or use it as a context manager.
+
+    Args:
+        path: the .h5 file.
+
+    Raises:
+        UserError: the file is missing, cut short, incomplete, written by something else or by a newer sgns.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._file: h5py.File = open_run(self.path)
+        self._cache: dict[str, Any] = {}
+        try:
+            try:
+                problems = structure_problems(self._file)
+                self._attributes = read_attributes(self._file) if not problems else {}
+            except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+                problems = [one_line(error)]
+            if problems:
+                more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
+                raise UserError(
+                    f"{self.path} is not a complete run: {problems[0]}{more}; "
+                    f"`sgns check {self.path}` lists everything; repeat the run"
+                )
+            self.frame_count, self.particle_count, _ = self._dataset("position").shape
+            """T and n."""
+            self.body_point_count: int = self._dataset("body_points").shape[1]
+            """M."""
+        except BaseException:
+            self._file.close()
+            raise
+
+    # --- where it comes from ------------------------------------------------------------------------------
+
+    @property
+    def scene(self) -> dict[str, Any]:
+        """The complete scene as plain nested data."""
+        return self._yaml("scene")
+
+    @property
+    def effects(self) -> dict[str, dict[str, Any]]:
+        """Physics that was on or off: {name: {"on": bool, "reason": str}}."""
+        return self._yaml("effects")
+
+    @property
+    def extra(self) -> dict[str, Any]:
+        """More provenance, given by who wrote the run."""
+        return self._yaml("extra")
+
+    @property
+    def producer(self) -> str:
+        """Who made the run: "mpm" or "rollout"."""
+        return self._attributes["producer"]
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return int(self._attributes["seed"])
+
+    @property
+    def frame_rate(self) -> float:
+        """Frames per second [Hz]."""
+        return float(self._attributes["frame_rate"])
+
+    @property
+    def wall_time_s(self) -> float:
+        """Time it took to compute the run [s]."""
+        return float(self._attributes["wall_time_s"])
+
+    @property
+    def arrangement_hash(self) -> str:
+        """Identifies the initial particle arrangement; the same in every run of a dataset."""
+        return self._attributes["arrangement_hash"]
+
+    @property
+    def content_hash(self) -> str:
+        """Identifies the recorded numbers, 32 hexadecimal digits."""
+        return self._attributes["content_hash"]
+
+    @property
+    def package_version(self) -> str:
+        """Version of sgns that wrote the file."""
+        return self._attributes["package_version"]
+
+    # --- what was recorded --------------------------------------------------------------------------------
+
+    @property
+    def time(self) -> np.ndarray:
+        """Times of the frames [s], shape (T,), float64."""
+        return self._series("position", "time")
+
+    @property
+    def pose(self) -> np.ndarray:
+        """Body: centre of mass [m] and unit quaternion x y z w, body to world, shape (T, 7), float64."""
+        return self._series("pose")
+
+    @property
+    def force(self) -> np.ndarray:
+        """By the soil on the body [N], world frame, mean over the frame, shape (T, 3), float64."""
+        return self._series("force")
+
+    @property
+    def torque(self) -> np.ndarray:
+        """By the soil on the body about its centre of mass [N m], world frame, shape (T, 3), float64."""
+        return self._series("torque")
+
+    @property
+    def body_points(self) -> np.ndarray:
+        """Points fixed to the body [m], world frame, shape (T, M, 3), float64."""
+        return self._series("body_points")
+
+    def positions(self, frames: slice | int | list[int] | np.ndarray = slice(None)) -> np.ndarray:
+        """Soil particles [m] in the chosen frames, shape (t, n, 3), float32; one frame gives t = 1."""
+        return self._frames("position", frames)
+
+    def velocities(self, frames: slice | int | list[int] | np.ndarray = slice(None)) -> np.ndarray:
+        """Velocities of the soil particles [m/s] in the chosen frames, shape (t, n, 3), float32."""
+        return self._frames("velocity", frames)
+
+    # --- the file -----------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Close the file; what was read stays valid."""
+        self._file.close()
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        size = f"{self.frame_count} frames, {self.particle_count} particles"
+        return f"Run({str(self.path)!r}: {self.producer}, {size})"
+
+    def _dataset(self, name: str, part: str = "value") -> h5py.Dataset:
+        if not self._file:
+            raise ValueError(f"{self.path} is closed")
+        return self._file[f"{ELEMENTS[name].path}/{part}"]
+
+    def _series(self, name: str, part: str = "value") -> np.ndarray:
+        """A small array as float64: read once, given out as a copy."""
+        if (name, part) not in self._cache:
+            try:
+                self._cache[name, part] = self._dataset(name, part)[...].astype(np.float64)
+            except (OSError, RuntimeError) as error:
+                raise self._damaged(name, error) from error
+        return self._cache[name, part].copy()
+
+    def _frames(self, name: str, frames: slice | int | list[int] | np.ndarray) -> np.ndarray:
+        index = np.atleast_1d(np.arange(self.frame_count)[frames])
+        dataset = self._dataset(name)
+        steps = np.diff(index)
+        out = np.empty((len(index), self.particle_count, 3), dtype=np.float32)
+        try:
+            if len(index) and (steps == 1).all():
+                dataset.read_direct(out, np.s_[index[0] : index[-1] + 1])
+            else:  # a frame is a chunk, so reading them one by one costs nothing extra
+                for row, frame in enumerate(index):
+                    dataset.read_direct(out, np.s_[frame], np.s_[row])
+        except (OSError, RuntimeError) as error:
+            raise self._damaged(name, error) from error
+        return out
+
+    def _yaml(self, name: str) -> dict[str, Any]:
+        if name not in self._cache:
+            try:
+                data = parse_yaml(self._attributes[name])
+            except ValueError as error:
+                raise self._damaged(name, error) from error
+            if not isinstance(data, dict):
+                raise self._damaged(name, "it is not a group of keys")
+            self._cache[name] = data
+        return copy.deepcopy(self._cache[name])
+
+    def _damaged(self, name: str, error: object) -> UserError:
+        return UserError(
+            f"{self.path}: {name} is damaged ({one_line(error)}); copy the file again or repeat the run"
+        )

@@ -1,0 +1,270 @@
+"""The command line as a person meets it: child processes in an empty folder."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import sysconfig
+import time
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+from hydra._internal.utils import get_args_parser
+
+from sgns import __version__
+from sgns.cli import COMMANDS
+from sgns.cli.command_help import groups_of, options_of
+
+# Runs `sgns train` with a training module that only holds the given body of `main(cfg)`.
+FAKE = """
+import sys, types, sgns.cli, sgns.errors
+module = types.ModuleType("sgns.learning.training")
+module.UserError = sgns.errors.UserError
+exec("def main(cfg):\\n    " + sys.argv.pop(1), module.__dict__)
+sys.modules["sgns.learning.training"] = module
+sys.exit(sgns.cli.main())
+"""
+
+
+def call(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run `sgns` with the arguments."""
+    return subprocess.run(
+        [sys.executable, "-m", "sgns", *arguments], capture_output=True, text=True, timeout=100
+    )
+
+
+def call_fake(body: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run `sgns train` with `body` in place of the training."""
+    command = [sys.executable, "-c", FAKE, body, "train", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=100)
+
+
+def assert_one_line(result: subprocess.CompletedProcess[str], *parts: str) -> None:
+    """Bad input: status 2 and one line on stderr with all the parts."""
+    assert result.returncode == 2, result.stderr
+    assert result.stderr.count("\n") == 1 and result.stderr.endswith("\n"), result.stderr
+    assert "Traceback" not in result.stderr
+    for part in parts:
+        assert part in result.stderr
+
+
+def test_the_console_script_runs_in_an_empty_folder(empty_folder: Path) -> None:
+    script = Path(sysconfig.get_path("scripts")) / "sgns"
+    if not script.exists():
+        pytest.skip("the package is not installed in this environment")
+    result = subprocess.run([script, "--version"], capture_output=True, text=True, timeout=100)
+    assert (result.returncode, result.stdout) == (0, f"sgns {__version__}\n")
+    assert not list(empty_folder.iterdir())
+
+
+def test_help_lists_every_command_quickly() -> None:
+    start = time.perf_counter()
+    result = call("--help")
+    assert time.perf_counter() - start < 5  # no torch, no warp: a fraction of a second on an idle machine
+    assert result.returncode == 0 and call().stdout == result.stdout
+    for name, command in COMMANDS.items():
+        assert f"  {name} " in result.stdout and command.summary in result.stdout
+
+
+def test_help_and_version_load_no_heavy_library() -> None:
+    code = "import sys, sgns.cli; sys.argv = ['sgns', '--help']; sgns.cli.main(); print(sorted(sys.modules))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    for name in ("torch", "warp", "lightning", "hydra", "h5py", "numpy"):
+        assert f"'{name}'" not in loaded
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_a_command(command: str, empty_folder: Path) -> None:
+    result = call(command, "--help")
+    assert result.returncode == 0
+    assert result.stdout.startswith(f"sgns {command}: ")
+    assert "Examples:" in result.stdout and "$" not in result.stdout
+    for group, default in groups_of(command).items():
+        if options_of(group):
+            assert f"  {group} " in result.stdout
+        if default is not None:
+            assert f"{default} (default)" in result.stdout
+    assert not list(empty_folder.iterdir())
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_settings_of_a_command(command: str) -> None:
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        cfg = compose(command, return_hydra_config=True)
+    keys = (
+        "scene material effects solver dataset reduction model training preset checkpoint output seed device"
+    )
+    own = {
+        "evaluate": {"split", "new_rollouts", "timing_repeats"},
+        "check": {"files"},
+    }
+    assert set(cfg) - {"hydra"} <= {*keys.split(), "experiment"} | own.get(command, set())
+    assert ("output" in cfg) == (COMMANDS[command].output is not None)
+    assert cfg.hydra.job.chdir is False
+    if command == "simulate":
+        assert cfg.dataset is None
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_of_every_group_composes(command: str) -> None:
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        for group in groups_of(command):
+            for option in options_of(group):
+                assert compose(command, [f"{group}={option}"])[group] is not None or group == "experiment"
+
+
+def test_settings_can_be_shown(empty_folder: Path) -> None:
+    result = call("train", "--cfg", "job")
+    assert result.returncode == 0 and not result.stderr
+    assert "num_modes:" in result.stdout and "\noutput: outputs/train/" in result.stdout
+    assert not list(empty_folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["foo"], ["unknown command 'foo'", *COMMANDS]),
+        (["-m", "train"], ["unknown command '-m'"]),
+        (["train", "foo=1"], ["foo: no such key", "keys: checkpoint, dataset, device"]),
+        (["train", "reduction.num_mode=3"], ["did you mean reduction.num_modes"]),
+        (["train", "num_modes=3"], ["did you mean reduction.num_modes"]),
+        (["train", "dataset=nope"], ["dataset=nope", "allowed:", "quick"]),
+        (["train", "scene=excavation"], ["no group 'scene'"]),
+        (["train", "reduction"], ["cannot read 'reduction'", "key=value"]),
+        (["train", "seed=[1"], ["cannot read 'seed=[1'", "quotes"]),
+        (["train", "seed=1,2"], ["add -m for a sweep"]),
+        (["train", "seed=range(1,3)"], ["add -m for a sweep"]),
+        (["train", "seed=${nope}"], ["Interpolation key 'nope' not found"]),
+        (["train", "~nope"], ["Could not delete"]),
+        (["train", "--nope"], ["unrecognized arguments: --nope"]),
+        (["train", "--cfg", "nope"], ["invalid choice: 'nope'", "job"]),
+        (["train", "--cfg", "job", "-m"], ["only one of"]),
+        (["train", "--config-name", "simulate"], ["--config-dir"]),
+        (["train", "--config-dir", "nope"], ["nope' not found"]),
+        (["rollout"], ["missing for checkpoint", "checkpoint=..."]),
+        (["evaluate"], ["missing for checkpoint", "checkpoint=..."]),
+        (["check"], ["missing for files", "sgns check run.h5"]),
+        (["check", "nope.h5"], ["nope.h5: no such file"]),
+    ],
+    ids=" ".join,
+)
+def test_bad_input_gives_one_line_and_leaves_nothing(
+    arguments: list[str], parts: list[str], empty_folder: Path
+) -> None:
+    assert_one_line(call(*arguments), *parts)
+    assert not list(empty_folder.iterdir())
+
+
+def test_a_command_says_what_is_wrong(empty_folder: Path) -> None:
+    result = call_fake("raise UserError('x.h5: not an HDF5 file;\\nwrite it again')")
+    assert_one_line(result, "sgns train: x.h5: not an HDF5 file; write it again\n")
+    assert not list(empty_folder.iterdir())
+
+
+@pytest.mark.parametrize("name", ["SceneError", "SolverStopped"])
+def test_the_solver_says_what_is_wrong(name: str, empty_folder: Path) -> None:
+    assert_one_line(
+        call_fake(f"import mpm_warp; raise mpm_warp.{name}('depth: too deep')"), "depth: too deep"
+    )
+
+
+def test_a_job_of_a_sweep_says_what_is_wrong(empty_folder: Path) -> None:
+    result = call_fake("if cfg.seed == 2: raise UserError('bad')", "-m", "seed=1,2,3", "output=sweep")
+    assert_one_line(result, "sgns train: job 1 (output=sweep,seed=2): bad\n")
+    assert {path.name for path in Path("sweep").iterdir()} == {"multirun.yaml", "0"}
+
+
+def test_wrong_key_in_a_sweep(empty_folder: Path) -> None:
+    assert_one_line(
+        call("train", "-m", "reduction.num_mode=1,2", "output=x"), "did you mean reduction.num_modes"
+    )
+
+
+def test_a_bug_keeps_its_traceback(empty_folder: Path) -> None:
+    for body in ("raise ValueError('a bug')", "cfg.no_such_setting"):
+        result = call_fake(body)
+        assert result.returncode == 1
+        assert "Traceback" in result.stderr
+
+
+def test_an_output_that_cannot_be_written(empty_folder: Path) -> None:
+    Path("taken").touch()
+    assert_one_line(call_fake("pass", "output=taken"), "taken: File exists")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "folders"),
+    [
+        ([], ["outputs/train/"]),
+        (["output=here/now"], ["here/now"]),
+        (["-m", "seed=1,2"], ["outputs/train/", "outputs/train/"]),
+        (["-m", "seed=1,2", "output=here"], ["here/0", "here/1"]),
+    ],
+    ids=["default", "given", "sweep", "sweep given"],
+)
+def test_output_is_the_run_folder(arguments: list[str], folders: list[str], empty_folder: Path) -> None:
+    result = call_fake("print('output:', cfg.output); return 1.0", *arguments)
+    assert result.returncode == 0, result.stderr
+    found = [line.split()[1] for line in result.stdout.splitlines() if line.startswith("output: ")]
+    assert len(found) == len(set(found)) == len(folders)
+    for folder, start in zip(found, folders, strict=True):
+        assert folder.startswith(start)
+        assert [path.name for path in Path(folder).iterdir()] == [".hydra"]
+
+
+def test_settings_before_and_after_flags(empty_folder: Path) -> None:
+    result = call("train", "seed=3", "--cfg", "job", "device=cuda")
+    assert result.returncode == 0, result.stderr
+    assert "seed: 3" in result.stdout and "device: cuda" in result.stdout
+
+
+def test_the_arguments_of_a_process_that_lightning_starts(empty_folder: Path) -> None:
+    result = call_fake("import sys; print(sys.argv[1:4])", "seed=3")
+    assert result.stdout == "['--config-name', 'train', 'seed=3']\n"
+    child = call("--config-name", "train", "--cfg", "job", 'hydra.run.dir="a/b"', "hydra.output_subdir=null")
+    assert child.returncode == 0 and "num_modes:" in child.stdout
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["run.h5", "a b.h5", "it's.h5", "a,b[1].h5", "x=1.h5", "${seed}.h5", 'say "hi".h5', "back\\slash.h5"],
+)
+def test_check_takes_plain_paths(name: str, empty_folder: Path) -> None:
+    Path(name).touch()
+    result = call("check", name)
+    assert_one_line(result, "1 of 1 files checked is not good")
+    assert result.stdout.startswith(name)
+
+
+def test_log_lines(empty_folder: Path) -> None:
+    body = "import logging as l; l.info('%d s', 3); l.warning('slow'); l.getLogger('lightning').info('no')"
+    result = call_fake(body)
+    assert (result.stdout, result.stderr) == ("3 s\nwarning: slow\n", "")
+
+
+@pytest.mark.parametrize("written", [True, False], ids=["something written", "nothing written"])
+def test_an_interruption_says_how_to_go_on(written: bool, empty_folder: Path) -> None:
+    write = "open(cfg.output + '/last.ckpt', 'w').close(); " if written else ""
+    body = write + "import time; print('ready', flush=True); time.sleep(60)"
+    command = [sys.executable, "-c", FAKE, body, "train", "output=here"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said.count("\n") == 1 and said.startswith("sgns train: interrupted; ")
+    assert ("output=here" in said) == written == Path("here").exists()
+
+
+def test_an_exit_that_lightning_makes_of_an_interruption(empty_folder: Path) -> None:
+    body = "try: raise KeyboardInterrupt\n    except KeyboardInterrupt: raise SystemExit(1)"
+    result = call_fake(body)
+    assert result.returncode == 130 and "interrupted" in result.stderr
+
+
+def test_hydras_flags_are_the_ones_that_are_checked() -> None:
+    parsed = get_args_parser().parse_args([])
+    for name in ("overrides", "cfg", "resolve", "run", "multirun", "shell_completion", "info", "config_name"):
+        assert hasattr(parsed, name)

@@ -1,0 +1,148 @@
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from surrogates import FakeSimulator, fitted, frozen_latent, small_dataset
+from synthetic import make_run
+
+from sgns.errors import UserError
+from sgns.evaluation import evaluate as evaluate_module
+from sgns.evaluation.evaluate import evaluate, full_basis, points_in_body_frame, single_thread, training_means
+from sgns.evaluation.report import write_report
+from sgns.rollout import write_rollout
+from sgns.runs import Run, check_run
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return small_dataset(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def basis(dataset):
+    return fitted(dataset.runs("train"), 6)
+
+
+def simulator(dataset, basis, **kw):
+    return FakeSimulator(basis, dataset.runs("train") + dataset.runs("test"), **kw)
+
+
+def test_whole_evaluation(dataset, basis, tmp_path):
+    known = simulator(dataset, basis, mistake=lambda z, d: z + 0.001 * np.arange(len(z))[:, None, None])
+    with Run(dataset.runs("test")[0]) as run:
+        rollout = known.rollout(run.pose, points_in_body_frame(run))
+        new = write_rollout(tmp_path / "new path.h5", known, run.scene, rollout)
+    output = tmp_path / "out"
+    result = evaluate(known, dataset, output, new_rollouts=[new], made={"command": "sgns evaluate"})
+    report = write_report(result, output)
+
+    with (output / "metrics.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(dataset.runs("test")) + 1
+    summary = json.loads((output / "metrics.json").read_text())
+    assert summary["aggregate"]["skill_frozen"] == pytest.approx(result.total.skill())
+    assert summary["wall_s_per_simulated_s"]["solver"] == pytest.approx(60.0 / 19.0)
+    assert result.timing.repeats >= 3
+    assert result.timing.decoding > result.timing.stepping > 0.0
+    for run in result.runs:
+        assert check_run(run.rollout) == []
+        assert run.scores.mse["total"] == pytest.approx(
+            run.scores.mse["network"] + run.scores.mse["reduction"], rel=1e-3
+        )
+    text = report.read_text(encoding="utf-8")
+    assert text.count("data:image/png;base64,") == len(list((output / "figures").glob("*.png"))) >= 8
+    assert "never simulated" in text
+
+
+def test_perfect_network_is_limited_by_the_reduction_alone(dataset, basis, tmp_path):
+    result = evaluate(simulator(dataset, basis), dataset, tmp_path)
+    assert result.total.mse["network"] == pytest.approx(0.0, abs=1e-14)
+    assert result.total.mse["total"] == pytest.approx(result.total.mse["reduction"], rel=1e-4)
+    assert result.total.force.overall_nrmse == pytest.approx(0.0, abs=1e-6)
+    assert result.total.skill() == pytest.approx(
+        1 - result.total.mse["reduction"] / result.total.mse["frozen"], rel=1e-4
+    )
+    assert result.curves.evaluated[basis.num_modes] > 0.0
+
+
+def test_frozen_network_has_no_skill(dataset, tmp_path):
+    # With nearly all variance in the subspace, a network that freezes is the frozen baseline.
+    basis = fitted(dataset.runs("train"), 10)
+    result = evaluate(simulator(dataset, basis, mistake=frozen_latent), dataset, tmp_path)
+    assert result.total.skill() == pytest.approx(0.0, abs=0.05)
+
+
+def test_network_that_always_answers_the_mean_equals_the_baseline(dataset, basis, tmp_path):
+    known = simulator(dataset, basis)
+    mean, _ = training_means(dataset.runs("train"), known.history)
+    known.known = [(p, z, np.broadcast_to(mean, f.shape), t) for p, z, f, t in known.known]
+    result = evaluate(known, dataset, tmp_path)
+    assert result.total.force.overall_nrmse == pytest.approx(result.total.mean_force.overall_nrmse, rel=1e-5)
+
+
+def test_evaluating_again_gives_the_same_numbers(dataset, basis, tmp_path):
+    first = evaluate(simulator(dataset, basis), dataset, tmp_path).total.row()
+    second = evaluate(simulator(dataset, basis), dataset, tmp_path).total.row()
+    assert first == pytest.approx(second, nan_ok=True)
+
+
+def test_body_points_come_back_from_the_world(dataset):
+    from sgns.learning.body import in_world_frame
+
+    with Run(dataset.runs("test")[0]) as run:
+        assert in_world_frame(run.pose, points_in_body_frame(run)) == pytest.approx(run.body_points, abs=1e-6)
+
+
+def test_full_basis_is_found_beside_the_dataset(dataset, tmp_path):
+    full = fitted(dataset.runs("train"), 10)
+    other = fitted(dataset.runs("test"), 6)
+    place = replace(dataset, path=tmp_path)
+    assert full_basis(place, full.sliced(4)).num_modes == 4
+    for name, cached in (("a", other), ("b", full)):
+        (tmp_path / "reduced" / name).mkdir(parents=True)
+        cached.save(tmp_path / "reduced" / name / "basis.h5")
+    (tmp_path / "reduced" / "c").mkdir()
+    (tmp_path / "reduced" / "c" / "basis.h5").write_bytes(b"not a basis")
+    found = full_basis(place, full.sliced(4))
+    assert found.num_modes == 10
+    assert torch.allclose(found.modes, full.modes)
+
+
+def test_empty_split_and_foreign_runs_are_refused(dataset, basis, tmp_path):
+    empty = replace(dataset, splits=dataset.splits | {"test": []})
+    with pytest.raises(UserError, match="no complete run in its split 'test'"):
+        evaluate(simulator(dataset, basis), empty, tmp_path)
+    foreign = make_run(tmp_path / "foreign.h5", frames=20, n=120, arrangement_hash="other")
+    with pytest.raises(UserError, match="another particle arrangement"):
+        evaluate(
+            simulator(dataset, basis), replace(dataset, splits=dataset.splits | {"test": [foreign]}), tmp_path
+        )
+    with pytest.raises(UserError, match="another particle arrangement"):
+        evaluate(simulator(dataset, basis), dataset, tmp_path, new_rollouts=[foreign])
+    slow = make_run(tmp_path / "slow.h5", frames=20, n=120, frame_rate=30.0)
+    with pytest.raises(UserError, match="recorded at 30 Hz"):
+        evaluate(simulator(dataset, basis), dataset, tmp_path, new_rollouts=[slow])
+
+
+def test_output_that_cannot_be_a_folder_is_refused(dataset, basis, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot write to output="):
+        evaluate(simulator(dataset, basis), dataset, tmp_path / "file")
+
+
+def test_one_thread_and_back():
+    before = torch.get_num_threads()
+    with single_thread():
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == before
+
+
+def test_summary_names_the_baselines(dataset, basis, tmp_path, caplog):
+    result = evaluate(simulator(dataset, basis), dataset, tmp_path)
+    with caplog.at_level("INFO"):
+        evaluate_module.log_summary(result, tmp_path / "report.html")
+    text = caplog.text
+    assert "frozen" in text and "mean force of the training split" in text and "report.html" in text

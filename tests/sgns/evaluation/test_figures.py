@@ -1,0 +1,130 @@
+import io
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib import image
+from synthetic import make_run
+
+from sgns.evaluation import figures
+from sgns.evaluation.figures import ForceHistory
+from sgns.evaluation.metrics import PositionErrors
+from sgns.evaluation.sideview import body_outline, hull, middle_slice, nice, rotated, side_views, view_times
+from sgns.evaluation.surface import surface_grid
+from sgns.runs import Run
+
+
+def pixels(figure):
+    """The drawn picture, shape (height, width, channels); fails if it is empty."""
+    picture = image.imread(io.BytesIO(figures.png(figure)))
+    assert picture[..., :3].std() > 0.01
+    return picture
+
+
+@pytest.fixture
+def run(tmp_path):
+    with Run(make_run(tmp_path / "run.h5", frames=20, n=400)) as run:
+        yield run
+
+
+def errors(scale=1.0, frames=6):
+    values = [scale * np.linspace(1e-6, 1e-4, frames)] * 7
+    return PositionErrors(np.arange(frames) / 60.0, *values)
+
+
+def test_side_views_of_one_and_of_two_runs(run):
+    start = run.positions(slice(0, 1))[0].astype(np.float64)
+    frames = view_times(run, 3)
+    one = pixels(side_views({"network": run}, frames, start))
+    two = pixels(side_views({"simulated (MPM)": run, "network": run}, frames, start))
+    assert two.shape[1] > one.shape[1]
+
+
+def test_side_view_of_a_run_without_force_motion_or_blade(tmp_path):
+    path = make_run(
+        tmp_path / "still.h5", frames=8, n=200, scene={"blade": None, "speed": 1e-9, "depth": 0.0}
+    )
+    with Run(path) as run:
+        start = run.positions(slice(0, 1))[0].astype(np.float64)
+        pixels(side_views({"network": run}, view_times(run, 2), start))
+
+
+def test_view_times_lie_after_the_history_and_within_the_run(run):
+    frames = view_times(run, 3)
+    assert len(frames) == 3 and frames == sorted(frames)
+    assert 3 < frames[0] and frames[-1] < run.frame_count
+
+
+def test_outline_is_the_box_of_the_blade(run):
+    outline = body_outline(run, 0)
+    blade = run.scene["blade"]
+    sides = np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1)
+    assert np.sort(sides) == pytest.approx([blade["thickness"]] * 2 + [blade["length"]] * 2, rel=1e-6)
+    assert outline.mean(axis=0) == pytest.approx(run.pose[0, [0, 2]])
+
+
+def test_hull_of_a_square_with_points_inside():
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
+    inside = np.random.default_rng(0).uniform(0.1, 0.9, (20, 2))
+    assert sorted(hull(np.vstack([square, inside, square])).tolist()) == sorted(square.tolist())
+    assert len(hull(np.array([[0.0, 0.0], [1.0, 1.0]]))) == 2
+
+
+def test_rotation_about_y():
+    half = np.radians(90.0) / 2.0
+    turned = rotated(np.array([0.0, np.sin(half), 0.0, np.cos(half)]), np.array([[0.0, 0.0, 1.0]]))
+    assert turned == pytest.approx(np.array([[1.0, 0.0, 0.0]]))
+
+
+def test_middle_slice_and_nice_numbers():
+    y = np.linspace(0.0, 1.0, 11)
+    bed = np.stack(np.meshgrid(y, y, y), axis=-1).reshape(-1, 3)
+    chosen = bed[middle_slice(bed)]
+    assert np.abs(chosen[:, 1] - 0.5).max() < 0.2 and len(chosen) > 100
+    assert [nice(v) for v in (0.1, 0.11, 27.0, 8.5)] == pytest.approx([0.1, 0.15, 30.0, 10.0])
+
+
+def test_force_histories_with_and_without_truth():
+    time = np.arange(10) / 60.0
+    force = np.random.default_rng(0).normal(size=(10, 3))
+    both = ForceHistory("a <b>", time, force, force + 1.0, start=time[3])
+    pixels(figures.force_figure([both, ForceHistory("new", time, force)], np.array([1.0, 0.0, 2.0])))
+    pixels(figures.force_figure([ForceHistory("new", time, force)]))
+
+
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_error_panels(count):
+    pixels(figures.error_figure({f"run{i}": errors() for i in range(count)}))
+
+
+def test_error_panel_of_a_prediction_without_error():
+    pixels(figures.error_figure({"run": errors(scale=0.0)}))
+
+
+def test_profile(run):
+    grid = surface_grid(run.positions(slice(0, 1))[0])
+    pixels(figures.profile_figure({"simulated (MPM)": run, "network": run}, [4, 9, 14], grid))
+
+
+@pytest.mark.parametrize("modes", [1, 2, 7, 64])
+def test_reduction_curves(modes):
+    energy = 1.0 - 0.5 ** np.arange(1, modes + 1)
+    pixels(figures.energy_figure(energy, energy - 0.1, min(modes, 4)))
+    residual = 1e-5 * 0.5 ** np.arange(modes + 1)
+    pixels(figures.reconstruction_figure(residual, residual[1:], min(modes, 4), 2.0))
+
+
+def test_complete_energy_and_no_residual_can_be_drawn():
+    pixels(figures.energy_figure(np.ones(3), np.ones(3), 3))
+    pixels(figures.reconstruction_figure(np.array([1e-5, 1e-6, 0.0]), None, 2))
+
+
+def test_settings_of_matplotlib_stay_as_they_were():
+    before = dict(matplotlib.rcParams)
+    pixels(figures.energy_figure(np.array([0.5]), np.array([0.5]), 1))
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_same_figure_same_bytes():
+    draw = lambda: figures.png(figures.energy_figure(np.array([0.5, 0.9]), np.array([0.4, 0.8]), 2))  # noqa: E731
+    assert draw() == draw()

@@ -1,0 +1,220 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from surrogates import fitted, small_dataset
+from synthetic import make_run
+
+from sgns.errors import UserError
+from sgns.evaluation import metrics
+from sgns.evaluation.metrics import (
+    PositionErrors,
+    VectorErrors,
+    mean_prediction,
+    position_errors,
+    reconstruction_curve,
+    skill,
+)
+from sgns.evaluation.surface import surface_grid
+from sgns.reduction import Basis
+from sgns.runs import Run
+
+
+class ArrayRun:
+    """A run in memory."""
+
+    def __init__(self, positions, name="run.h5"):
+        self.values = np.asarray(positions, dtype=np.float32)
+        self.frame_count, self.particle_count, _ = self.values.shape
+        self.time = np.arange(self.frame_count) / 60.0
+        self.arrangement_hash = "same"
+        self.path = name
+
+    def positions(self, frames=slice(None)):
+        return self.values[frames]
+
+
+def make_basis(n=7, r=2, seed=0):
+    rng = np.random.default_rng(seed)
+    modes = np.linalg.qr(rng.normal(size=(n, r)))[0]
+    return Basis(
+        mean=torch.from_numpy(rng.normal(size=(n, 3))),
+        modes=torch.from_numpy(modes),
+        eigenvalues=torch.arange(r, 0, -1, dtype=torch.float64),
+        total_variance=float(r * (r + 1) / 2),
+        displacement_variance=1.0,
+        centring="particle_axis",
+    )
+
+
+def compared(truth, prediction, basis=None, history=2):
+    truth, prediction = ArrayRun(truth), ArrayRun(prediction)
+    grid = surface_grid(truth.values[0])
+    return position_errors(truth, prediction, basis or make_basis(truth.particle_count), history, grid)
+
+
+def random_walk(frames=9, n=7, seed=1, size=0.1):
+    return np.cumsum(np.random.default_rng(seed).normal(0.0, size, (frames, n, 3)), axis=0)
+
+
+def test_position_errors_by_hand():
+    # One particle that goes 0, 1, 3, 6 along x; the prediction stays at 1; two frames are given.
+    truth = np.zeros((4, 1, 3))
+    truth[:, 0, 0] = [0, 1, 3, 6]
+    prediction = np.zeros((4, 1, 3))
+    prediction[:, 0, 0] = [0, 1, 1, 1]
+    basis = make_basis(n=1, r=1)
+    errors = compared(truth, prediction, basis)
+    assert errors.frozen == pytest.approx([4 / 3, 25 / 3])
+    assert errors.total == pytest.approx([4 / 3, 25 / 3])
+    assert errors.constant_velocity == pytest.approx([1 / 3, 9 / 3])  # goes on to 2 and 3
+    assert errors.reduction == pytest.approx([0.0, 0.0], abs=1e-12)  # one mode holds one particle
+    assert errors.network == pytest.approx(errors.total)
+    assert errors.mse("total") == pytest.approx(29 / 6)
+    assert errors.rmse_mm("total") == pytest.approx(1e3 * math.sqrt(29 / 6))
+    assert errors.skill("constant_velocity") == pytest.approx(1 - 29 / 10)
+    assert errors.time == pytest.approx([2 / 60, 3 / 60])
+
+
+def test_skill_of_perfect_is_one_and_of_frozen_is_zero():
+    truth = random_walk()
+    assert compared(truth, truth).skill() == 1.0
+    frozen = truth.copy()
+    frozen[2:] = frozen[1]
+    assert compared(truth, frozen).skill() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_history_counts_in_no_metric():
+    truth, prediction = random_walk(), random_walk(seed=2)
+    expected = compared(truth, prediction)
+    prediction[:2] += 100.0
+    changed = compared(truth, prediction)
+    assert changed.mse("total") == expected.mse("total")
+    assert len(changed.total) == len(truth) - 2
+
+
+def test_latent_formula_equals_full_space():
+    truth, basis = random_walk(), make_basis()
+    latent = torch.from_numpy(np.random.default_rng(3).normal(size=(9, 2, 3)))
+    prediction = basis.inverse(latent).numpy()
+    errors = compared(truth, prediction, basis)
+    projected = basis.inverse(basis.transform(torch.from_numpy(truth.astype(np.float32)).double())).numpy()
+    full = np.mean((prediction.astype(np.float32) - projected)[2:] ** 2, axis=(1, 2))
+    assert errors.network == pytest.approx(full, rel=1e-5)
+    # The residual of the reduction stands at right angles to the subspace.
+    assert errors.total == pytest.approx(errors.network + errors.reduction, rel=1e-5)
+
+
+def test_chunks_of_frames_do_not_change_anything(monkeypatch):
+    truth, prediction = random_walk(), random_walk(seed=2)
+    whole = compared(truth, prediction)
+    monkeypatch.setattr(metrics, "CHUNK_BYTES", 1.0)
+    pieces = compared(truth, prediction)
+    for name in ("reduction", "network", "total", "frozen", "constant_velocity", "surface"):
+        assert getattr(pieces, name) == pytest.approx(getattr(whole, name), rel=1e-12)
+
+
+def test_surface_error_of_a_raised_bed():
+    bed = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0), np.arange(3.0)), axis=-1).reshape(1, -1, 3)
+    truth = np.repeat(bed, 4, axis=0)
+    prediction = truth.copy()
+    prediction[2:, :, 2] += 0.01
+    errors = compared(truth, prediction, make_basis(n=truth.shape[1]))
+    assert errors.rmse_mm("surface") == pytest.approx(10.0, rel=1e-5)
+    assert errors.mse("surface_frozen") == 0.0
+
+
+def test_one_frame_of_history_has_no_velocity():
+    truth = random_walk()
+    errors = compared(truth, truth, history=1)
+    assert errors.constant_velocity == pytest.approx(errors.frozen)
+
+
+def test_aggregate_skill_is_of_sums():
+    assert skill([1.0, 3.0], [4.0, 4.0]) == pytest.approx(0.5)
+    assert skill([5.0], [4.0]) == pytest.approx(-0.25)
+    assert math.isnan(skill([0.0], [0.0]))
+
+
+def test_incomparable_runs_are_refused():
+    truth = random_walk()
+    with pytest.raises(UserError, match="frames 8 against 9"):
+        compared(truth, truth[:-1])
+    with pytest.raises(UserError, match="particles 6 against 7"):
+        compared(truth, truth[:, :-1], make_basis())
+    with pytest.raises(UserError, match="nothing is left to compare"):
+        compared(truth, truth, history=9)
+
+
+def test_force_metrics_by_hand():
+    truth = np.array([[-100.0, 0.0, 50.0], [-300.0, 0.0, -50.0]])
+    prediction = np.array([[-110.0, 1.0, 50.0], [-330.0, -1.0, -30.0]])
+    errors = VectorErrors.compare(truth, prediction)
+    assert errors.mae == pytest.approx([20.0, 1.0, 10.0])
+    assert errors.nrmse[0] == pytest.approx(0.1)
+    assert errors.nrmse[2] == pytest.approx(math.sqrt(200 / 2500))
+    assert math.isnan(errors.nrmse[1])  # zero by symmetry: a ratio says nothing
+    assert errors.mpe[0] == pytest.approx(10.0)
+    assert math.isnan(errors.mpe[1]) and math.isnan(errors.mpe[2])  # means are zero
+    assert errors.overall_nrmse == pytest.approx(math.sqrt((100 + 900 + 2 + 400) / (1e4 + 9e4 + 5e3)))
+
+
+def test_sign_of_mpe_does_not_depend_on_the_sign_of_the_force():
+    truth = np.full((5, 3), [-10.0, 8.0, 10.0])
+    assert VectorErrors.compare(truth, 1.2 * truth).mpe == pytest.approx([20.0, 20.0, 20.0])
+    assert VectorErrors.compare(truth, 0.9 * truth).mpe == pytest.approx([-10.0, -10.0, -10.0])
+
+
+def test_sums_of_runs_equal_the_runs_joined():
+    rng = np.random.default_rng(0)
+    truth, prediction = rng.normal(size=(2, 10, 3))
+    parts = VectorErrors.compare(truth[:4], prediction[:4]) + VectorErrors.compare(truth[4:], prediction[4:])
+    whole = VectorErrors.compare(truth, prediction)
+    assert parts.samples == whole.samples == 10
+    for name in ("mae", "nrmse", "mpe", "overall_nrmse"):
+        assert getattr(parts, name) == pytest.approx(getattr(whole, name), nan_ok=True)
+
+
+def test_forces_of_zero_have_no_relative_error():
+    errors = VectorErrors.compare(np.zeros((3, 3)), np.ones((3, 3)))
+    assert math.isnan(errors.overall_nrmse)
+    assert np.isnan(errors.nrmse).all() and np.isnan(errors.mpe).all()
+
+
+def test_constant_prediction_and_training_mean():
+    histories = [np.array([[9.0, 9, 9], [1, 2, 3]]), np.array([[9.0, 9, 9], [3, 4, 5], [5, 6, 7]])]
+    mean = mean_prediction(histories, history=1)
+    assert mean == pytest.approx([3.0, 4.0, 5.0])
+    errors = VectorErrors.compare(np.array([[1.0, 2, 3], [3, 4, 5]]), mean)
+    assert errors.mae == pytest.approx([1.0, 1.0, 1.0])
+
+
+def test_reconstruction_curve_is_the_error_of_projecting(tmp_path):
+    dataset = small_dataset(tmp_path)
+    basis = fitted(dataset.runs("train"), modes=6)
+    with Run(dataset.runs("test")[0]) as run:
+        curve = reconstruction_curve([run], basis)
+        true = torch.from_numpy(run.positions()).double()
+        for r in (1, 3, 6):
+            part = basis.sliced(r)
+            direct = float((part.inverse(part.transform(true)) - true).square().mean())
+            assert curve[r] == pytest.approx(direct, rel=1e-6)
+    assert (np.diff(curve) <= 0.0).all()
+
+
+def test_reconstruction_curve_of_the_training_runs_is_the_basis_own(tmp_path):
+    paths = [make_run(tmp_path / f"{i}.h5", frames=10, n=40, seed=i) for i in range(3)]
+    basis = fitted(paths, modes=8)
+    with Run(paths[0]) as a, Run(paths[1]) as b, Run(paths[2]) as c:
+        curve = reconstruction_curve([a, b, c], basis)
+    assert curve[1:] == pytest.approx(np.asarray(basis.residual_mse()), rel=1e-4, abs=1e-14)
+
+
+def test_no_runs_give_no_curve():
+    assert np.isnan(reconstruction_curve([], make_basis())).all()
+
+
+def test_errors_of_zero_are_zero_not_negative():
+    zeros = np.zeros(3)
+    assert PositionErrors(*[zeros] * 8).rmse_mm("total") == 0.0

@@ -1,0 +1,108 @@
+"""Windows, padding, noise and the target that corrects it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tiny import MODEL, reduced
+
+from sgns.learning.data import TrainingWindows, fit_normalisation, generator, random_walk
+from sgns.learning.dynamics import LatentDynamics, ModelSettings
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return reduced(tmp_path_factory.mktemp("tiny"))
+
+
+def windows_of(data, history: int = 3, seed: int = 0) -> TrainingWindows:
+    return TrainingWindows(data.runs("train"), 4, history, "pose", seed)
+
+
+def test_every_frame_but_the_first_is_a_target(data) -> None:
+    windows = windows_of(data)
+    assert len(windows) == 4 * 13
+    batch = windows.windows(windows.targets)
+    for i, run in enumerate(data.runs("train")):
+        rows = slice(13 * i, 13 * (i + 1))
+        np.testing.assert_array_equal(batch.latent[rows, -1], run.latent[1:, :4])
+        np.testing.assert_array_equal(batch.force[rows], run.force[1:])
+        np.testing.assert_array_equal(batch.body.position[rows, -1, 0], run.pose[1:, :3])
+
+
+def test_runs_start_at_rest(data) -> None:
+    windows = windows_of(data, history=4)
+    first = windows.windows(windows.targets[:1])
+    start = data.runs("train")[0].latent[0, :4]
+    for position in range(4):
+        np.testing.assert_array_equal(first.latent[0, position], start)
+    # The tool moves only into the frame to be predicted.
+    assert not first.body.motion[0, :-1].any()
+    assert first.body.motion[0, -1].any()
+
+
+def test_windows_do_not_reach_across_runs(data) -> None:
+    windows = windows_of(data)
+    second = windows.windows(windows.targets[13:14])
+    np.testing.assert_array_equal(second.latent[0, 0], data.runs("train")[1].latent[0, :4])
+
+
+def test_batches_depend_on_seed_and_step_only(data) -> None:
+    scale = torch.rand(4, 3, dtype=torch.float64)
+    stream = windows_of(data).batches(8, scale)
+    for _ in range(9):
+        drawn = next(stream)
+    alone = windows_of(data).batch(8, 8, scale)
+    assert torch.equal(drawn.latent, alone.latent) and torch.equal(drawn.noise, alone.noise)
+    other = windows_of(data, seed=1).batch(8, 8, scale)
+    assert not torch.equal(other.noise, alone.noise)
+
+
+def test_an_epoch_shows_every_window_once(data) -> None:
+    windows = windows_of(data)
+    # 52 windows in batches of 8: batches straddle epochs; two epochs are 13 batches.
+    seen = torch.cat([windows.batch(step, 8, torch.zeros(4, 3)).latent[:, -1] for step in range(13)])
+    counts = torch.unique(seen.flatten(1), dim=0, return_counts=True)[1]
+    assert counts.tolist() == [2] * 52
+
+
+def test_noise_is_a_walk_of_the_stated_size() -> None:
+    scale = torch.tensor([[1.0, 2.0, 0.0]], dtype=torch.float64)
+    noise = random_walk(scale, (20000, 5), generator(0, 0, 1))
+    assert not noise[:, 0].any()
+    velocity = noise.diff(dim=1)
+    for k in range(4):
+        expected = scale[0] * ((k + 1) / 4) ** 0.5
+        torch.testing.assert_close(velocity[:, k, 0].std(0), expected, rtol=0.03, atol=1e-12)
+    # Increments of the velocity are independent.
+    steps = velocity.diff(dim=1)
+    correlation = (steps[:, 0, 0] * steps[:, 1, 0]).mean(0)
+    assert correlation.abs().max() < 0.03
+
+
+def test_the_target_undoes_the_noise_of_the_velocity(data) -> None:
+    windows = windows_of(data)
+    batch = windows.batch(0, 8, 1e-3 * torch.ones(4, 3, dtype=torch.float64))
+    shown = batch.history
+    following = 2 * shown[:, -1] - shown[:, -2] + batch.acceleration
+    clean_velocity = batch.latent[:, -1] - batch.latent[:, -2]
+    torch.testing.assert_close(following - shown[:, -1], clean_velocity, rtol=0, atol=1e-12)
+
+
+def test_without_noise_the_target_is_the_second_difference(data) -> None:
+    batch = windows_of(data).batch(0, 8, torch.zeros(4, 3))
+    torch.testing.assert_close(batch.acceleration, batch.latent.diff(n=2, dim=1)[:, -1], rtol=0, atol=1e-12)
+
+
+def test_normalised_training_quantities_are_of_order_one(data) -> None:
+    windows = windows_of(data)
+    dynamics = LatentDynamics(ModelSettings(**MODEL), 4)
+    noise_scale = fit_normalisation(dynamics, windows, noise=0.1, floor=0.01)
+    torch.testing.assert_close(noise_scale, 0.1 * dynamics.velocity.scale)
+    batch = windows.windows(windows.targets)
+    velocity = dynamics.velocity.normalise(batch.latent.diff(dim=1)[:, -1])
+    assert 0.9 < float(velocity[:, 0, 0].square().mean()) < 1.1
+    assert float(dynamics.force.normalise(batch.force).abs().max()) < 10
+    assert torch.isfinite(dynamics.body_motion.normalise(batch.body.motion)).all()
+    assert torch.isfinite(dynamics.body_orientation.normalise(batch.body.orientation)).all()

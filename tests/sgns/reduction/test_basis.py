@@ -1,0 +1,186 @@
+"""Basis: projection, energies, and the file."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from sgns.errors import UserError
+from sgns.reduction import IncrementalPCA
+from sgns.reduction.basis import CENTRINGS, Basis
+
+
+@pytest.fixture
+def positions() -> np.ndarray:
+    rng = np.random.default_rng(1)
+    return rng.uniform(size=(1, 20, 3)) + 0.1 * rng.normal(size=(30, 20, 3)) * rng.uniform(size=(20, 1))
+
+
+@pytest.fixture(params=CENTRINGS)
+def basis(request, positions) -> Basis:
+    pca = IncrementalPCA(6, 14).partial_fit(positions)
+    return pca.basis(request.param, arrangement_hash="abc", fitted_on=["run_0", "läuft"])
+
+
+def same(a: Basis, b: Basis) -> bool:
+    """Whether every field is bit-equal."""
+    values = zip(a.state().items(), b.state().items(), strict=True)
+    return all(
+        p == q and (torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y) for (p, x), (q, y) in values
+    )
+
+
+def test_transform_and_inverse_undo_each_other_in_the_subspace(basis, positions):
+    latent = basis.transform(positions)
+    assert latent.shape == (30, 6, 3)
+    assert latent.dtype == torch.float64
+    np.testing.assert_allclose(basis.transform(basis.inverse(latent)), latent, atol=1e-13)
+    once = basis.inverse(latent)
+    np.testing.assert_allclose(basis.inverse(basis.transform(once)), once, atol=1e-13)
+
+
+def test_transform_is_the_papers_projection(basis, positions):
+    frame = positions[3]
+    expected = (frame - basis.mean.numpy()).T @ basis.modes.numpy()
+    np.testing.assert_allclose(basis.transform(frame), expected.T, atol=1e-14)
+    several = basis.transform(torch.from_numpy(positions.reshape(5, 6, 20, 3)))
+    np.testing.assert_allclose(several[0, 3], expected.T, atol=1e-14)
+    assert basis.inverse(several).shape == (5, 6, 20, 3)
+
+
+def test_latent_error_is_full_space_error(basis):
+    a, b = torch.randn(2, 4, 6, 3, dtype=torch.float64)
+    full = (basis.inverse(a) - basis.inverse(b)).square().mean()
+    np.testing.assert_allclose((a - b).square().sum((1, 2)).mean() / (3 * 20), full, rtol=1e-12)
+
+
+def test_gradients_reach_the_latent(basis):
+    latent = torch.zeros(2, 6, 3, requires_grad=True)
+    basis.inverse(latent).sum().backward()
+    expected = basis.modes.sum(0)[:, None].expand(2, 6, 3)
+    np.testing.assert_allclose(latent.grad, expected.float(), rtol=1e-6)
+
+
+def test_energies_rise_to_their_definitions(basis):
+    kept = basis.eigenvalues.cumsum(0)
+    np.testing.assert_allclose(basis.energy(), kept / basis.total_variance, rtol=1e-12)
+    residual = basis.total_variance - kept
+    np.testing.assert_allclose(basis.residual_mse() * 20, residual, rtol=1e-10)
+    np.testing.assert_allclose(
+        basis.displacement_energy(), 1 - residual / basis.displacement_variance, rtol=1e-10
+    )
+    assert (np.diff(basis.energy()) > 0).all()
+    assert (np.diff(basis.displacement_energy()) > 0).all()
+    assert basis.energy(0) == pytest.approx(0.0, abs=1e-12)
+    assert basis.energy(4) == float(basis.energy()[3])
+    if basis.centring == "particle_axis":
+        assert basis.displacement_energy(4) == basis.energy(4)
+
+
+def test_a_slice_is_the_smaller_basis(basis, positions):
+    cut = basis.sliced(2)
+    fitted = IncrementalPCA(2, 18).partial_fit(positions).basis(basis.centring)
+    np.testing.assert_allclose(cut.modes, fitted.modes, atol=1e-10)
+    assert cut.energy(2) == basis.energy(2)
+    assert cut.residual_mse(1) == pytest.approx(basis.residual_mse(1), rel=1e-14)
+    assert (cut.arrangement_hash, cut.fitted_on) == ("abc", ["run_0", "läuft"])
+    for r in (0, 7):
+        with pytest.raises(UserError, match=f"cannot keep {r} modes; .* allowed: 1 to 6"):
+            basis.sliced(r)
+    with pytest.raises(UserError, match="asked for 7 modes"):
+        basis.energy(7)
+
+
+def test_wrong_shapes_are_named(basis):
+    with pytest.raises(
+        UserError, match=r"positions have shape \(2, 19, 3\); this basis takes \(\.\.\., 20, 3\)"
+    ):
+        basis.transform(np.zeros((2, 19, 3)))
+    with pytest.raises(UserError, match=r"reduced positions have shape \(6,\)"):
+        basis.inverse(np.zeros(6))
+    with pytest.raises(UserError, match="do not belong together"):
+        dataclasses.replace(basis, mean=basis.mean[1:])
+
+
+def test_file_round_trip_is_bit_equal(basis, tmp_path):
+    path = tmp_path / "basis.h5"
+    basis.save(path)
+    basis.save(path)  # replaces
+    assert [p.name for p in tmp_path.iterdir()] == ["basis.h5"]
+    assert same(Basis.load(path), basis)
+    assert same(Basis.load(str(path)).sliced(2), basis.sliced(2))
+
+
+def test_state_survives_a_checkpoint_without_pickle(basis, tmp_path):
+    torch.save(basis.state(), tmp_path / "basis.ckpt")
+    assert same(Basis.from_state(torch.load(tmp_path / "basis.ckpt", weights_only=True)), basis)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"modes": None}, "not a basis"),
+        ({"format_version": 99}, "newer than this program"),
+        ({"centring": "none"}, "unknown centring"),
+        ({"total_variance": float("nan")}, "not finite"),
+        ({"modes": torch.ones(20, 6)}, "not orthonormal"),
+        ({"modes": torch.eye(20)}, "do not belong together"),
+    ],
+)
+def test_a_wrong_state_is_named(basis, change, message):
+    with pytest.raises(UserError, match=message):
+        Basis.from_state(basis.state() | change)
+    with pytest.raises(UserError, match="not a basis"):
+        Basis.from_state({})
+
+
+@pytest.fixture
+def saved(positions, tmp_path):
+    path = tmp_path / "basis.h5"
+    IncrementalPCA(6).partial_fit(positions).basis().save(path)
+    return path
+
+
+def test_damaged_files_are_refused(saved):
+    whole = saved.read_bytes()
+    with h5py.File(saved) as file:
+        where = file["modes"].id.get_chunk_info(0).byte_offset
+    flipped = bytearray(whole)
+    flipped[where + 12] ^= 1
+    for damaged in (whole[: len(whole) // 2], whole[:100], b"", b"not HDF5 at all", bytes(flipped)):
+        saved.write_bytes(damaged)
+        with pytest.raises(UserError, match="truncated or damaged") as caught:
+            Basis.load(saved)
+        assert "\n" not in str(caught.value)
+
+
+def test_missing_and_foreign_files_are_refused(saved, tmp_path):
+    with pytest.raises(UserError, match="no basis file at"):
+        Basis.load(tmp_path / "none.h5")
+    with h5py.File(saved, "a") as file:
+        del file["modes"]
+    with pytest.raises(UserError, match="truncated or damaged"):
+        Basis.load(saved)
+    with h5py.File(saved, "w") as file:
+        file["modes"] = np.eye(3)
+    with pytest.raises(UserError, match="not a basis"):
+        Basis.load(saved)
+
+
+def test_a_failed_save_leaves_nothing_behind(basis, tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="cannot write the basis"):
+        basis.save(tmp_path / "nowhere" / "basis.h5")
+    (tmp_path / "basis.h5").write_text("old")
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(UserError, match="disk full"):
+        basis.save(tmp_path / "basis.h5")
+    assert [p.name for p in tmp_path.iterdir()] == ["basis.h5"]
+    assert (tmp_path / "basis.h5").read_text() == "old"

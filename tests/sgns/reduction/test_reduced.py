@@ -1,0 +1,113 @@
+"""The cache of reduced runs: what is reused, what is made anew, what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from synthetic import make_run
+from tiny import REDUCTION, make_dataset
+
+import sgns.reduction.reduced as module
+from sgns.errors import UserError
+from sgns.reduction.reduced import main, reduce_dataset
+from sgns.runs import Run
+
+
+def files(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*.h5")}
+
+
+def test_reduced_runs_are_transformed_runs(tmp_path) -> None:
+    dataset = make_dataset(tmp_path)
+    reduced = reduce_dataset(dataset, REDUCTION)
+    assert reduced.basis.fitted_on == ["a", "b", "c", "d"]
+    assert [run.name for run in reduced.runs("validation")] == ["e", "f"]
+    with Run(dataset.runs("test")[0]) as run:
+        found = reduced.runs("test")[0]
+        np.testing.assert_array_equal(found.latent, reduced.basis.transform(run.positions()).numpy())
+        np.testing.assert_array_equal(found.force, run.force)
+        np.testing.assert_array_equal(reduced.start_positions, run.positions(0)[0])
+        assert found.scene == run.scene
+        assert reduced.frame_rate == run.frame_rate
+
+
+def test_second_time_nothing_is_computed(tmp_path, monkeypatch) -> None:
+    dataset = make_dataset(tmp_path)
+    first = reduce_dataset(dataset, REDUCTION)
+    before = files(tmp_path / "reduced")
+    monkeypatch.setattr(module, "IncrementalPCA", None)
+    second = reduce_dataset(dataset, REDUCTION)
+    assert files(tmp_path / "reduced") == before
+    for a, b in zip(first.runs("train"), second.runs("train"), strict=True):
+        np.testing.assert_array_equal(a.latent, b.latent)
+
+
+def test_a_sweep_over_modes_fits_one_basis(tmp_path, monkeypatch) -> None:
+    dataset = make_dataset(tmp_path)
+    reduce_dataset(dataset, REDUCTION)
+    monkeypatch.setattr(module, "IncrementalPCA", None)
+    for r in (1, 2, 6):
+        assert reduce_dataset(dataset, REDUCTION | {"num_modes": r}).basis.num_modes == 6
+    assert len(list((tmp_path / "reduced").iterdir())) == 1
+
+
+def test_other_settings_and_other_training_runs_get_another_cache(tmp_path) -> None:
+    dataset = make_dataset(tmp_path)
+    first = reduce_dataset(dataset, REDUCTION).folder
+    assert reduce_dataset(dataset, REDUCTION | {"centring": "particle"}).folder != first
+    assert reduce_dataset(dataset, REDUCTION | {"max_modes": 5}).folder != first
+    make_run(dataset.runs("test")[0], frames=14, seed=99)
+    assert reduce_dataset(dataset, REDUCTION).folder == first
+    make_run(dataset.runs("train")[0], frames=14, seed=98)
+    assert reduce_dataset(dataset, REDUCTION).folder != first
+
+
+def test_a_changed_test_run_is_reduced_again(tmp_path) -> None:
+    dataset = make_dataset(tmp_path)
+    before = reduce_dataset(dataset, REDUCTION).runs("test")[0]
+    make_run(dataset.runs("test")[0], frames=14, seed=99)
+    after = reduce_dataset(dataset, REDUCTION).runs("test")[0]
+    assert np.abs(after.latent - before.latent).max() > 1e-6
+
+
+def test_damaged_cache_is_made_anew(tmp_path) -> None:
+    dataset = make_dataset(tmp_path)
+    first = reduce_dataset(dataset, REDUCTION)
+    for path in first.folder.iterdir():
+        path.write_bytes(path.read_bytes()[:100])
+    again = reduce_dataset(dataset, REDUCTION)
+    assert torch.equal(again.basis.modes, first.basis.modes)
+
+
+def test_no_more_modes_than_the_data_has(tmp_path) -> None:
+    dataset = make_dataset(tmp_path, n=5)
+    with pytest.raises(UserError, match="ask for at most"):
+        reduce_dataset(dataset, {"num_modes": 6, "max_modes": 9, "centring": "particle_axis"})
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [({"num_modes": 0}, "1 to"), ({"num_modes": 7}, "max_modes"), ({"centring": "median"}, "particle_axis")],
+)
+def test_wrong_settings(tmp_path, change, line) -> None:
+    with pytest.raises(UserError, match=line):
+        reduce_dataset(make_dataset(tmp_path), REDUCTION | change)
+
+
+def test_a_mixture_of_beds_is_refused(tmp_path) -> None:
+    dataset = make_dataset(tmp_path)
+    make_run(dataset.runs("validation")[0], frames=14, n=40)
+    with pytest.raises(UserError, match="do not belong together"):
+        reduce_dataset(dataset, REDUCTION)
+
+
+def test_the_command_prints_a_table_and_returns_the_error(tmp_path, caplog) -> None:
+    dataset = make_dataset(tmp_path)
+    cfg = OmegaConf.create({"dataset": {"path": str(tmp_path)}, "reduction": REDUCTION})
+    with caplog.at_level("INFO"):
+        error = main(cfg)
+    basis = reduce_dataset(dataset, REDUCTION).basis
+    assert error == basis.residual_mse(4)
+    assert "displacement energy" in caplog.text
