@@ -1,12 +1,19 @@
-"""The grid step: gravity, the body, floor and walls."""
+"""Contact between soil particles and a rigid body.
+
+A particle within the body is pushed out by a stiff damped spring along the body's normal and held back by Coulomb
+friction; the body receives the opposite. Particles move with the soil, so the force changes smoothly as the body
+advances, while contact enforced at grid nodes comes and goes with every cell the body crosses.
+
+The grid spreads a push over the width of its B-splines, so a body acts about half a grid spacing further out than it
+is. Contact therefore begins at a margin of -1/2 grid spacings: when a particle's centre is that far inside.
+"""
 
 from functools import cache
+from types import SimpleNamespace
 
 import warp as wp
 
-from .transfer import grid_struct
-
-__all__ = ["body_struct", "grid_step"]
+__all__ = ["body_struct", "contact"]
 
 
 @cache
@@ -16,8 +23,12 @@ def body_struct(real: type) -> type:
 
     @wp.struct
     class Body:
-        half_size: vec3  # with the contact margin [m]
-        reach: real  # radius of the sphere around the box [m]
+        half_size: vec3  # [m]
+        reach: real  # radius of the sphere around the box and everything in contact with it [m]
+        margin: real  # distance from the surface at which contact begins, negative inside [m]
+        stiffness: real  # of the spring [N/m]
+        damping: real  # [N s/m]
+        separation_speed: real  # no push on soil that leaves faster than this [m/s]
         friction: real
         position: wp.array(dtype=vec3)  # of the centre of mass at the start of each substep [m]
         rotation: wp.array(dtype=quat)
@@ -31,78 +42,57 @@ def body_struct(real: type) -> type:
 
 
 @cache
-def grid_step(real: type, with_body: bool) -> wp.Kernel:
-    """Kernel that turns momentum into velocity, applies gravity and contact, and clears the momentum."""
+def contact(real: type, atomic: bool) -> SimpleNamespace:
+    """Warp function `push(x, v, mass, dt, s, body)` -> impulse on a particle [N s] in substep s, in precision `real`.
+
+    The opposite impulse is added to the body; `atomic` is needed where many threads do so at once (a GPU).
+    """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    Grid, Body = grid_struct(real), body_struct(real)
+    Body = body_struct(real)
 
     @wp.func
-    def box_normal(q: vec3, half: vec3):
-        # Outward normal of the face nearest to an inside point (body frame).
-        dx = half[0] - wp.abs(q[0])
-        dy = half[1] - wp.abs(q[1])
-        dz = half[2] - wp.abs(q[2])
-        n = vec3(wp.sign(q[0]), real(0.0), real(0.0))
-        if dy < dx and dy <= dz:
-            n = vec3(real(0.0), wp.sign(q[1]), real(0.0))
-        if dz < dx and dz < dy:
-            n = vec3(real(0.0), real(0.0), wp.sign(q[2]))
-        return n
+    def outward(q: vec3, half: vec3):
+        # Outward normal of a box at a point in the body frame, and the signed distance as the fourth number.
+        d = vec3(wp.abs(q[0]) - half[0], wp.abs(q[1]) - half[1], wp.abs(q[2]) - half[2])
+        out = vec3(wp.max(d[0], real(0.0)), wp.max(d[1], real(0.0)), wp.max(d[2], real(0.0)))
+        distance = wp.length(out)
+        if distance > real(0.0):
+            n = out / distance
+        else:
+            distance = wp.max(d[0], wp.max(d[1], d[2]))
+            n = vec3(real(1.0), real(0.0), real(0.0))
+            if d[1] > d[0] and d[1] >= d[2]:
+                n = vec3(real(0.0), real(1.0), real(0.0))
+            if d[2] > d[0] and d[2] > d[1]:
+                n = vec3(real(0.0), real(0.0), real(1.0))
+        return vec4(n[0] * wp.sign(q[0]), n[1] * wp.sign(q[1]), n[2] * wp.sign(q[2]), distance)
 
     @wp.func
-    def after_contact(v: vec3, arm: vec3, s: int, body: Body):
-        # Soil moving into the body loses its normal velocity relative to the body and at most the
-        # Coulomb share of the tangential one; soil moving away is left alone.
-        rotation = body.rotation[s]
-        q = wp.quat_rotate_inv(rotation, arm)
-        half = body.half_size
-        if wp.abs(q[0]) < half[0] and wp.abs(q[1]) < half[1] and wp.abs(q[2]) < half[2]:
-            normal = wp.quat_rotate(rotation, box_normal(q, half))
-            body_velocity = body.velocity[s] + wp.cross(body.spin[s], arm)
-            relative = v - body_velocity
-            approach = wp.dot(relative, normal)
-            if approach < real(0.0):
-                tangential = relative - approach * normal
-                slip = wp.length(tangential)
-                if slip > real(0.0):
-                    keep = wp.max(real(0.0), real(1.0) + body.friction * approach / slip)
-                    return body_velocity + keep * tangential
-                return body_velocity
-        return v
+    def push(x: vec3, v: vec3, mass: real, dt: real, s: int, body: Body):
+        arm = x - body.position[s]
+        impulse = vec3()
+        if wp.length_sq(arm) < body.reach * body.reach:
+            rotation = body.rotation[s]
+            found = outward(wp.quat_rotate_inv(rotation, arm), body.half_size)
+            overlap = body.margin - found[3]
+            if overlap > real(0.0):
+                normal = wp.quat_rotate(rotation, vec3(found[0], found[1], found[2]))
+                relative = v - body.velocity[s] - wp.cross(body.spin[s], arm)
+                leaving = wp.dot(relative, normal)
+                if leaving < body.separation_speed:
+                    pressed = dt * (body.stiffness * overlap - body.damping * leaving)
+                    if pressed > real(0.0):
+                        impulse = pressed * normal
+                        sliding = relative - leaving * normal
+                        speed = wp.length(sliding)
+                        if speed > real(0.0):
+                            impulse -= wp.min(body.friction * pressed, mass * speed) / speed * sliding
+                        if wp.static(atomic):
+                            wp.atomic_sub(body.impulse, 0, impulse)
+                            wp.atomic_sub(body.impulse, 1, wp.cross(arm, impulse))
+                        else:
+                            body.impulse[0] = body.impulse[0] - impulse
+                            body.impulse[1] = body.impulse[1] - wp.cross(arm, impulse)
+        return impulse
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def step(
-        grid: Grid,
-        body: Body,
-        nodes: wp.array(dtype=vec4),
-        velocity: wp.array(dtype=vec4),
-        substep: wp.array(dtype=int),
-    ):
-        n = wp.tid()
-        node = nodes[n]
-        mass = node[3]
-        if mass > real(0.0):
-            nodes[n] = vec4()
-            v = vec3(node[0], node[1], node[2]) / mass
-            v = v - vec3(real(0.0), real(0.0), grid.gravity * grid.dt)
-            k = n % grid.nz
-            j = (n // grid.nz) % grid.ny
-            i = n // (grid.nz * grid.ny)
-            if wp.static(with_body):
-                s = substep[0]
-                at = grid.origin + grid.spacing * vec3(real(i), real(j), real(k))
-                arm = at - body.position[s]
-                if wp.length_sq(arm) < body.reach * body.reach:
-                    touched = after_contact(v, arm, s, body)
-                    impulse = mass * (v - touched)
-                    if wp.length_sq(impulse) > real(0.0):
-                        wp.atomic_add(body.impulse, 0, impulse)
-                        wp.atomic_add(body.impulse, 1, wp.cross(arm, impulse))
-                        v = touched
-            low = grid.low
-            high = grid.high
-            if i <= low[0] or j <= low[1] or k <= low[2] or i >= high[0] or j >= high[1] or k >= high[2]:
-                v = vec3()  # no slip on floor and walls
-            velocity[n] = vec4(v[0], v[1], v[2], real(0.0))
-
-    return step
+    return SimpleNamespace(push=push)

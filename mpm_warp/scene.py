@@ -99,8 +99,8 @@ class Scene:
     """[s]."""
     frame_rate: float = 60.0
     """Recorded frames per second [Hz]."""
-    contact_margin: float = 0.0
-    """How far from its surface the body acts on the soil [m]; grid nodes within it take part in contact."""
+    contact_margin: float = -0.5
+    """Distance from the body's surface at which it begins to act on particles [grid spacings]; see contact.py."""
     courant: float = 0.6
     """Time step as a share of spacing / wave speed."""
 
@@ -111,10 +111,8 @@ class Scene:
             raise SceneError(f"scene.frame_rate is {self.frame_rate} Hz; it must be above 0")
         if not (math.isfinite(self.duration) and self.duration * self.frame_rate >= 1.0):
             raise SceneError(f"scene.duration is {self.duration} s; it must last at least one frame")
-        if not 0.0 <= self.contact_margin <= 2.0 * self.bed.spacing:
-            raise SceneError(
-                f"scene.contact_margin is {self.contact_margin} m; allowed: 0 to two grid spacings"
-            )
+        if not -1.0 <= self.contact_margin <= 1.0:
+            raise SceneError(f"scene.contact_margin is {self.contact_margin} grid spacings; allowed: -1 to 1")
         if not 0.0 < self.courant <= 1.0:
             raise SceneError(f"scene.courant is {self.courant}; allowed: above 0, at most 1")
 
@@ -225,6 +223,12 @@ class Excavation(Scene):
             raise SceneError(f"scene.rake is {self.rake} degrees; allowed: -60 to 60")
         if not 0.0 <= self.start <= 1.0:
             raise SceneError(f"scene.start is {self.start}; allowed: 0 to 1, a share of the bin's length")
+        core = self.blade.half_size.min() + self.contact_margin * self.bed.spacing
+        if core < 0.1 * self.bed.spacing:
+            raise SceneError(
+                f"blade.thickness of {self.blade.thickness} m is too thin for a grid of {self.bed.spacing:g} m: "
+                "soil would pass through; use a smaller bed.spacing (at most half the thickness is good)"
+            )
         object.__setattr__(self, "body_grid", tuple(int(c) for c in self.body_grid))
         if len(self.body_grid) != 2 or not all(1 <= c <= 100 for c in self.body_grid):
             raise SceneError(f"scene.body_grid is {self.body_grid}; it needs two counts from 1 to 100")

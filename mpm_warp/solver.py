@@ -10,13 +10,14 @@ import numpy as np
 import warp as wp
 
 from .constitutive import soil_struct
-from .contact import body_struct, grid_step
+from .contact import body_struct
 from .effects import Effects
 from .errors import SceneError, SolverStopped
+from .grid import grid_step, grid_struct
 from .rotation import angular_velocity, rotate
 from .scene import Scene
 from .start import start_warp
-from .transfer import grid_struct, transfer
+from .transfer import transfer
 
 __all__ = ["PRECISIONS", "Frame", "Solver"]
 
@@ -169,12 +170,13 @@ class Solver:
 
         body, plate, m = body_struct(real)(), scene.plate, self.substeps_per_frame
         if plate is not None:
-            half = plate.half_size + scene.contact_margin
-            body.half_size, body.reach, body.friction = (
-                vec3(*half),
-                float(np.linalg.norm(half)),
-                plate.friction,
-            )
+            body.half_size, body.friction = vec3(*plate.half_size), plate.friction
+            body.margin = scene.contact_margin * h
+            body.reach = float(np.linalg.norm(plate.half_size + max(0.0, body.margin)))
+            # The spring is as stiff as a layer of soil one particle thick; damping is critical.
+            stiffness = material.wave_speed**2 * material.bulk_density * volume ** (1.0 / 3.0)
+            body.stiffness, body.damping = stiffness, 2.0 * math.sqrt(stiffness * grid.particle_mass)
+            body.separation_speed = 0.01 * material.wave_speed
         body.position = wp.zeros(m, dtype=vec3, **new)
         body.rotation = wp.zeros(m, dtype=wp.types.quaternion(real), **new)
         body.velocity = wp.zeros(m, dtype=vec3, **new)
@@ -182,16 +184,13 @@ class Solver:
         body.impulse = wp.zeros(2, dtype=vec3, **new)
         self._body = body
 
-        kernels = transfer(real, self.effects, atomic=self.device.is_cuda)
+        kernels = transfer(real, self.effects, with_body=plate is not None, atomic=self.device.is_cuda)
         particles = [self._x, self._v, self._c, self._e, self._ln_j, grid, soil]
         record = {"device": self.device, "record_cmd": True}
         self._launches = [
-            wp.launch(kernels.to_grid, n, [*particles, self._nodes, self._substep], **record),
+            wp.launch(kernels.to_grid, n, [*particles, body, self._nodes, self._substep], **record),
             wp.launch(
-                grid_step(real, plate is not None),
-                node_count,
-                [grid, body, self._nodes, self._velocity, self._substep],
-                **record,
+                grid_step(real), node_count, [grid, self._nodes, self._velocity, self._substep], **record
             ),
             wp.launch(
                 kernels.to_particles, n, [*particles, self._velocity, self._substep, self._stray], **record
@@ -203,7 +202,7 @@ class Solver:
 
     def _load_motion(self, frame: int) -> None:
         """The body's pose and velocity in every substep of the frame that begins at `frame`."""
-        self._substep.fill_(-1)
+        self._substep.zero_()
         self._body.impulse.zero_()
         if self.scene.plate is None:
             return
@@ -237,7 +236,7 @@ class Solver:
             self._substeps()
         count, particle, substep, slow = (int(i) for i in self._stray.numpy())
         if count:
-            time = (index - 1) / self.scene.frame_rate + (substep + 1) * self.time_step
+            time = (index - 1) / self.scene.frame_rate + substep * self.time_step
             at = ", ".join(f"{c:.4f}" for c in self._x.numpy()[particle])
             cause = (
                 "it left the grid: soil was thrown or pushed beyond it, raise scene.bed.headroom"

@@ -10,38 +10,15 @@ from types import SimpleNamespace
 import warp as wp
 
 from .constitutive import constitutive, soil_struct
+from .contact import body_struct, contact
 from .effects import Effects
+from .grid import grid_struct
 
-__all__ = ["grid_struct", "transfer"]
-
-
-@cache
-def grid_struct(real: type) -> type:
-    """Struct of the grid and the step in precision `real`."""
-    vec3 = wp.types.vector(3, real)
-
-    @wp.struct
-    class Grid:
-        origin: vec3  # position of node (0, 0, 0) [m]
-        spacing: real  # dx [m]
-        inverse_spacing: real  # 1 / dx [1/m]
-        nx: int
-        ny: int
-        nz: int
-        dt: real  # [s]
-        gravity: real  # [m/s^2]
-        # Nodes with index <= low or >= high belong to the floor and the walls.
-        low: wp.vec3i
-        high: wp.vec3i
-        particle_mass: real  # [kg]
-        particle_volume: real  # at the critical density [m^3]
-        speed_limit: real  # one cell per step [m/s]
-
-    return Grid
+__all__ = ["transfer"]
 
 
 @cache
-def transfer(real: type, effects: Effects, atomic: bool) -> SimpleNamespace:
+def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> SimpleNamespace:
     """Kernels `to_grid` and `to_particles` in precision `real` with only the physics in `effects`.
 
     `atomic` is needed where many threads write to the grid at once (a GPU).
@@ -50,7 +27,8 @@ def transfer(real: type, effects: Effects, atomic: bool) -> SimpleNamespace:
     vec4 = wp.types.vector(4, real)
     law = constitutive(real, effects)
     vec6, mat33 = law.vec6, law.mat33
-    Soil, Grid = soil_struct(real), grid_struct(real)
+    Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real)
+    push = contact(real, atomic).push
     update, kirchhoff = law.update, law.kirchhoff
 
     @wp.func
@@ -91,12 +69,11 @@ def transfer(real: type, effects: Effects, atomic: bool) -> SimpleNamespace:
         ln_j: wp.array(dtype=real),
         grid: Grid,
         soil: Soil,
+        body: Body,
         nodes: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
     ):
         p = wp.tid()
-        if p == 0:
-            substep[0] = substep[0] + 1
         base, f = base_and_offset(x[p], grid)
         wx = weights(f[0])
         wy = weights(f[1])
@@ -108,6 +85,8 @@ def transfer(real: type, effects: Effects, atomic: bool) -> SimpleNamespace:
         )
         q = c[p] * (grid.particle_mass * h) + force
         start = grid.particle_mass * v[p] - q * f
+        if wp.static(with_body):
+            start += push(x[p], v[p], grid.particle_mass, grid.dt, substep[0], body)
         qx = vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0))
         qy = vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0))
         qz = vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0))

@@ -71,6 +71,8 @@ def test_arrangement_hash_names_the_start():
         ({"duration": 0.0}, "scene.duration"),
         ({"courant": 1.5}, "scene.courant is 1.5; allowed"),
         ({"body_grid": (0, 5)}, "scene.body_grid"),
+        ({"contact_margin": 2.0}, "scene.contact_margin"),
+        ({"blade": Plate(thickness=0.02)}, "too thin for a grid of 0.02 m"),
     ],
 )
 def test_what_a_scene_refuses(change, words):
@@ -117,8 +119,8 @@ def test_what_nested_data_may_not_say(data, words):
 
 
 def test_warnings_name_thin_plates_and_weak_soil():
-    thin = cut(blade=Plate(length=0.2, width=0.19, thickness=0.02))
-    assert any("1.0 grid spacings thick" in w for w in thin.warnings())
+    thin = cut(blade=Plate(length=0.2, width=0.19, thickness=0.03))
+    assert any("1.5 grid spacings thick" in w for w in thin.warnings())
     weak = cut(material=Material(static_friction=0.4))
     assert any("K0" in w for w in weak.warnings())
     assert cut().warnings() == []

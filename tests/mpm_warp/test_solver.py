@@ -166,6 +166,45 @@ def test_impulse_on_the_body_is_the_soils_momentum():
     np.testing.assert_allclose(impulse, -gained, atol=1e-12 * abs(gained[0]))
 
 
+@pytest.fixture(scope="module")
+def steady_cut():
+    """A plate at a constant depth of 4 cm, moving over six cells."""
+    path = ((0.0, 0.10, 0.2, 0.06, 0, 0, 0, 1), (0.6, 0.22, 0.2, 0.06, 0, 0, 0, 1))
+    scene = cut(motion="path", path=path, duration=0.6, frame_rate=100.0)
+    return scene, list(Solver(scene).frames())
+
+
+def test_the_force_does_not_come_and_go_with_the_cells(steady_cut):
+    """Crossing a cell takes 10 frames; the draft's swing over that period is small against its mean."""
+    _, frames = steady_cut
+    draft = -np.array([f.force[0] for f in frames[20:]])
+    smooth = np.convolve(draft, np.ones(10) / 10, mode="valid")
+    swing = draft[5 : 5 + len(smooth)] - smooth
+    assert smooth.min() > 0.0
+    assert swing.std() < 0.15 * smooth.mean()
+
+
+def test_soil_does_not_enter_the_plate(steady_cut):
+    """No particle's centre gets deeper than the contact margin and a tenth of a cell."""
+    scene, frames = steady_cut
+    core = scene.blade.half_size - 0.6 * scene.bed.spacing
+    for frame in frames[20::10]:
+        inside = np.all(np.abs(frame.position - frame.body_pose[:3]) < core, axis=1)
+        assert not inside.any()
+
+
+def test_soil_does_not_cross_the_plate(steady_cut):
+    """Soil in front of the plate does not end behind it, except by flowing around its side edges."""
+    scene, frames = steady_cut
+    start, end = frames[0], frames[-1]
+    half = scene.blade.half_size
+    ahead = start.position[:, 0] > start.body_pose[0] + half[0]
+    away_from_edges = np.abs(end.position[:, 1] - end.body_pose[1]) < half[1] - scene.bed.spacing
+    behind = end.position[:, 0] < end.body_pose[0] - half[0]
+    above_tip = end.position[:, 2] > end.body_pose[2] - half[2]
+    assert np.sum(ahead & away_from_edges & behind & above_tip) == 0
+
+
 def test_torque_is_about_the_centre_of_mass():
     """Force and torque of a thin slice of contact: T = r x F for soil on one side only."""
     frame = last_frame(cut(motion="path", path=diagonal_path(0.0), duration=0.02, frame_rate=100.0))
