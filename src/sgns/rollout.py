@@ -13,17 +13,18 @@ import numpy as np
 import torch
 
 from sgns.errors import UserError
-from sgns.runs import RunWriter
+from sgns.runs import RunWriter, frame_chunks
+from sgns.settings import differences
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+    from mpm_warp import Scene
+    from sgns.simulator import Rollout, Simulator
+
 __all__ = ["RolloutTiming", "main", "require_known_bed", "rollout_scene", "write_rollout"]
 
 log = logging.getLogger(__name__)
-
-# Decoded positions held at one time [bytes, float64].
-CHUNK_BYTES = 32e6
 
 
 @dataclass(frozen=True)
@@ -53,14 +54,14 @@ class RolloutTiming:
 
 def write_rollout(
     path: str | Path,
-    simulator: Any,
-    scene: Any,
-    rollout: Any,
+    simulator: Simulator,
+    scene: dict[str, Any],
+    rollout: Rollout,
     *,
-    effects: Mapping[str, Mapping[str, Any]] | None = None,
+    effects: dict[str, dict[str, Any]] | None = None,
     seed: int = 0,
-    start: np.ndarray | None = None,
-    extra: dict[str, Any] | None = None,
+    checkpoint: str | Path = "",
+    given_frames: int = 1,
 ) -> Path:
     """Decodes a rollout and writes it as a run file (producer `rollout`).
 
@@ -68,58 +69,61 @@ def write_rollout(
 
     Args:
         path: run file to write; complete or absent, never half-written.
-        simulator: the `Simulator` that made the rollout.
-        scene: an `mpm_warp.Scene` or the dict of one.
-        rollout: `Rollout` of T frames.
+        simulator: the one that made the rollout.
+        scene: the scene as plain data.
+        rollout: of T frames.
         effects: resolved effects to record; none by default, a network has no such choice.
         seed: recorded seed.
-        start: true positions of frame 0 [m], shape (n, 3), written in place of its reconstruction.
-        extra: further attributes of the run file.
+        checkpoint: file that the simulator was loaded from; recorded with its settings.
+        given_frames: how many frames at the start are no predictions; recorded as `history`.
 
     Returns:
         The path written.
+
+    Raises:
+        UserError: the rollout is not finite, or the file cannot be written.
     """
     path = Path(path)
     require_finite(path, rollout)
     began = time.perf_counter()
-    n = len(simulator.start_positions)
-    latent = torch.as_tensor(rollout.latent)
-    frames = len(latent)
     rate = float(simulator.frame_rate)
-    chunk = max(1, int(CHUNK_BYTES / (24.0 * n)))
-    writer = RunWriter(
+    latent = torch.as_tensor(rollout.latent)
+    particle_count = len(simulator.start_positions)
+    with RunWriter(
         path,
-        scene=dict(scene) if isinstance(scene, Mapping) else scene.to_dict(),
-        effects={name: dict(effect) for name, effect in (effects or {}).items()},
+        scene=scene,
+        effects=effects or {},
         arrangement_hash=simulator.arrangement_hash,
-        particle_count=n,
+        particle_count=particle_count,
         body_points=rollout.body_points.shape[1],
         frame_rate=rate,
         seed=seed,
         producer="rollout",
-        extra=extra,
-    )
-    poses, points, force, torque = (
-        np.asarray(value) for value in (rollout.poses, rollout.body_points, rollout.force, rollout.torque)
-    )
-    with writer:
+        extra={
+            "checkpoint": str(checkpoint),
+            "checkpoint_version": simulator.card.get("package_version"),
+            "checkpoint_settings": simulator.card.get("settings", {}),
+            "history": given_frames,
+        },
+    ) as writer:
         previous = None
-        for first in range(0, frames, chunk):
-            decoded = simulator.basis.inverse(latent[first : first + chunk]).numpy()
-            for offset, position in enumerate(decoded):
-                frame = first + offset
-                if frame == 0 and start is not None:
-                    position = np.asarray(start, dtype=np.float64)
-                velocity = np.zeros_like(position) if previous is None else (position - previous) * rate
-                previous = position
+        for frames in frame_chunks(particle_count, len(latent)):
+            for frame, position in enumerate(simulator.basis.inverse(latent[frames]).numpy(), frames.start):
                 writer.append(
-                    frame / rate, position, velocity, points[frame], poses[frame], force[frame], torque[frame]
+                    frame / rate,
+                    position,
+                    np.zeros_like(position) if previous is None else (position - previous) * rate,
+                    rollout.body_points[frame],
+                    rollout.poses[frame],
+                    rollout.force[frame],
+                    rollout.torque[frame],
                 )
+                previous = position
         writer.finish(float(rollout.wall_time_s) + time.perf_counter() - began)
     return path
 
 
-def require_finite(path: Path, rollout: Any) -> None:
+def require_finite(path: Path, rollout: Rollout) -> None:
     """Refuses a rollout whose network ran away from the numbers it knows."""
     latent = np.asarray(rollout.latent, dtype=np.float64).reshape(len(rollout.latent), -1)
     finite = np.isfinite(np.hstack([latent, np.asarray(rollout.force), np.asarray(rollout.torque)])).all(
@@ -133,7 +137,7 @@ def require_finite(path: Path, rollout: Any) -> None:
         )
 
 
-def require_known_bed(simulator: Any, scene: Any, checkpoint: str | Path) -> None:
+def require_known_bed(simulator: Simulator, scene: Scene, checkpoint: str | Path) -> None:
     """Refuses a scene whose particles are not the ones the checkpoint's basis was fitted on."""
     if scene.arrangement_hash != simulator.arrangement_hash:
         raise UserError(
@@ -151,11 +155,9 @@ def require_known_bed(simulator: Any, scene: Any, checkpoint: str | Path) -> Non
 
 def bed_differences(known: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     """Names the values of two scenes' beds that differ, the checkpoint's first."""
-    a, b = flat(known.get("bed", known)), flat(asked.get("bed", asked))
     named = [
-        f"{key} {a.get(key, 'absent')} (here {b.get(key, 'absent')})"
-        for key in a | b
-        if a.get(key) != b.get(key)
+        f"{key} {a} (here {b})"
+        for key, (a, b) in differences(known.get("bed", {}), asked.get("bed", {})).items()
     ]
     if not named:
         return "the particles' arrangement differs"
@@ -169,27 +171,20 @@ def unlearned(known: Mapping[str, Any], asked: Mapping[str, Any]) -> list[str]:
     Returns:
         `key value (trained with value)` for every such key of blade, material and gravity.
     """
-    a, b = flat(known), flat(asked)
-    fixed = [key for key in b if key.split(".")[0] in ("blade", "material", "gravity") and key in a]
-    return [f"{key} {b[key]} (trained with {a[key]})" for key in fixed if a[key] != b[key]]
+    return [
+        f"{key} {b} (trained with {a})"
+        for key, (a, b) in differences(known, asked).items()
+        if key.split(".")[0] in ("blade", "material", "gravity") and a is not None and b is not None
+    ]
 
 
-def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A nested dict as one level, keys joined by dots."""
-    out: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            out |= flat(value, f"{prefix}{key}.")
-        else:
-            out[f"{prefix}{key}"] = value
-    return out
-
-
-def rollout_scene(simulator: Any, scene: Any, path: str | Path, *, seed: int = 0) -> RolloutTiming:
+def rollout_scene(
+    simulator: Simulator, scene: Scene, path: str | Path, *, seed: int = 0, checkpoint: str | Path = ""
+) -> RolloutTiming:
     """Rolls a scene that was never simulated out, from the common start at rest, into a run file."""
     rollout = simulator.rollout(scene.body_poses(), scene.body_points())
     began = time.perf_counter()
-    write_rollout(path, simulator, scene, rollout, seed=seed)
+    write_rollout(path, simulator, scene.to_dict(), rollout, seed=seed, checkpoint=checkpoint)
     writing = time.perf_counter() - began
     steps = len(rollout.latent) - 1
     return RolloutTiming(steps / float(simulator.frame_rate), float(rollout.wall_time_s), writing)
@@ -200,14 +195,14 @@ def main(cfg: DictConfig) -> float:
     from sgns.scenes import scene_from_config
     from sgns.simulator import Simulator
 
-    simulator = Simulator.load(cfg.checkpoint, device=cfg.get("device", "cpu"))
     scene = scene_from_config(cfg)
+    simulator = Simulator.load(cfg.checkpoint, device=cfg.device)
     require_known_bed(simulator, scene, cfg.checkpoint)
     ignored = unlearned(simulator.scene, scene.to_dict())
     if ignored:
         log.warning("the network follows the tool's path only; it does not know of %s", ", ".join(ignored))
     output = Path(cfg.output)
-    timing = rollout_scene(simulator, scene, output, seed=int(cfg.get("seed") or 0))
+    timing = rollout_scene(simulator, scene, output, seed=cfg.seed, checkpoint=cfg.checkpoint)
     log.info("rolled out %d frames (%.3g s) into %s", scene.frame_count, timing.simulated, output)
     log.info("wall seconds per simulated second: %.3g stepping with force", timing.stepping_rate)
     log.info(

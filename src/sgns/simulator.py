@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from sgns.errors import UserError
-from sgns.learning.body import BodyTrack, body_track, check_poses, in_world_frame
+from sgns.learning.body import BodyTrack, body_track
 from sgns.learning.surrogate import Surrogate, load_surrogate
+from sgns.poses import check_poses, in_world_frame
 from sgns.reduction.basis import Basis
 
 __all__ = ["Rollout", "Simulator", "State"]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from synthetic import make_run
 
-from sgns.learning.body import in_world_frame
+from sgns.evaluation.metrics import VectorErrors
+from sgns.evaluation.scores import Scores
+from sgns.poses import in_world_frame
 from sgns.reduction import Basis, IncrementalPCA
 from sgns.runs import Run
 
@@ -47,6 +50,7 @@ class FakeSimulator:
 
     history = 3
     frame_rate = 60.0
+    card: ClassVar = {"settings": {"num_modes": 6}, "package_version": "0"}
 
     def __init__(
         self, basis: Basis, paths: list[Path], mistake: Any = None, force_factor: float = 1.0
@@ -95,3 +99,13 @@ def frozen_latent(latent: np.ndarray, history: int) -> np.ndarray:
     """Nothing moves after the history."""
     latent[history:] = latent[history - 1]
     return latent
+
+
+def made_scores(name: str, total: float, frozen: float, force: float = 1.0, rate: float = 10.0) -> Scores:
+    """Scores of four frames with given position errors [m²], factor on the force, and solver time."""
+    truth = np.full((4, 3), [-100.0, 0.0, 50.0])
+    errors = VectorErrors.compare(truth, force * truth)
+    mse = dict.fromkeys(("reduction", "network", "surface", "surface_frozen"), 1e-6)
+    mse |= {"total": total, "frozen": frozen, "constant_velocity": 2.0 * frozen}
+    mpe = {"draft": 100 * abs(force - 1), "lateral": math.nan, "vertical": 100 * abs(force - 1)}
+    return Scores(name, 4, mse, errors, errors, errors, errors, rate, mpe)

@@ -14,7 +14,7 @@ import numpy as np
 
 from sgns.runs import RunWriter
 
-__all__ = ["BED", "PLATE", "make_run", "make_writer", "random_frame", "start_positions"]
+__all__ = ["BED", "PLATE", "make_run", "make_writer", "random_frame", "random_poses", "start_positions"]
 
 BED = np.array([0.80, 0.60, 0.15])
 """Lx, Ly, Lz [m]."""
@@ -118,6 +118,13 @@ def random_frame(i: int, n: int = 4, m: int = 2) -> dict[str, Any]:
         "force": rng.random(3),
         "torque": rng.random(3),
     }
+
+
+def random_poses(count: int = 6) -> np.ndarray:
+    """Random places [m] and moderate random turns, shape (count, 7)."""
+    rng = np.random.default_rng(0)
+    place, turn = rng.normal(size=(count, 3)), 0.3 * rng.normal(size=(count, 4)) + [0.0, 0.0, 0.0, 1.0]
+    return np.hstack([place, turn / np.linalg.norm(turn, axis=1, keepdims=True)])
 
 
 def _about_y(angle: float) -> np.ndarray:

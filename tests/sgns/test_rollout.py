@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from surrogates import FakeSimulator, fitted, small_dataset
 
-from sgns import rollout as rollout_module
 from sgns.errors import UserError
 from sgns.rollout import (
     RolloutTiming,
@@ -10,9 +9,8 @@ from sgns.rollout import (
     require_known_bed,
     rollout_scene,
     unlearned,
-    write_rollout,
 )
-from sgns.runs import Run, check_run
+from sgns.runs import Run, check_run, chunks
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +62,7 @@ def test_file_is_a_complete_run_with_decoded_soil(simulator, tmp_path):
 def test_velocities_are_differences_of_positions(simulator, tmp_path, monkeypatch):
     scene = FakeScene(simulator)
     rollout_scene(simulator, scene, tmp_path / "a.h5")
-    monkeypatch.setattr(rollout_module, "CHUNK_BYTES", 1.0)  # one frame at a time
+    monkeypatch.setattr(chunks, "CHUNK_BYTES", 1.0)  # one frame at a time
     rollout_scene(simulator, scene, tmp_path / "b.h5")
     with Run(tmp_path / "a.h5") as a, Run(tmp_path / "b.h5") as b:
         velocity, position = a.velocities(), a.positions().astype(np.float64)
@@ -73,14 +71,12 @@ def test_velocities_are_differences_of_positions(simulator, tmp_path, monkeypatc
         assert a.content_hash == b.content_hash
 
 
-def test_true_start_replaces_its_reconstruction(simulator, tmp_path):
-    scene = FakeScene(simulator)
-    rollout = simulator.rollout(scene.body_poses(), scene.body_points())
-    start = simulator.start_positions
-    path = write_rollout(tmp_path / "a.h5", simulator, scene, rollout, start=start, extra={"note": "x"})
-    with Run(path) as run:
-        assert run.positions(slice(0, 1))[0] == pytest.approx(start.astype(np.float32))
-        assert run.extra["note"] == "x"
+def test_run_file_says_which_checkpoint_made_it(simulator, tmp_path):
+    rollout_scene(simulator, FakeScene(simulator), tmp_path / "a.h5", checkpoint="first/best.ckpt")
+    with Run(tmp_path / "a.h5") as run:
+        assert run.extra["checkpoint"] == "first/best.ckpt"
+        assert run.extra["checkpoint_settings"] == simulator.card["settings"]
+        assert run.extra["history"] == 1
 
 
 def test_unknown_bed_is_refused_in_one_line_that_names_it(simulator):

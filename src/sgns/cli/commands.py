@@ -24,24 +24,42 @@ __all__ = ["COMMANDS", "main", "run_command"]
 
 
 class Command(NamedTuple):
-    """One command: the module whose `main(cfg)` does it, a line of help, and what its `output` is."""
+    """One command.
+
+    Attributes:
+        module: whose `main(cfg)` does it.
+        summary: a line of help.
+        output: what its `output` is: "file", "folder", or None where it has none.
+        needs: dotted keys of paths that it cannot do without.
+    """
 
     module: str
     summary: str
     output: str | None
+    needs: tuple[str, ...] = ()
 
 
 COMMANDS = {
     "simulate": Command(
-        "sgns.simulate", "simulate a scene or a dataset with the material point method", "file"
+        "sgns.simulate", "simulate a scene or a dataset with the material point method", "file", ("output",)
     ),
     "reduce": Command(
-        "sgns.reduction.reduced", "fit the basis (PCA) on a dataset and reduce its runs", "folder"
+        "sgns.reduction.reduce",
+        "fit the basis (PCA) on a dataset and reduce its runs",
+        "folder",
+        ("dataset.path",),
     ),
-    "train": Command("sgns.learning.training", "learn a simulator from a dataset", "folder"),
-    "rollout": Command("sgns.rollout", "let a trained network play a scene", "file"),
+    "train": Command(
+        "sgns.learning.training", "learn a simulator from a dataset", "folder", ("dataset.path",)
+    ),
+    "rollout": Command(
+        "sgns.rollout", "let a trained network play a scene", "file", ("checkpoint", "output")
+    ),
     "evaluate": Command(
-        "sgns.evaluation.evaluate", "compare a trained network with true runs; write the report", "folder"
+        "sgns.evaluation.evaluate",
+        "compare a trained network with true runs; write the report",
+        "folder",
+        ("dataset.path", "checkpoint"),
     ),
     "check": Command("sgns.check", "read run files through and list what is wrong with them", None),
 }
@@ -104,6 +122,8 @@ def run_command(cfg: DictConfig) -> float | None:
     """Hydra's task: run one job; its value is the command's main metric, for sweepers to optimise."""
     from hydra.core.hydra_config import HydraConfig
 
+    from sgns.cli.shared_settings import check_shared
+
     hydra_cfg = HydraConfig.get()
     name = hydra_cfg.job.config_name
     in_sweep = hydra_cfg.mode.name == "MULTIRUN"
@@ -111,10 +131,8 @@ def run_command(cfg: DictConfig) -> float | None:
     interrupted = False
     try:
         _place_output(cfg, hydra_cfg, COMMANDS[name], in_sweep)
-        _require_values(cfg, name)
-        module = importlib.import_module(COMMANDS[name].module)
-        _quiet_libraries()
-        return module.main(cfg)
+        check_shared(cfg, name, COMMANDS[name].needs)
+        return importlib.import_module(COMMANDS[name].module).main(cfg)
     except KeyboardInterrupt:
         interrupted = True
     except SystemExit as error:
@@ -229,19 +247,6 @@ def _place_output(cfg: DictConfig, hydra_cfg: Any, command: Command, in_sweep: b
         cfg.output = str(folder / (path.name if path.is_absolute() else path))
 
 
-def _require_values(cfg: DictConfig, name: str) -> None:
-    """Refuse settings that still lack a value (???) or point nowhere, before any work is done."""
-    from omegaconf import OmegaConf
-
-    missing = sorted(OmegaConf.missing_keys(cfg))
-    if missing:
-        keys = " ".join(f"{key}=..." for key in missing)
-        what = "a value is" if len(missing) == 1 else "values are"
-        give = "run files, as in sgns check run.h5" if name == "check" else keys
-        raise UserError(f"{what} missing for {', '.join(missing)}; give {give}; see sgns {name} --help")
-    OmegaConf.to_container(cfg, resolve=True)
-
-
 def _drop_empty_output(hydra_cfg: Any) -> bool:
     """Remove the run folder when nothing but Hydra's record is in it; says whether it is still there."""
     folder = Path(hydra_cfg.runtime.output_dir)
@@ -296,13 +301,3 @@ def _show_traceback() -> None:
         import traceback
 
         traceback.print_exc()
-
-
-def _quiet_libraries() -> None:
-    from sgns.cli.console import quiet_libraries
-
-    quiet_libraries()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

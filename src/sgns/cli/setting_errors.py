@@ -38,6 +38,10 @@ def describe(error: Exception) -> str | None:
         return _missing_option(error)
     if isinstance(error, ConfigCompositionException):
         return _composition(error)
+    if isinstance(error, ValueError) and str(error).startswith("Config group override must be a string"):
+        return (
+            "a group is null or a number; groups take one of their options, as in dataset=quick; see --help"
+        )
     if isinstance(error, (HydraException, ConfigLoadError, yaml.YAMLError, *_WRITTEN)):
         return _flat(str(error))
     return None

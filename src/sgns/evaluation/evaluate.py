@@ -12,122 +12,37 @@ import statistics
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from sgns.errors import UserError
-from sgns.evaluation.metrics import PositionErrors, mean_prediction, position_errors, reconstruction_curve
+from sgns.evaluation.metrics import mean_prediction, position_errors
 from sgns.evaluation.provenance import provenance
+from sgns.evaluation.report import write_report
 from sgns.evaluation.report_words import describe, short_names
-from sgns.evaluation.scores import Scores, aggregate, run_scores, write_csv, write_json
+from sgns.evaluation.results import EvaluatedRun, Evaluation, NetworkTiming
+from sgns.evaluation.scores import aggregate, run_scores
 from sgns.evaluation.surface import surface_grid
+from sgns.evaluation.tables import write_tables
+from sgns.poses import in_body_frame
 from sgns.reduction import Basis
+from sgns.reduction.reconstruction import reduction_curves
 from sgns.rollout import write_rollout
 from sgns.runs import Run
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-__all__ = ["EvaluatedRun", "Evaluation", "NetworkTiming", "ReductionCurves", "evaluate", "main"]
+    from sgns.campaign import Dataset
+    from sgns.simulator import Rollout, Simulator
+
+__all__ = ["evaluate", "main"]
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class EvaluatedRun:
-    """One run of the split and its rollout.
-
-    Attributes:
-        name: of the run.
-        label: short name.
-        words: its scene in a few words; empty if there is nothing to say.
-        truth: path of the simulated run.
-        rollout: path of the predicted run.
-        errors: position errors through time.
-        scores: every metric.
-    """
-
-    name: str
-    label: str
-    words: str
-    truth: Path
-    rollout: Path
-    errors: PositionErrors
-    scores: Scores
-
-
-@dataclass(frozen=True)
-class NetworkTiming:
-    """Wall seconds per simulated second of the network: medians of warm repeats on one thread.
-
-    Attributes:
-        stepping: steps with force and torque; the soil stays in the subspace.
-        decoding: the same, and every frame decoded to all particles.
-        repeats: number of timed repeats.
-        run: run that was timed.
-    """
-
-    stepping: float
-    decoding: float
-    repeats: int
-    run: str
-
-
-@dataclass(frozen=True)
-class ReductionCurves:
-    """What the subspace holds for r = 1 … R modes.
-
-    Attributes:
-        energy: the paper's energy on the training runs, shape (R,).
-        displacement_energy: share of the motion's variance on the training runs, shape (R,).
-        training: reduction MSE on the training runs [m²], shape (R,).
-        evaluated: reduction MSE on the evaluated runs [m²] for r = 0 … R, shape (R + 1,).
-    """
-
-    energy: np.ndarray
-    displacement_energy: np.ndarray
-    training: np.ndarray
-    evaluated: np.ndarray
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Everything that a report shows, in numbers.
-
-    Attributes:
-        dataset: name of the dataset.
-        split: which of its splits was evaluated.
-        runs: the evaluated runs.
-        total: scores of all of them together.
-        timing: of the network.
-        mean_force: mean force of the training split [N], shape (3,).
-        curves: of the reduction.
-        num_modes: modes r that the network uses.
-        history: frames d that it was given.
-        particle_count: particles n of the bed.
-        start: common start of the particles [m], shape (n, 3).
-        new_rollouts: run files without truth that are shown too.
-        made: how it was made: name → value, in the order to show.
-    """
-
-    dataset: str
-    split: str
-    runs: Sequence[EvaluatedRun]
-    total: Scores
-    timing: NetworkTiming
-    mean_force: np.ndarray
-    curves: ReductionCurves
-    num_modes: int
-    history: int
-    particle_count: int
-    start: np.ndarray
-    new_rollouts: Sequence[Path] = ()
-    made: dict[str, str] = field(default_factory=dict)
 
 
 @contextmanager
@@ -141,31 +56,19 @@ def single_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def points_in_body_frame(run: Run) -> np.ndarray:
-    """The body's points fixed to the body [m], shape (M, 3), from their places in frame 0."""
-    pose = run.pose[0]
-    offset = run.body_points[0] - pose[:3]
-    axis, w = -pose[3:6], pose[6]  # the conjugate turns world → body
-    twice = 2.0 * np.cross(axis, offset)
-    return offset + w * twice + np.cross(axis, twice)
+def roll_out(simulator: Simulator, run: Run) -> Rollout:
+    """The network along a run's tool path, from the run's first d true frames."""
+    points = in_body_frame(run.pose[0], run.body_points[0])
+    given = simulator.basis.transform(run.positions(slice(0, simulator.history)))
+    return simulator.rollout(run.pose, points, latent_history=given)
 
 
-def true_history(simulator: Any, run: Run) -> torch.Tensor:
-    """The first d true frames in the subspace, shape (d, r, 3)."""
-    return simulator.basis.transform(torch.from_numpy(run.positions(slice(0, simulator.history))).double())
-
-
-def roll_out(simulator: Any, run: Run) -> Any:
-    """The network's `Rollout` along a run's tool path from its true history."""
-    return simulator.rollout(run.pose, points_in_body_frame(run), latent_history=true_history(simulator, run))
-
-
-def time_network(simulator: Any, path: Path, repeats: int) -> NetworkTiming:
+def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTiming:
     """Times rollouts along one run's tool path, after one that warms up."""
     stepping, decoding = [], []
     with Run(path) as run, single_thread():
         simulated = (run.frame_count - simulator.history) / run.frame_rate
-        for repeat in range(max(repeats, 3) + 1):
+        for repeat in range(repeats + 1):
             rollout = roll_out(simulator, run)
             began = time.perf_counter()
             for latent in torch.as_tensor(rollout.latent):
@@ -178,7 +81,7 @@ def time_network(simulator: Any, path: Path, repeats: int) -> NetworkTiming:
         )
 
 
-def full_basis(dataset: Any, basis: Basis) -> Basis:
+def full_basis(dataset: Dataset, basis: Basis) -> Basis:
     """The dataset's cached basis with more modes whose first modes are the network's; else the network's."""
     best = basis
     for path in sorted(Path(dataset.path).glob("reduced/*/basis.h5")):
@@ -194,22 +97,6 @@ def full_basis(dataset: Any, basis: Basis) -> Basis:
     return best
 
 
-def reduction_curves(basis: Basis, paths: Sequence[Path]) -> ReductionCurves:
-    """Energy and reconstruction error of a basis on the training runs and on some others."""
-
-    def runs() -> Iterator[Run]:
-        for path in paths:
-            with Run(path) as run:
-                yield run
-
-    return ReductionCurves(
-        energy=np.asarray(basis.energy()),
-        displacement_energy=np.asarray(basis.displacement_energy()),
-        training=np.asarray(basis.residual_mse()),
-        evaluated=reconstruction_curve(runs(), basis),
-    )
-
-
 def training_means(paths: Sequence[Path], history: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean force [N] and torque [N m] of the training split, shape (3,) each."""
     forces, torques = [], []
@@ -220,7 +107,7 @@ def training_means(paths: Sequence[Path], history: int) -> tuple[np.ndarray, np.
     return mean_prediction(forces, history), mean_prediction(torques, history)
 
 
-def require_known_run(simulator: Any, run: Run, checkpoint: Path) -> None:
+def require_known_run(simulator: Simulator, run: Run, checkpoint: Path) -> None:
     """Refuses a run that the checkpoint's subspace cannot describe."""
     if run.arrangement_hash != simulator.arrangement_hash:
         raise UserError(
@@ -235,12 +122,12 @@ def require_known_run(simulator: Any, run: Run, checkpoint: Path) -> None:
 
 
 def evaluate(
-    simulator: Any,
-    dataset: Any,
+    simulator: Simulator,
+    dataset: Dataset,
     output: Path,
     *,
     split: str = "test",
-    checkpoint: Path = Path("checkpoint"),
+    checkpoint: Path,
     new_rollouts: Sequence[Path] = (),
     repeats: int = 3,
     made: dict[str, str] | None = None,
@@ -252,9 +139,9 @@ def evaluate(
         dataset: `Dataset` with the runs.
         output: folder to write to.
         split: `train`, `validation` or `test`.
-        checkpoint: named in messages.
+        checkpoint: file of the simulator, for messages and the rollouts' run files.
         new_rollouts: run files without truth, checked here and shown in the report.
-        repeats: timed rollouts, at least 3.
+        repeats: timed rollouts.
         made: how it was made, for the report.
     """
     paths = [Path(path) for path in dataset.runs(split)]
@@ -263,7 +150,7 @@ def evaluate(
             f"dataset {dataset.name} has no complete run in its split {split!r}; allowed: train, "
             f"validation, test; simulate it first: sgns simulate dataset={dataset.name}"
         )
-    for path in new_rollouts:
+    for path in (*paths, *new_rollouts):  # all of them before anything is written
         with Run(path) as run:
             require_known_run(simulator, run, checkpoint)
     try:
@@ -283,16 +170,15 @@ def evaluate(
         target = output / "rollouts" / f"{path.stem}.h5"
         with ExitStack() as stack:
             truth = stack.enter_context(Run(path))
-            require_known_run(simulator, truth, checkpoint)
-            rollout = roll_out(simulator, truth)
             write_rollout(
                 target,
                 simulator,
                 truth.scene,
-                rollout,
+                roll_out(simulator, truth),
                 effects=truth.effects,
                 seed=truth.seed,
-                extra={"checkpoint": str(checkpoint), "history": history},
+                checkpoint=checkpoint,
+                given_frames=history,
             )
             prediction = stack.enter_context(Run(target))
             errors = position_errors(truth, prediction, simulator.basis, history, grid)
@@ -317,35 +203,6 @@ def evaluate(
     )
     write_tables(evaluation, output)
     return evaluation
-
-
-def write_tables(evaluation: Evaluation, output: Path) -> None:
-    """`metrics.csv`: a row per run and one for all; `metrics.json`: the same and everything around it."""
-    scores = [run.scores for run in evaluation.runs]
-    write_csv(output / "metrics.csv", [*scores, evaluation.total])
-    timing = evaluation.timing
-    write_json(
-        output / "metrics.json",
-        {
-            "dataset": evaluation.dataset,
-            "split": evaluation.split,
-            "num_modes": evaluation.num_modes,
-            "history": evaluation.history,
-            "particles": evaluation.particle_count,
-            "aggregate": evaluation.total.row(),
-            "runs": [score.row() for score in scores],
-            "mean_training_force_N": evaluation.mean_force,
-            "wall_s_per_simulated_s": {
-                "solver": evaluation.total.solver_rate,
-                "network_stepping_with_force": timing.stepping,
-                "network_with_decoding": timing.decoding,
-                "network_threads": 1,
-                "network_repeats": timing.repeats,
-            },
-            "reconstruction_mse_m2": evaluation.curves.evaluated,
-            "made": evaluation.made,
-        },
-    )
 
 
 def log_summary(evaluation: Evaluation, report: Path) -> None:
@@ -380,20 +237,23 @@ def log_summary(evaluation: Evaluation, report: Path) -> None:
 def main(cfg: DictConfig) -> float:
     """The `sgns evaluate` command; returns the position skill against frozen over all runs of the split."""
     from sgns.campaign import Dataset
-    from sgns.evaluation.report import write_report
     from sgns.simulator import Simulator
 
+    new_rollouts = [cfg.new_rollouts] if isinstance(cfg.new_rollouts, str) else cfg.new_rollouts or []
+    if not isinstance(cfg.timing_repeats, int) or cfg.timing_repeats < 3:
+        raise UserError(f"timing_repeats is {cfg.timing_repeats!r}; it must be a whole number, at least 3")
     checkpoint = Path(cfg.checkpoint)
-    simulator = Simulator.load(checkpoint, device=cfg.get("device") or "cpu")
+    dataset = Dataset.open(cfg.dataset.path)
+    simulator = Simulator.load(checkpoint, device=cfg.device)
     output = Path(cfg.output)
     evaluation = evaluate(
         simulator,
-        Dataset.open(cfg.dataset.path),
+        dataset,
         output,
-        split=str(cfg.split),
+        split=cfg.split,
         checkpoint=checkpoint,
-        new_rollouts=[Path(path) for path in cfg.get("new_rollouts") or ()],
-        repeats=int(cfg.get("timing_repeats") or 3),
+        new_rollouts=[Path(str(path)) for path in new_rollouts],
+        repeats=cfg.timing_repeats,
         made=provenance(simulator, checkpoint),
     )
     report = write_report(evaluation, output)

@@ -16,6 +16,7 @@ import torch
 
 from sgns.errors import UserError
 from sgns.evaluation.surface import SurfaceGrid, height_map
+from sgns.runs import frame_chunks
 
 __all__ = [
     "FORCE_COMPONENTS",
@@ -24,7 +25,6 @@ __all__ = [
     "VectorErrors",
     "mean_prediction",
     "position_errors",
-    "reconstruction_curve",
     "skill",
 ]
 
@@ -35,9 +35,6 @@ TORQUE_COMPONENTS = {"roll": 0, "pitch": 1, "yaw": 2}
 # A component this small beside the whole vector (RMS) is zero by symmetry, up to noise of the truth:
 # dividing by it says nothing, so relative metrics are left out (NaN).
 NEGLIGIBLE_SHARE = 0.05
-
-# Decoded positions held at one time [bytes, float64].
-CHUNK_BYTES = 32e6
 
 
 @dataclass(frozen=True)
@@ -182,13 +179,6 @@ def mean_prediction(histories: Iterable[np.ndarray], history: int) -> np.ndarray
     return total / max(count, 1)
 
 
-def frame_chunks(first: int, last: int, particle_count: int) -> Iterable[slice]:
-    """Slices of at least one frame that cover first … last − 1 with bounded memory."""
-    step = max(1, int(CHUNK_BYTES / (24.0 * max(particle_count, 1))))
-    for start in range(first, last, step):
-        yield slice(start, min(start + step, last))
-
-
 def require_comparable(truth: Any, prediction: Any, history: int) -> None:
     """Refuses pairs of runs that cannot be compared frame by frame and particle by particle."""
     for what, a, b in (
@@ -230,7 +220,7 @@ def position_errors(
     last_heights = height_map(last, grid)
     names = [f.name for f in fields(PositionErrors) if f.name != "time"]
     collected: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    for frames in frame_chunks(history, truth.frame_count, truth.particle_count):
+    for frames in frame_chunks(truth.particle_count, truth.frame_count, history):
         true = np.asarray(truth.positions(frames), dtype=np.float64)
         predicted = np.asarray(prediction.positions(frames), dtype=np.float64)
         latent = basis.transform(torch.from_numpy(true))
@@ -262,30 +252,3 @@ def height_error(a: np.ndarray, b: np.ndarray) -> float:
     """Mean-square difference [m²] of two height maps (nx, ny) [m] over the columns that both fill."""
     both = np.isfinite(a) & np.isfinite(b)
     return float(np.mean((a[both] - b[both]) ** 2)) if both.any() else math.nan
-
-
-def reconstruction_curve(runs: Iterable[Any], basis: Any) -> np.ndarray:
-    """Reduction MSE of runs for every number of modes, in one pass.
-
-    Orthonormal modes take away their share one after the other: the residual with r modes is
-    ‖S − S̄‖² less the squared first r coordinates.
-
-    Args:
-        runs: `Run`s to reconstruct, each read in chunks.
-        basis: `Basis` with R modes.
-
-    Returns:
-        Mean over frames, particles and axes [m²] for r = 0 … R, shape (R + 1,).
-    """
-    total, taken, count = 0.0, np.zeros(basis.num_modes), 0
-    for run in runs:
-        for frames in frame_chunks(0, run.frame_count, run.particle_count):
-            centred = torch.from_numpy(np.asarray(run.positions(frames), dtype=np.float64))
-            latent = basis.transform(centred)
-            total += float((centred - basis.mean).square().sum())
-            taken += latent.square().sum(dim=(0, 2)).numpy()
-            count += centred.numel()
-    if count == 0:
-        return np.full(basis.num_modes + 1, np.nan)
-    residual = total - np.concatenate([[0.0], np.cumsum(taken)])
-    return np.maximum(residual, 0.0) / count

@@ -7,11 +7,14 @@ import platform
 import shlex
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 
 from sgns import __version__
+
+if TYPE_CHECKING:
+    from sgns.simulator import Simulator
 
 __all__ = ["cpu_model", "provenance", "usable_cores"]
 
@@ -44,15 +47,14 @@ def command_line() -> str:
     return shlex.join(["sgns", str(config.job.config_name), *config.overrides.task])
 
 
-def provenance(simulator: Any, checkpoint: Path) -> dict[str, str]:
+def provenance(simulator: Simulator, checkpoint: Path) -> dict[str, str]:
     """Name → value, in the order to show; what is not known is left out.
 
     Args:
         simulator: the trained `Simulator`; its card tells how it was trained.
         checkpoint: file it was loaded from.
     """
-    card = getattr(simulator, "card", None) or {}
-    settings = card.get("settings") or {}
+    settings = simulator.card.get("settings", {})
     facts = {
         "command": command_line(),
         "checkpoint": str(checkpoint),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -16,9 +15,10 @@ from typing import TYPE_CHECKING
 
 from sgns.evaluation.report_figures import ReportFigure, report_figures
 from sgns.evaluation.report_words import fixed, force_note, number, soil_note, summary, time_note
+from sgns.wholefile import write_whole
 
 if TYPE_CHECKING:
-    from sgns.evaluation.evaluate import Evaluation
+    from sgns.evaluation.results import Evaluation
 
 __all__ = ["render_report", "write_report"]
 
@@ -247,7 +247,5 @@ def write_report(evaluation: Evaluation, output: Path) -> Path:
     for figure in figures:
         (folder / f"{figure.name}.png").write_bytes(figure.png)
     path = output / "report.html"
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(render_report(evaluation, figures), encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, render_report(evaluation, figures))
     return path

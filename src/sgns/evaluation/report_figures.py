@@ -14,7 +14,7 @@ from sgns.evaluation.surface import surface_grid
 from sgns.runs import Run
 
 if TYPE_CHECKING:
-    from sgns.evaluation.evaluate import EvaluatedRun, Evaluation
+    from sgns.evaluation.results import EvaluatedRun, Evaluation
 
 __all__ = ["ReportFigure", "report_figures"]
 
@@ -147,9 +147,7 @@ def reduction(evaluation: Evaluation) -> list[ReportFigure]:
             f"Projection of the {evaluation.split} runs on r modes and back; the horizontal line is the "
             f"rollout's error with {evaluation.num_modes} modes.",
             figures.png(
-                figures.reconstruction_figure(
-                    curves.evaluated, curves.training, evaluation.num_modes, network
-                )
+                figures.reconstruction_figure(curves.held_out, curves.training, evaluation.num_modes, network)
             ),
         ),
     ]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from sgns.evaluation.scores import Scores
 
 if TYPE_CHECKING:
-    from sgns.evaluation.evaluate import Evaluation
+    from sgns.evaluation.results import Evaluation
 
 __all__ = [
     "describe",

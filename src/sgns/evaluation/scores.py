@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sgns.evaluation.metrics import FORCE_COMPONENTS, TORQUE_COMPONENTS, PositionErrors, VectorErrors, skill
 
-__all__ = ["Scores", "aggregate", "run_scores", "write_csv", "write_json"]
+__all__ = ["Scores", "aggregate", "run_scores"]
 
 POSITION_ERRORS = ("reduction", "network", "total", "frozen", "constant_velocity")
 SURFACE_ERRORS = ("surface", "surface_frozen")
@@ -153,42 +149,3 @@ def mean_of_known(values: Sequence[float]) -> float:
     """Mean of the values that are numbers; NaN if none is."""
     known = [value for value in values if not math.isnan(value)]
     return sum(known) / len(known) if known else math.nan
-
-
-def write_csv(path: Path, scores: Sequence[Scores]) -> None:
-    """One line per `Scores` under a line of column names; a metric without meaning is left empty."""
-    rows = [score.row() for score in scores]
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({key: "" if is_nan(value) else value for key, value in row.items()})
-    os.replace(temporary, path)
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Nested plain values as JSON that every reader takes: numbers that are not finite become null."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(strict(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
-
-
-def strict(value: Any) -> Any:
-    """The value with every number that is not finite replaced by None."""
-    if isinstance(value, Mapping):
-        return {str(key): strict(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [strict(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return strict(value.tolist())
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.integer):
-        return int(value)
-    return value
-
-
-def is_nan(value: Any) -> bool:
-    """Whether a value is the number NaN."""
-    return isinstance(value, float) and math.isnan(value)

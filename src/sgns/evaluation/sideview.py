@@ -16,6 +16,7 @@ from matplotlib.patches import Polygon
 
 from sgns.evaluation.figures import NETWORK, TRUTH, new_figure, styled
 from sgns.evaluation.surface import particle_spacing
+from sgns.poses import in_world_frame
 
 __all__ = ["body_outline", "middle_slice", "side_views", "view_times"]
 
@@ -39,17 +40,10 @@ def body_outline(run: Any, frame: int) -> np.ndarray:
     if isinstance(blade, Mapping):
         half = 0.5 * np.array([blade["thickness"], blade["width"], blade["length"]], dtype=np.float64)
         signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-        points = rotated(np.asarray(run.pose[frame, 3:]), signs * half) + run.pose[frame, :3]
+        points = in_world_frame(run.pose[[frame]], signs * half)[0]
     else:
         points = np.asarray(run.body_points[frame])
     return hull(points[:, [0, 2]])
-
-
-def rotated(quaternion: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Vectors (k, 3) turned by a unit quaternion x, y, z, w."""
-    axis, w = quaternion[:3], quaternion[3]
-    twice = 2.0 * np.cross(axis, vectors)
-    return vectors + w * twice + np.cross(axis, twice)
 
 
 def hull(points: np.ndarray) -> np.ndarray:

@@ -54,9 +54,8 @@ class Batch(NamedTuple):
         """The target [m], shape (B, r, 3).
 
         Second difference from the noisy history to the clean next position moved by the newest noise: the
-            network
-        learns to undo errors of the velocity and lets those of the position be, as in Sanchez-Gonzalez et al.
-        2020 (arXiv:2002.09405, appendix B).
+        network learns to undo errors of the velocity and lets those of the position be, as in
+        Sanchez-Gonzalez et al. 2020 (arXiv:2002.09405, appendix B).
         """
         shown = self.history
         following = self.latent[:, -1] + self.noise[:, -1]
@@ -193,8 +192,7 @@ def fit_normalisation(
     """Give the dynamics the statistics of the training windows.
 
     Positions, velocities and accelerations are scaled per mode and axis: modes differ by more than an order
-        of
-    magnitude. Velocities and accelerations keep their zero, which means rest.
+    of magnitude. Velocities and accelerations keep their zero, which means rest.
 
     Args:
         dynamics: Filled in place.

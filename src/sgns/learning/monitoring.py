@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from tqdm import tqdm
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.validation import RolloutScore, ValidationRollouts
 
-__all__ = ["RolloutValidation", "StepProgress", "flattened", "force_figure"]
+__all__ = ["RolloutValidation", "StepProgress", "force_figure"]
 
 log = logging.getLogger(__name__)
 
@@ -173,15 +172,3 @@ def force_figure(rollouts: ValidationRollouts, score: RolloutScore, most: int = 
         axes[1, column].set_xlabel("frame")
     axes[0, 0].legend(frameon=False, fontsize=8)
     return figure
-
-
-def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as one level with dotted keys and scalar values, for comparison and TensorBoard's
-    HParams tab."""
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            flat |= flattened(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value if isinstance(value, (bool, int, float, str)) else str(value)
-    return flat

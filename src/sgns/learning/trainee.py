@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import lightning as L
@@ -17,10 +17,12 @@ from torch import Tensor
 from sgns.errors import UserError
 from sgns.learning.data import Batch
 from sgns.learning.surrogate import Surrogate
+from sgns.settings import check_fields
 
 __all__ = ["SurrogateTraining", "TrainingSettings"]
 
 SCHEDULES = ("cosine", "exponential")
+LOSSES = ("acceleration", "force", "torque")
 
 
 @dataclass(frozen=True)
@@ -50,39 +52,35 @@ class TrainingSettings:
         Raises:
             UserError: A value is out of range; the line names the key.
         """
-        names = {field.name for field in fields(cls)}
-        if set(values) != names:
-            wrong = sorted(set(values) ^ names)[0]
-            raise UserError(
-                f"training.{wrong} is {'unknown' if wrong in values else 'missing'}; keys: "
-                f"{', '.join(sorted(names))}"
-            )
-        settings = cls(**{**values, "loss": {key: float(weight) for key, weight in values["loss"].items()}})
+        check_fields(cls, values, "training")
+        settings = cls(**values)
+        if not isinstance(settings.loss, dict) or set(settings.loss) != set(LOSSES):
+            raise UserError(f"training.loss is {settings.loss!r}; it needs a weight for {', '.join(LOSSES)}")
         for key, low in (
             ("max_steps", 1),
             ("batch_size", 1),
             ("warmup_steps", 0),
+            ("weight_decay", 0),
+            ("noise", 0),
+            ("normalisation_floor", 0),
             ("validate_every", 1),
             ("log_every", 1),
+            ("threads", 1),
         ):
-            if getattr(settings, key) < low:
-                raise UserError(f"training.{key} is {getattr(settings, key)}; it must be at least {low}")
-        for key in ("learning_rate", "final_learning_rate"):
             value = getattr(settings, key)
-            if not (math.isfinite(value) and value > 0):
+            if value is not None and value < low:
+                raise UserError(f"training.{key} is {value}; it must be at least {low}")
+        for key in ("learning_rate", "final_learning_rate", "gradient_clip"):
+            value = getattr(settings, key)
+            if value is not None and value <= 0:
                 raise UserError(f"training.{key} is {value}; it must be above 0")
-        for key in ("weight_decay", "noise", "normalisation_floor"):
-            value = getattr(settings, key)
-            if not (math.isfinite(value) and value >= 0):
-                raise UserError(f"training.{key} is {value}; it must be 0 or more")
+        for key, weight in settings.loss.items():
+            if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not 0 <= weight < math.inf:
+                raise UserError(f"training.loss.{key} is {weight!r}; it must be a number, 0 or more")
         if settings.schedule not in SCHEDULES:
             raise UserError(f"training.schedule is {settings.schedule!r}; allowed: {', '.join(SCHEDULES)}")
         if settings.resume not in ("auto", False):
             raise UserError(f"training.resume is {settings.resume!r}; allowed: auto, false")
-        if set(settings.loss) != {"acceleration", "force", "torque"}:
-            raise UserError(
-                f"training.loss has keys {sorted(settings.loss)}; it needs acceleration, force and torque"
-            )
         return settings
 
     def to_dict(self) -> dict[str, Any]:
@@ -107,14 +105,12 @@ class SurrogateTraining(L.LightningModule):
     Args:
         surrogate: What is trained; all of it goes into the checkpoint.
         settings: How.
-        noise_scale: Deviation of the history's velocity noise [m], shape (r, 3).
     """
 
-    def __init__(self, surrogate: Surrogate, settings: TrainingSettings, noise_scale: Tensor) -> None:
+    def __init__(self, surrogate: Surrogate, settings: TrainingSettings) -> None:
         super().__init__()
         self.surrogate = surrogate
         self.settings = settings
-        self.noise_scale = noise_scale
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Squared errors of the normalised quantities, unweighted.
@@ -141,9 +137,8 @@ class SurrogateTraining(L.LightningModule):
         if not bool(torch.isfinite(loss)):
             worst = next((name for name, value in losses.items() if not bool(torch.isfinite(value))), "loss")
             raise UserError(
-                f"the {worst} loss is {float(loss.detach())} at step {self.global_step}; likely the "
-                "learning rate is too high: "
-                f"lower training.learning_rate (now {self.settings.learning_rate:g}) or set "
+                f"the {worst} loss is {float(loss.detach())} at step {self.global_step}; likely the learning rate "
+                f"is too high: lower training.learning_rate (now {self.settings.learning_rate:g}) or set "
                 "training.gradient_clip"
             )
         for name, value in losses.items():

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shutil
 import signal
 import threading
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,14 +26,16 @@ from omegaconf import OmegaConf
 
 import sgns
 from sgns.errors import UserError
-from sgns.learning.body import in_body_frame
 from sgns.learning.data import TrainingWindows, WindowDataModule, fit_normalisation
 from sgns.learning.dynamics import LatentDynamics, ModelSettings
-from sgns.learning.monitoring import RolloutValidation, StepProgress, flattened
+from sgns.learning.monitoring import RolloutValidation, StepProgress
 from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.validation import ValidationRollouts
+from sgns.poses import in_body_frame
 from sgns.reduction.reduced import ReducedDataset, reduce_dataset
+from sgns.settings import check_fields, differences, flattened
+from sgns.wholefile import write_whole
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -52,20 +54,16 @@ def main(cfg: DictConfig) -> float:
 
     reduced = reduce_dataset(Dataset.open(cfg.dataset.path), cfg.reduction)
     plain = OmegaConf.to_container(cfg, resolve=True)
-    preset = plain.get("preset") or {}
     return train(
         reduced,
-        num_modes=int(cfg.reduction.num_modes),
+        num_modes=cfg.reduction.num_modes,
         model=plain["model"],
         training=plain["training"],
         output=Path(cfg.output),
-        seed=int(cfg.seed),
-        device=str(cfg.get("device") or "cpu"),
-        start_from=cfg.get("checkpoint"),
-        provenance={
-            "preset": str(preset.get("name", "default")),
-            "dataset": str(plain["dataset"].get("name", "")),
-        },
+        seed=cfg.seed,
+        device=cfg.device,
+        start_from=cfg.checkpoint,
+        provenance={"preset": plain["preset"]["name"], "dataset": plain["dataset"]["name"]},
     )
 
 
@@ -101,7 +99,8 @@ def train(
         UserError: Bad settings, a loss that is not finite, or an `output` of another training.
     """
     settings = TrainingSettings.from_dict(training)
-    model_settings = ModelSettings(**dict(model))
+    check_fields(ModelSettings, model, "model")
+    model_settings = ModelSettings(**model)
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     validation_runs = reduced.runs("validation")
@@ -132,27 +131,22 @@ def train(
         return float(summary["skill"])
 
     torch.manual_seed(seed)
-    surrogate, data, noise_scale = prepared(
-        reduced, num_modes, model_settings, settings, seed, card, start_from
-    )
+    surrogate, data = prepared(reduced, num_modes, model_settings, settings, seed, card, start_from)
     rollouts = ValidationRollouts(
         validation_runs, num_modes, model_settings.history, model_settings.body_nodes
     )
-    watch = RolloutValidation(rollouts, output, settings)
-    trainer = make_trainer(output, settings, device, [watch, StepProgress(settings.max_steps)])
-    began = time.perf_counter()
-    fit(
-        trainer,
-        SurrogateTraining(surrogate, settings, noise_scale),
-        data,
-        output / "last.ckpt" if resumed else None,
-    )
-    seconds = time.perf_counter() - began
+    callbacks = [RolloutValidation(rollouts, output, settings), StepProgress(settings.max_steps)]
+    module = SurrogateTraining(surrogate, settings)
+    with quiet_lightning():
+        trainer = make_trainer(output, settings, device, callbacks)
+        began = time.perf_counter()
+        fit(trainer, module, data, output / "last.ckpt" if resumed else None)
+        seconds = time.perf_counter() - began
 
     score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
     metrics = {"skill": score.skill, "skill_at_rest": score.skill_at_rest, "force_nrmse": score.force_nrmse}
     trainer.logger.log_hyperparams(
-        flattened(card["settings"]), {f"final/{key}": value for key, value in metrics.items()}
+        hyperparameters(card["settings"]), {f"final/{key}": value for key, value in metrics.items()}
     )
     trainer.logger.finalize("success")
     summary = {"steps": settings.max_steps, **metrics, "seconds": round(seconds, 1)}
@@ -171,6 +165,14 @@ def train(
     return score.skill
 
 
+def hyperparameters(settings: Mapping[str, Any]) -> dict[str, bool | int | float | str]:
+    """Settings as TensorBoard's HParams tab takes them: one level, scalars or text."""
+    return {
+        key: value if isinstance(value, (bool, int, float, str)) else str(value)
+        for key, value in flattened(settings).items()
+    }
+
+
 def prepared(
     reduced: ReducedDataset,
     num_modes: int,
@@ -179,8 +181,8 @@ def prepared(
     seed: int,
     card: dict[str, Any],
     start_from: str | Path | None,
-) -> tuple[Surrogate, WindowDataModule, torch.Tensor]:
-    """The untrained surrogate with its statistics, its data, and the noise deviation [m], shape (r, 3)."""
+) -> tuple[Surrogate, WindowDataModule]:
+    """The untrained surrogate with its statistics, and its data."""
     runs = reduced.runs("train")
     windows = TrainingWindows(runs, num_modes, model.history, model.body_nodes, seed)
     dynamics = LatentDynamics(model, num_modes)
@@ -202,7 +204,7 @@ def prepared(
     surrogate = Surrogate(
         dynamics, reduced.basis.sliced(num_modes), torch.as_tensor(reduced.start_positions), points, card
     )
-    return surrogate, WindowDataModule(windows, settings.batch_size, noise_scale), noise_scale
+    return surrogate, WindowDataModule(windows, settings.batch_size, noise_scale)
 
 
 def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> str:
@@ -220,14 +222,11 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
     if not (output / "last.ckpt").exists():
         return ""
     there = read_checkpoint(output / "last.ckpt")["hyper_parameters"].get("settings", {})
-    a, b = flattened(there), flattened(asked)
-    different = [key for key in a | b if a.get(key) != b.get(key)]
-    if different:
-        key = different[0]
+    if different := differences(there, asked):
+        key, (old, new) = next(iter(different.items()))
+        more = f" (and {len(different) - 1} more)" if len(different) > 1 else ""
         raise UserError(
-            f"{output} holds a training with other settings: {key} is {a.get(key)!r} there and "
-            f"{b.get(key)!r} here"
-            f"{f' (and {len(different) - 1} more)' if len(different) > 1 else ''}; "
+            f"{output} holds a training with other settings: {key} is {old!r} there and {new!r} here{more}; "
             "use another output, or training.resume=false to overwrite it"
         )
     complete = all((output / name).exists() for name in names)
@@ -264,6 +263,18 @@ def make_trainer(
     )
 
 
+@contextmanager
+def quiet_lightning() -> Iterator[None]:
+    """Lightning's log without its information: which devices there are, tips, that it stopped when it should."""
+    logger = logging.getLogger("lightning.pytorch")
+    before = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
 def fit(
     trainer: L.Trainer, module: L.LightningModule, data: L.LightningDataModule, last: Path | None
 ) -> None:
@@ -285,10 +296,3 @@ def fit(
         finally:
             if in_main_thread and handler is not None:
                 signal.signal(signal.SIGINT, handler)
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a small file that is complete or absent."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import uuid
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import torch
 from torch import Tensor
 
 from sgns.errors import UserError
+from sgns.wholefile import whole_file
 
 __all__ = ["CENTRINGS", "Basis"]
 
@@ -186,9 +186,8 @@ class Basis:
             UserError: If the file cannot be written.
         """
         path = Path(path)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp")
         try:
-            with h5py.File(temporary, "w") as file:
+            with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
                 for key, value in self.state().items():
                     if isinstance(value, Tensor):
                         # Checksummed, so that a damaged file is an error and not a wrong basis.
@@ -201,15 +200,10 @@ class Basis:
                         file.attrs[key] = value
                 file.attrs["format"] = _FORMAT
                 file.attrs["si_unit"] = "mean: m; eigenvalues and variances: m2; modes: 1"
-            with temporary.open("r+b") as written:
-                os.fsync(written.fileno())
-            os.replace(temporary, path)
         except OSError as error:
             raise UserError(
                 f"cannot write the basis to {path}: {error}; choose a folder that exists and is writable"
             ) from error
-        finally:
-            temporary.unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Basis:

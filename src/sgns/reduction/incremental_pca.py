@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from sgns.errors import UserError
-from sgns.reduction.basis import CENTRINGS, Basis, check_centring, orthonormality_error
+from sgns.reduction.basis import Basis, check_centring, orthonormality_error
 
-__all__ = ["CENTRINGS", "Basis", "IncrementalPCA"]
+__all__ = ["IncrementalPCA"]
 
 _EPS = torch.finfo(torch.float64).eps
 # A Gram matrix squares the singular values, so eigenvectors under this fraction of the largest eigenvalue

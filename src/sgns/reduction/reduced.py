@@ -1,5 +1,4 @@
-"""`sgns reduce`: the basis of a dataset's training runs, and every run in that basis, kept in the dataset's
-folder.
+"""The basis of a dataset's training runs, and every run in that basis, kept in the dataset's folder.
 
     <dataset>/reduced/<key>/basis.h5               fitted on the training split only
     <dataset>/reduced/<key>/<content hash>.h5      one reduced run each
@@ -16,13 +15,11 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import sys
-import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import h5py
 import numpy as np
@@ -32,21 +29,19 @@ from tqdm import tqdm
 from sgns.errors import UserError
 from sgns.reduction.basis import CENTRINGS, Basis
 from sgns.reduction.incremental_pca import IncrementalPCA
-from sgns.runs import Run
+from sgns.runs import Run, frame_chunks
+from sgns.settings import check_fields
+from sgns.wholefile import whole_file
 
 if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
     from sgns.campaign import Dataset
 
-__all__ = ["ReducedDataset", "ReducedRun", "main", "reduce_dataset"]
+__all__ = ["ReducedDataset", "ReducedRun", "reduce_dataset"]
 
 log = logging.getLogger(__name__)
 
 _FORMAT = "sgns-reduced-run-1"
 _SERIES = ("latent", "time", "pose", "body_points", "force", "torque")
-# Particle positions read at one time [bytes, float32].
-_CHUNK_BYTES = 64e6
 SPLITS = ("train", "validation", "test")
 
 
@@ -135,8 +130,7 @@ def reduce_dataset(dataset: Dataset, reduction: Mapping[str, Any], progress: boo
         if settings["num_modes"] > basis.num_modes:
             raise UserError(
                 f"reduction.num_modes is {settings['num_modes']} but the training runs give "
-                f"{basis.num_modes} modes; "
-                f"ask for at most {basis.num_modes}"
+                f"{basis.num_modes} modes; ask for at most {basis.num_modes}"
             )
         everything = [path for split in SPLITS for path in paths[split]]
         reduced = {
@@ -153,17 +147,24 @@ def reduce_dataset(dataset: Dataset, reduction: Mapping[str, Any], progress: boo
     return ReducedDataset(basis, folder, frame_rate, start, runs)
 
 
+class ReductionSettings(TypedDict):
+    """What `conf/reduction` says; see there for the meaning of each key."""
+
+    num_modes: int
+    max_modes: int
+    centring: str
+
+
 def check_settings(reduction: Mapping[str, Any]) -> dict[str, Any]:
     """The settings as plain values, refused where they make no sense."""
-    settings = {"num_modes": int(reduction["num_modes"]), "max_modes": int(reduction["max_modes"])}
-    settings["centring"] = str(reduction["centring"])
+    check_fields(ReductionSettings, reduction, "reduction")
+    settings = dict(reduction)
     if settings["centring"] not in CENTRINGS:
         raise UserError(f"reduction.centring is {settings['centring']!r}; allowed: {', '.join(CENTRINGS)}")
     if not 1 <= settings["num_modes"] <= settings["max_modes"]:
         raise UserError(
             f"reduction.num_modes is {settings['num_modes']}; allowed: 1 to reduction.max_modes "
-            f"({settings['max_modes']}); "
-            "raise reduction.max_modes to keep more"
+            f"({settings['max_modes']}); raise reduction.max_modes to keep more"
         )
     return settings
 
@@ -179,9 +180,8 @@ def check_one_bed(paths: Sequence[Path]) -> tuple[dict[Path, str], float]:
     if len(beds) > 1:
         one, other = list(beds.values())[:2]
         raise UserError(
-            f"the runs do not belong together: {one} and {other} differ in particle arrangement "
-            "or frame rate; "
-            "one basis serves one bed: keep one dataset per bed"
+            f"the runs do not belong together: {one} and {other} differ in particle arrangement or frame "
+            "rate; one basis serves one bed: keep one dataset per bed"
         )
     return content, next(iter(beds))[2]
 
@@ -207,7 +207,7 @@ def fitted_basis(path: Path, runs: Sequence[Path], settings: Mapping[str, Any], 
     for run_path in tqdm(runs, desc="fitting the basis", **bar):
         with Run(run_path) as run:
             arrangement = run.arrangement_hash
-            for frames in chunks(run):
+            for frames in frame_chunks(run.particle_count, run.frame_count):
                 pca.partial_fit(run.positions(frames))
         names.append(run_path.stem)
     rank = pca.rank(settings["centring"])
@@ -221,12 +221,6 @@ def fitted_basis(path: Path, runs: Sequence[Path], settings: Mapping[str, Any], 
     return basis
 
 
-def chunks(run: Run) -> list[slice]:
-    """The run's frames in slices of bounded memory."""
-    size = max(1, int(_CHUNK_BYTES / (12 * run.particle_count)))
-    return [slice(i, min(i + size, run.frame_count)) for i in range(0, run.frame_count, size)]
-
-
 def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
     """The cached reduced run, or a new one."""
     if path.exists():
@@ -235,7 +229,12 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
         except (OSError, KeyError, ValueError) as error:
             log.warning("%s is damaged (%s); reducing %s again", path, error, run_path)
     with Run(run_path) as run:
-        latent = torch.cat([basis.transform(run.positions(frames)) for frames in chunks(run)]).numpy()
+        latent = torch.cat(
+            [
+                basis.transform(run.positions(frames))
+                for frames in frame_chunks(run.particle_count, run.frame_count)
+            ]
+        ).numpy()
         reduced = ReducedRun(
             run_path.stem, latent, run.time, run.pose, run.body_points, run.force, run.torque, run.scene
         )
@@ -245,17 +244,12 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
 
 def write_reduced(path: Path, run: ReducedRun) -> None:
     """Write a reduced run; it appears complete or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp")
-    try:
-        with h5py.File(temporary, "w") as file:
-            for name in _SERIES:
-                file.create_dataset(name, data=getattr(run, name))
-            file.create_dataset("scene", data=json.dumps(run.scene))
-            file.attrs["name"] = run.name
-            file.attrs["format"] = _FORMAT
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+        for name in _SERIES:
+            file.create_dataset(name, data=getattr(run, name))
+        file.create_dataset("scene", data=json.dumps(run.scene))
+        file.attrs["name"] = run.name
+        file.attrs["format"] = _FORMAT
 
 
 def read_reduced(path: Path) -> ReducedRun:
@@ -269,24 +263,3 @@ def read_reduced(path: Path) -> ReducedRun:
             raise ValueError("not a reduced run")
         series = {name: file[name][()] for name in _SERIES}
         return ReducedRun(name=str(file.attrs["name"]), scene=json.loads(file["scene"][()]), **series)
-
-
-def main(cfg: DictConfig) -> float:
-    """The `sgns reduce` command; returns the mean squared reconstruction error on the training runs [m^2]."""
-    from sgns.campaign import Dataset
-
-    reduced = reduce_dataset(Dataset.open(cfg.dataset.path), cfg.reduction)
-    basis, asked = reduced.basis, int(cfg.reduction.num_modes)
-    counts = sorted(
-        {r for r in (1, 2, 4, 8, 16, 32, 64, 128, 256, asked) if r <= basis.num_modes} | {basis.num_modes}
-    )
-    lines = ["modes  energy     displacement energy  RMSE [mm]  MSE [m^2]"]
-    for r in counts:
-        mse = basis.residual_mse(r)
-        lines.append(
-            f"{r:5d}  {basis.energy(r):.6f}  {basis.displacement_energy(r):19.6f}  "
-            f"{1e3 * mse**0.5:9.3f}  {mse:.3e}" + ("  <- reduction.num_modes" if r == asked else "")
-        )
-    log.info("%s", "\n".join(lines))
-    log.info("errors on the %d training runs; kept in %s", len(basis.fitted_on or []), reduced.folder)
-    return float(basis.residual_mse(asked))

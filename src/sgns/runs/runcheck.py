@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 
 from sgns.errors import UserError
+from sgns.poses import rotation_matrices
 from sgns.runs.runlayout import (
     ELEMENTS,
     PRODUCERS,
@@ -156,7 +157,7 @@ def _check_body(file: h5py.File) -> list[str]:
     frame = _first(~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE))
     if frame is not None:
         return [f"the quaternion of frame {frame} has length {length[frame]:.6g}, not 1"]
-    rotation = _matrices(pose[:, 3:])  # (T, 3, 3)
+    rotation = rotation_matrices(pose[:, 3:])  # (T, 3, 3)
     body_frame = (points - pose[:, None, :3]) @ rotation  # rows times R = R^T applied to each point
     error = np.linalg.norm(body_frame - body_frame[:1], axis=2)
     frame = _first(~(error <= RIGID_TOLERANCE).all(axis=1))
@@ -205,14 +206,3 @@ def _check_frames(file: h5py.File) -> list[str]:
 def _first(wrong: np.ndarray) -> int | None:
     """Index of the first True, or None."""
     return int(np.argmax(wrong)) if wrong.any() else None
-
-
-def _matrices(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrices (T, 3, 3), body to world, of unit quaternions x y z w (T, 4)."""
-    x, y, z, w = quaternion.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)

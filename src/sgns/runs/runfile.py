@@ -15,11 +15,9 @@ import h5py
 import numpy as np
 
 from sgns.errors import UserError
-from sgns.runs.runcheck import check_run
 from sgns.runs.runlayout import ELEMENTS, one_line, open_run, parse_yaml, read_attributes, structure_problems
-from sgns.runs.runwriter import RunWriter
 
-__all__ = ["Run", "RunWriter", "check_run"]
+__all__ = ["Run"]
 
 
 class Run:

@@ -10,8 +10,10 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 from hydra import compose, initialize_config_module
 from hydra._internal.utils import get_args_parser
+from tiny import make_dataset
 
 from sgns import __version__
 from sgns.cli import COMMANDS
@@ -145,6 +147,16 @@ def test_settings_can_be_shown(empty_folder: Path) -> None:
         (["train", "--config-dir", "nope"], ["nope' not found"]),
         (["rollout"], ["missing for checkpoint", "checkpoint=..."]),
         (["evaluate"], ["missing for checkpoint", "checkpoint=..."]),
+        (["rollout", "checkpoint=null"], ["checkpoint is null"]),
+        (["rollout", "checkpoint=a.ckpt", "output=null"], ["output is null"]),
+        (["rollout", "checkpoint=a.ckpt", "solver.precision=float64"], ["solver: no such key"]),
+        (["evaluate", "checkpoint=a.ckpt", "dataset=null"], ["a group is null"]),
+        (["evaluate", "checkpoint=a.ckpt", "~dataset"], ["dataset is missing", "allowed: quick"]),
+        (["evaluate", "checkpoint=a.ckpt", "dataset.path=nope"], ["no dataset in nope"]),
+        (["evaluate", "checkpoint=a.ckpt", "timing_repeats=x"], ["timing_repeats is 'x'"]),
+        (["train", "dataset.path=null"], ["dataset.path is null"]),
+        (["train", "seed=1.5"], ["seed is 1.5", "whole number"]),
+        (["reduce", "dataset.path=nope"], ["no dataset in nope"]),
         (["check"], ["missing for files", "sgns check run.h5"]),
         (["check", "nope.h5"], ["nope.h5: no such file"]),
     ],
@@ -155,6 +167,57 @@ def test_bad_input_gives_one_line_and_leaves_nothing(
 ) -> None:
     assert_one_line(call(*arguments), *parts)
     assert not list(empty_folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("rows", "part"),
+    [
+        ("1,0.2,nan,0.15,0,0,0,1", "not finite in row 2, column 3"),
+        ("1,0.9,0.3,0.10,0,0,0,1", "the plate leaves the bin"),
+        ("1,0.2,0.3", "line 3 of path.csv has 3 values"),
+        ("1,left,0.3,0.15,0,0,0,1", "line 3 of path.csv holds something that is not a number"),
+        (None, "cannot read path.csv"),
+    ],
+)
+def test_a_bad_blade_path_gives_one_line_and_leaves_nothing(
+    rows: str | None, part: str, empty_folder: Path
+) -> None:
+    path = Path("path.csv")
+    if rows is not None:
+        path.write_text(f"t,x,y,z,qx,qy,qz,qw\n0,0.15,0.3,0.1925,0,0,0,1\n{rows}\n")
+    path_keys = ["scene=quick_excavation", "scene.motion=path", "scene.path=path.csv"]
+    assert_one_line(call("rollout", "checkpoint=best.ckpt", *path_keys, "output=new.h5"), part)
+    assert [found.name for found in empty_folder.iterdir()] == ["path.csv"] * (rows is not None)
+
+
+@pytest.mark.parametrize("kind", ["missing", "truncated", "foreign"])
+def test_a_bad_checkpoint_gives_one_line_and_leaves_nothing(kind: str, empty_folder: Path) -> None:
+    if kind == "truncated":
+        torch.save({"state_dict": {}, "hyper_parameters": {}}, "best.ckpt")
+        Path("best.ckpt").write_bytes(Path("best.ckpt").read_bytes()[:-300])
+    elif kind == "foreign":
+        torch.save({"weights": torch.zeros(3)}, "best.ckpt")
+    said = {
+        "missing": "no checkpoint at best.ckpt",
+        "truncated": "best.ckpt cannot be read as a checkpoint",
+        "foreign": "best.ckpt is not a checkpoint of sgns",
+    }
+    result = call("rollout", "checkpoint=best.ckpt", "scene=quick_excavation", "output=new.h5")
+    assert_one_line(result, said[kind])
+    assert [found.name for found in empty_folder.iterdir()] == ["best.ckpt"] * (kind != "missing")
+
+
+@pytest.mark.parametrize("kind", ["missing", "truncated", "foreign"])
+def test_a_bad_run_of_a_dataset_gives_one_line_and_leaves_nothing(kind: str, empty_folder: Path) -> None:
+    dataset = make_dataset(empty_folder.parent / "data")
+    bad = dataset.runs("validation")[0]
+    if kind == "missing":
+        bad.unlink()
+    else:
+        bad.write_bytes(bad.read_bytes()[:3000] if kind == "truncated" else b"not HDF5")
+    said = {"missing": "runs of", "truncated": "cut short or damaged", "foreign": "not an HDF5 file"}
+    assert_one_line(call("reduce", f"dataset.path={dataset.path}"), said[kind])
+    assert not list(empty_folder.iterdir()) and not (dataset.path / "reduced").exists()
 
 
 def test_a_command_says_what_is_wrong(empty_folder: Path) -> None:
@@ -239,7 +302,7 @@ def test_check_takes_plain_paths(name: str, empty_folder: Path) -> None:
 
 
 def test_log_lines(empty_folder: Path) -> None:
-    body = "import logging as l; l.info('%d s', 3); l.warning('slow'); l.getLogger('lightning').info('no')"
+    body = "import logging as l; l.info('%d s', 3); l.warning('slow'); l.getLogger('h5py').info('no')"
     result = call_fake(body)
     assert (result.stdout, result.stderr) == ("3 s\nwarning: slow\n", "")
 

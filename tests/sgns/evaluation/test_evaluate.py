@@ -1,6 +1,7 @@
 import csv
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from synthetic import make_run
 
 from sgns.errors import UserError
 from sgns.evaluation import evaluate as evaluate_module
-from sgns.evaluation.evaluate import evaluate, full_basis, points_in_body_frame, single_thread, training_means
+from sgns.evaluation.evaluate import full_basis, single_thread, training_means
 from sgns.evaluation.report import write_report
+from sgns.poses import in_body_frame
 from sgns.rollout import write_rollout
 from sgns.runs import Run, check_run
 
@@ -26,6 +28,10 @@ def basis(dataset):
     return fitted(dataset.runs("train"), 6)
 
 
+def evaluate(*args, **kw):
+    return evaluate_module.evaluate(*args, **{"checkpoint": Path("best.ckpt"), **kw})
+
+
 def simulator(dataset, basis, **kw):
     return FakeSimulator(basis, dataset.runs("train") + dataset.runs("test"), **kw)
 
@@ -33,7 +39,7 @@ def simulator(dataset, basis, **kw):
 def test_whole_evaluation(dataset, basis, tmp_path):
     known = simulator(dataset, basis, mistake=lambda z, d: z + 0.001 * np.arange(len(z))[:, None, None])
     with Run(dataset.runs("test")[0]) as run:
-        rollout = known.rollout(run.pose, points_in_body_frame(run))
+        rollout = known.rollout(run.pose, in_body_frame(run.pose[0], run.body_points[0]))
         new = write_rollout(tmp_path / "new path.h5", known, run.scene, rollout)
     output = tmp_path / "out"
     result = evaluate(known, dataset, output, new_rollouts=[new], made={"command": "sgns evaluate"})
@@ -49,6 +55,10 @@ def test_whole_evaluation(dataset, basis, tmp_path):
     assert result.timing.decoding > result.timing.stepping > 0.0
     for run in result.runs:
         assert check_run(run.rollout) == []
+        with Run(run.rollout) as written:
+            assert written.extra["checkpoint"] == "best.ckpt"
+            assert written.extra["checkpoint_settings"] == known.card["settings"]
+            assert written.extra["history"] == known.history
         assert run.scores.mse["total"] == pytest.approx(
             run.scores.mse["network"] + run.scores.mse["reduction"], rel=1e-3
         )
@@ -65,7 +75,7 @@ def test_perfect_network_is_limited_by_the_reduction_alone(dataset, basis, tmp_p
     assert result.total.skill() == pytest.approx(
         1 - result.total.mse["reduction"] / result.total.mse["frozen"], rel=1e-4
     )
-    assert result.curves.evaluated[basis.num_modes] > 0.0
+    assert result.curves.held_out[basis.num_modes] > 0.0
 
 
 def test_frozen_network_has_no_skill(dataset, tmp_path):
@@ -87,13 +97,6 @@ def test_evaluating_again_gives_the_same_numbers(dataset, basis, tmp_path):
     first = evaluate(simulator(dataset, basis), dataset, tmp_path).total.row()
     second = evaluate(simulator(dataset, basis), dataset, tmp_path).total.row()
     assert first == pytest.approx(second, nan_ok=True)
-
-
-def test_body_points_come_back_from_the_world(dataset):
-    from sgns.learning.body import in_world_frame
-
-    with Run(dataset.runs("test")[0]) as run:
-        assert in_world_frame(run.pose, points_in_body_frame(run)) == pytest.approx(run.body_points, abs=1e-6)
 
 
 def test_full_basis_is_found_beside_the_dataset(dataset, tmp_path):

@@ -9,7 +9,7 @@ from synthetic import make_run
 from sgns.evaluation import figures
 from sgns.evaluation.figures import ForceHistory
 from sgns.evaluation.metrics import PositionErrors
-from sgns.evaluation.sideview import body_outline, hull, middle_slice, nice, rotated, side_views, view_times
+from sgns.evaluation.sideview import body_outline, hull, middle_slice, nice, side_views, view_times
 from sgns.evaluation.surface import surface_grid
 from sgns.runs import Run
 
@@ -68,12 +68,6 @@ def test_hull_of_a_square_with_points_inside():
     inside = np.random.default_rng(0).uniform(0.1, 0.9, (20, 2))
     assert sorted(hull(np.vstack([square, inside, square])).tolist()) == sorted(square.tolist())
     assert len(hull(np.array([[0.0, 0.0], [1.0, 1.0]]))) == 2
-
-
-def test_rotation_about_y():
-    half = np.radians(90.0) / 2.0
-    turned = rotated(np.array([0.0, np.sin(half), 0.0, np.cos(half)]), np.array([[0.0, 0.0, 1.0]]))
-    assert turned == pytest.approx(np.array([[1.0, 0.0, 0.0]]))
 
 
 def test_middle_slice_and_nice_numbers():

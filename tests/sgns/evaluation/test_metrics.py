@@ -3,22 +3,18 @@ import math
 import numpy as np
 import pytest
 import torch
-from surrogates import fitted, small_dataset
-from synthetic import make_run
 
 from sgns.errors import UserError
-from sgns.evaluation import metrics
 from sgns.evaluation.metrics import (
     PositionErrors,
     VectorErrors,
     mean_prediction,
     position_errors,
-    reconstruction_curve,
     skill,
 )
 from sgns.evaluation.surface import surface_grid
 from sgns.reduction import Basis
-from sgns.runs import Run
+from sgns.runs import chunks
 
 
 class ArrayRun:
@@ -109,7 +105,7 @@ def test_latent_formula_equals_full_space():
 def test_chunks_of_frames_do_not_change_anything(monkeypatch):
     truth, prediction = random_walk(), random_walk(seed=2)
     whole = compared(truth, prediction)
-    monkeypatch.setattr(metrics, "CHUNK_BYTES", 1.0)
+    monkeypatch.setattr(chunks, "CHUNK_BYTES", 1.0)
     pieces = compared(truth, prediction)
     for name in ("reduction", "network", "total", "frozen", "constant_velocity", "surface"):
         assert getattr(pieces, name) == pytest.approx(getattr(whole, name), rel=1e-12)
@@ -188,31 +184,6 @@ def test_constant_prediction_and_training_mean():
     assert mean == pytest.approx([3.0, 4.0, 5.0])
     errors = VectorErrors.compare(np.array([[1.0, 2, 3], [3, 4, 5]]), mean)
     assert errors.mae == pytest.approx([1.0, 1.0, 1.0])
-
-
-def test_reconstruction_curve_is_the_error_of_projecting(tmp_path):
-    dataset = small_dataset(tmp_path)
-    basis = fitted(dataset.runs("train"), modes=6)
-    with Run(dataset.runs("test")[0]) as run:
-        curve = reconstruction_curve([run], basis)
-        true = torch.from_numpy(run.positions()).double()
-        for r in (1, 3, 6):
-            part = basis.sliced(r)
-            direct = float((part.inverse(part.transform(true)) - true).square().mean())
-            assert curve[r] == pytest.approx(direct, rel=1e-6)
-    assert (np.diff(curve) <= 0.0).all()
-
-
-def test_reconstruction_curve_of_the_training_runs_is_the_basis_own(tmp_path):
-    paths = [make_run(tmp_path / f"{i}.h5", frames=10, n=40, seed=i) for i in range(3)]
-    basis = fitted(paths, modes=8)
-    with Run(paths[0]) as a, Run(paths[1]) as b, Run(paths[2]) as c:
-        curve = reconstruction_curve([a, b, c], basis)
-    assert curve[1:] == pytest.approx(np.asarray(basis.residual_mse()), rel=1e-4, abs=1e-14)
-
-
-def test_no_runs_give_no_curve():
-    assert np.isnan(reconstruction_curve([], make_basis())).all()
 
 
 def test_errors_of_zero_are_zero_not_negative():

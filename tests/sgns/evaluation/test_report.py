@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sgns.evaluation.evaluate import EvaluatedRun, Evaluation, NetworkTiming, ReductionCurves
 from sgns.evaluation.metrics import PositionErrors, VectorErrors
 from sgns.evaluation.report import render_report
 from sgns.evaluation.report_figures import ReportFigure, file_name
 from sgns.evaluation.report_words import describe, fixed, number, short_names, summary, titled
+from sgns.evaluation.results import EvaluatedRun, Evaluation, NetworkTiming
 from sgns.evaluation.scores import Scores, aggregate
+from sgns.reduction.reconstruction import ReductionCurves
 
 EVIL = '<script>alert("run&1")</script>'
 

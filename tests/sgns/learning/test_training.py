@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,6 +58,13 @@ def test_resuming_equals_not_stopping(data, tmp_path, monkeypatch) -> None:
     assert a.keys() == b.keys()
     for name in a:
         assert torch.equal(a[name], b[name]), name
+
+
+def test_lightning_says_nothing(data, tmp_path, capfd) -> None:
+    run(data, tmp_path)
+    (tmp_path / "training.json").unlink()
+    run(data, tmp_path)  # resumed
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_complete_training_is_not_repeated(data, tmp_path, monkeypatch) -> None:
@@ -122,6 +130,20 @@ def test_start_from_another_checkpoint(data, tmp_path) -> None:
         )
 
 
+def test_a_checkpoint_of_another_basis_is_refused(data, tmp_path) -> None:
+    run(data, tmp_path / "first")
+    other = replace(data, basis=replace(data.basis, modes=data.basis.modes.flip(1)))
+    with pytest.raises(UserError, match="belongs to another basis"):
+        train(
+            other,
+            num_modes=4,
+            model=MODEL,
+            training=TRAINING,
+            output=tmp_path / "second",
+            start_from=tmp_path / "first" / "last.ckpt",
+        )
+
+
 def test_skill_of_truth_and_of_a_frozen_bed(data) -> None:
     rollouts = ValidationRollouts(data.runs("validation"), 4, 3, "pose")
 
@@ -166,6 +188,14 @@ def test_schedule() -> None:
         ("schedule", "steps"),
         ("resume", "yes"),
         ("noise", -0.1),
+        ("learning_rate", "fast"),
+        ("learning_rate", float("nan")),
+        ("max_steps", 1.5),
+        ("max_steps", True),
+        ("threads", 0),
+        ("gradient_clip", 0.0),
+        ("loss", {"acceleration": 1.0, "force": "x", "torque": 1.0}),
+        ("loss", None),
         ("x", 1),
     ],
 )

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 from synthetic import make_run
 from tiny import REDUCTION, make_dataset
 
 import sgns.reduction.reduced as module
 from sgns.errors import UserError
-from sgns.reduction.reduced import main, reduce_dataset
+from sgns.reduction.reduced import reduce_dataset
 from sgns.runs import Run
 
 
@@ -89,7 +88,12 @@ def test_no_more_modes_than_the_data_has(tmp_path) -> None:
 
 @pytest.mark.parametrize(
     ("change", "line"),
-    [({"num_modes": 0}, "1 to"), ({"num_modes": 7}, "max_modes"), ({"centring": "median"}, "particle_axis")],
+    [
+        ({"num_modes": "many"}, "must be a whole number"),
+        ({"num_modes": 0}, "1 to"),
+        ({"num_modes": 7}, "max_modes"),
+        ({"centring": "median"}, "particle_axis"),
+    ],
 )
 def test_wrong_settings(tmp_path, change, line) -> None:
     with pytest.raises(UserError, match=line):
@@ -101,13 +105,3 @@ def test_a_mixture_of_beds_is_refused(tmp_path) -> None:
     make_run(dataset.runs("validation")[0], frames=14, n=40)
     with pytest.raises(UserError, match="do not belong together"):
         reduce_dataset(dataset, REDUCTION)
-
-
-def test_the_command_prints_a_table_and_returns_the_error(tmp_path, caplog) -> None:
-    dataset = make_dataset(tmp_path)
-    cfg = OmegaConf.create({"dataset": {"path": str(tmp_path)}, "reduction": REDUCTION})
-    with caplog.at_level("INFO"):
-        error = main(cfg)
-    basis = reduce_dataset(dataset, REDUCTION).basis
-    assert error == basis.residual_mse(4)
-    assert "displacement energy" in caplog.text

@@ -1,0 +1,61 @@
+"""`sgns reduce`: fit the basis, reduce the runs, and say what every number of modes holds."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sgns.reduction.reconstruction import ReductionCurves, reduction_curves
+from sgns.reduction.reduced import reduce_dataset
+from sgns.wholefile import whole_file
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+__all__ = ["main", "write_energy_table"]
+
+log = logging.getLogger(__name__)
+
+
+def main(cfg: DictConfig) -> float:
+    """The `sgns reduce` command; returns the mean squared reconstruction error on the training runs [m²]."""
+    from sgns.campaign import Dataset
+
+    dataset = Dataset.open(cfg.dataset.path)
+    reduced = reduce_dataset(dataset, cfg.reduction)
+    basis, asked = reduced.basis, int(cfg.reduction.num_modes)
+    validation = dataset.runs("validation")
+    curves = reduction_curves(basis, validation)
+    table = Path(cfg.output) / "energy.csv"
+    write_energy_table(curves, table)
+    log.info("%s", "\n".join(energy_lines(curves, asked)))
+    log.info("errors on %d training and %d validation runs", len(basis.fitted_on or []), len(validation))
+    log.info("every number of modes: %s; basis and reduced runs: %s", table, reduced.folder)
+    return float(basis.residual_mse(asked))
+
+
+def energy_lines(curves: ReductionCurves, asked: int) -> list[str]:
+    """A table for the terminal: powers of two, all modes, and the number asked for."""
+    last = len(curves.energy)
+    lines = ["modes  energy     displacement energy  training RMSE [mm]  validation RMSE [mm]"]
+    for r in sorted({2**k for k in range(last.bit_length())} | {asked, last}):
+        training, held_out = (1e3 * math.sqrt(mse) for mse in (curves.training[r - 1], curves.held_out[r]))
+        lines.append(
+            f"{r:5d}  {curves.energy[r - 1]:.6f}  {curves.displacement_energy[r - 1]:19.6f}  {training:18.3f}  "
+            f"{held_out:20.3f}" + ("  <- reduction.num_modes" if r == asked else "")
+        )
+    return lines
+
+
+def write_energy_table(curves: ReductionCurves, path: Path) -> None:
+    """`energy.csv`: a line for every number of modes; the validation column is empty without such runs."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["modes", "energy", "displacement_energy", "mse_training_m2", "mse_validation_m2"])
+        columns = (curves.energy, curves.displacement_energy, curves.training, curves.held_out[1:])
+        for r, values in enumerate(zip(*columns, strict=True), start=1):
+            writer.writerow([r, *("" if math.isnan(value) else float(value) for value in values)])

@@ -1,0 +1,57 @@
+"""Rotations, points carried along, and poses that are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic import random_poses
+
+from sgns.errors import UserError
+from sgns.poses import check_poses, in_body_frame, in_world_frame, rotation_matrices, rotation_vectors
+
+
+def test_rotations_agree_with_scipy() -> None:
+    q = random_poses()[:, 3:]
+    np.testing.assert_allclose(rotation_matrices(q), Rotation.from_quat(q).as_matrix(), atol=1e-14)
+    expected = (Rotation.from_quat(q[1:]) * Rotation.from_quat(q[:-1]).inv()).as_rotvec()
+    np.testing.assert_allclose(rotation_vectors(q[:-1], q[1:]), expected, atol=1e-14)
+    # q and -q are one rotation.
+    np.testing.assert_allclose(rotation_vectors(q[:-1], -q[1:]), expected, atol=1e-14)
+
+
+def test_points_go_there_and_back() -> None:
+    poses, points = random_poses(), np.random.default_rng(1).normal(size=(5, 3))
+    world = in_world_frame(poses, points)
+    for pose, there in zip(poses, world, strict=True):
+        np.testing.assert_allclose(in_body_frame(pose, there), points, atol=1e-14)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_pose_that_is_not_finite_names_its_frame(bad: float) -> None:
+    poses = random_poses()
+    poses[3, 1] = bad
+    with pytest.raises(UserError, match="frame 3"):
+        check_poses(poses)
+
+
+def test_a_quaternion_must_have_unit_length() -> None:
+    poses = random_poses()
+    poses[2, 3:] *= 1.01
+    with pytest.raises(UserError, match="frame 2"):
+        check_poses(poses)
+    poses[2, 3:] *= 1.0005 / 1.01
+    np.testing.assert_allclose(np.linalg.norm(check_poses(poses)[:, 3:], axis=1), 1.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("bad", [np.zeros((4, 6)), np.zeros((0, 7)), "path", None])
+def test_poses_of_a_wrong_kind(bad: object) -> None:
+    with pytest.raises(UserError, match="needs rows"):
+        check_poses(bad)  # type: ignore[arg-type]
+
+
+def test_a_quarter_turn_about_y_takes_z_to_x() -> None:
+    half = np.radians(90.0) / 2.0
+    pose = np.array([[0.0, 0.0, 0.0, 0.0, np.sin(half), 0.0, np.cos(half)]])
+    turned = in_world_frame(pose, np.array([[0.0, 0.0, 1.0]]))
+    np.testing.assert_allclose(turned, [[[1.0, 0.0, 0.0]]], atol=1e-15)
