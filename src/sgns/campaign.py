@@ -19,6 +19,7 @@ from omegaconf import OmegaConf
 
 from mpm_warp import Scene
 from sgns.errors import UserError
+from sgns.wholefile import write_whole
 
 __all__ = ["SPLITS", "Campaign", "Dataset", "plan"]
 
@@ -66,9 +67,7 @@ class Campaign:
             return
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            temporary = file.with_name(f".{file.name}.{os.getpid()}")
-            temporary.write_text(yaml.safe_dump(self.describe(), sort_keys=False), encoding="utf-8")
-            os.replace(temporary, file)
+            write_whole(file, yaml.safe_dump(self.describe(), sort_keys=False))
         except OSError as error:
             raise UserError(f"cannot write {file}: {error.strerror}") from None
 
@@ -172,7 +171,7 @@ class Dataset:
         missing = [run for s in SPLITS for run in dataset.runs(s) if not run.exists()]
         if missing:
             raise UserError(
-                f"{len(missing)} runs of {path} are missing, the first is {missing[0].name}; finish the dataset: "
+                f"runs of {path} are missing: {len(missing)}, the first is {missing[0].name}; finish the dataset: "
                 f"sgns simulate dataset={dataset.name}"
             )
         return dataset

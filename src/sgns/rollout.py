@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from mpm_warp import Scene
     from sgns.simulator import Rollout, Simulator
 
-__all__ = ["RolloutTiming", "main", "require_known_bed", "rollout_scene", "write_rollout"]
+__all__ = ["RolloutTiming", "main", "require_known_bed", "rollout_scene", "single_thread", "write_rollout"]
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +51,17 @@ class RolloutTiming:
     def complete_rate(self) -> float:
         """Wall seconds per simulated second: steps, decoding and writing every frame."""
         return (self.stepping + self.writing) / self.simulated
+
+
+@contextmanager
+def single_thread() -> Iterator[None]:
+    """torch on one thread, as before afterwards: a step is too short for more than one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def write_rollout(
@@ -182,7 +194,8 @@ def rollout_scene(
     simulator: Simulator, scene: Scene, path: str | Path, *, seed: int = 0, checkpoint: str | Path = ""
 ) -> RolloutTiming:
     """Rolls a scene that was never simulated out, from the common start at rest, into a run file."""
-    rollout = simulator.rollout(scene.body_poses(), scene.body_points())
+    with single_thread():
+        rollout = simulator.rollout(scene.body_poses(), scene.body_points())
     began = time.perf_counter()
     write_rollout(path, simulator, scene.to_dict(), rollout, seed=seed, checkpoint=checkpoint)
     writing = time.perf_counter() - began

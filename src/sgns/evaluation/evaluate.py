@@ -10,8 +10,8 @@ import logging
 import os
 import statistics
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,7 +31,7 @@ from sgns.evaluation.tables import write_tables
 from sgns.poses import in_body_frame
 from sgns.reduction import Basis
 from sgns.reduction.reconstruction import reduction_curves
-from sgns.rollout import write_rollout
+from sgns.rollout import single_thread, write_rollout
 from sgns.runs import Run
 
 if TYPE_CHECKING:
@@ -43,17 +43,6 @@ if TYPE_CHECKING:
 __all__ = ["evaluate", "main"]
 
 log = logging.getLogger(__name__)
-
-
-@contextmanager
-def single_thread() -> Iterator[None]:
-    """torch on one thread, as before afterwards."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def roll_out(simulator: Simulator, run: Run) -> Rollout:

@@ -19,13 +19,14 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any, TypedDict
 
 import h5py
 import numpy as np
 import torch
 from tqdm import tqdm
 
+from sgns.campaign import SPLITS, Dataset
 from sgns.errors import UserError
 from sgns.reduction.basis import CENTRINGS, Basis
 from sgns.reduction.incremental_pca import IncrementalPCA
@@ -33,16 +34,12 @@ from sgns.runs import Run, frame_chunks
 from sgns.settings import check_fields
 from sgns.wholefile import whole_file
 
-if TYPE_CHECKING:
-    from sgns.campaign import Dataset
-
 __all__ = ["ReducedDataset", "ReducedRun", "reduce_dataset"]
 
 log = logging.getLogger(__name__)
 
 _FORMAT = "sgns-reduced-run-1"
 _SERIES = ("latent", "time", "pose", "body_points", "force", "torque")
-SPLITS = ("train", "validation", "test")
 
 
 @dataclass(frozen=True, eq=False)
