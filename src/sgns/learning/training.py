@@ -52,6 +52,8 @@ def main(cfg: DictConfig) -> float:
     """The `sgns train` command; returns the rollout skill on the validation runs."""
     from sgns.campaign import Dataset
 
+    if cfg.training.threads is not None:
+        torch.set_num_threads(cfg.training.threads)  # for the reduction, too
     reduced = reduce_dataset(Dataset.open(cfg.dataset.path), cfg.reduction)
     plain = OmegaConf.to_container(cfg, resolve=True)
     return train(
