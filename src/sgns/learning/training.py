@@ -52,10 +52,11 @@ def main(cfg: DictConfig) -> float:
     """The `sgns train` command; returns the rollout skill on the validation runs."""
     from sgns.campaign import Dataset
 
-    if cfg.training.threads is not None:
-        torch.set_num_threads(cfg.training.threads)  # for the reduction, too
-    reduced = reduce_dataset(Dataset.open(cfg.dataset.path), cfg.reduction)
     plain = OmegaConf.to_container(cfg, resolve=True)
+    threads = TrainingSettings.from_dict(plain["training"]).threads
+    if threads is not None:
+        torch.set_num_threads(threads)  # for the reduction, too
+    reduced = reduce_dataset(Dataset.open(cfg.dataset.path), cfg.reduction)
     return train(
         reduced,
         num_modes=cfg.reduction.num_modes,

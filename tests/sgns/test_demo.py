@@ -1,0 +1,68 @@
+"""The demo: commands a user could type, in order, stopping at the first that fails."""
+
+from __future__ import annotations
+
+import os
+from types import SimpleNamespace
+
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from sgns import demo
+from sgns.campaign import plan
+from sgns.cli import COMMANDS
+from sgns.scenes import scene_from_config
+
+
+@pytest.fixture
+def calls(monkeypatch, empty_folder):
+    """Commands the demo would run; `status` says how each ends."""
+    made = SimpleNamespace(commands=[], status={})
+
+    def run(arguments, check):
+        command = arguments[3]
+        made.commands.append(command)
+        if command == "train" and not made.status.get(command):
+            demo.CHECKPOINT.parent.mkdir(parents=True, exist_ok=True)
+            demo.CHECKPOINT.touch()
+        if command == "evaluate":
+            demo.REPORT.parent.mkdir(parents=True, exist_ok=True)
+            demo.REPORT.touch()
+            later = demo.CHECKPOINT.stat().st_mtime + 1
+            os.utime(demo.REPORT, (later, later))
+        return SimpleNamespace(returncode=made.status.get(command, 0))
+
+    monkeypatch.setattr(demo.subprocess, "run", run)
+    return made
+
+
+def test_steps_in_order_and_the_report_is_named(calls, capsys):
+    assert demo.main() == 0
+    assert calls.commands == ["simulate", "train", "rollout", "evaluate"]
+    assert set(calls.commands) <= set(COMMANDS)
+    assert str(demo.REPORT.resolve()) in capsys.readouterr().out
+
+
+def test_a_report_newer_than_its_checkpoint_is_kept(calls):
+    demo.main()
+    demo.main()
+    assert calls.commands.count("evaluate") == 1
+
+
+def test_it_stops_at_the_first_failure(calls):
+    calls.status["train"] = 2
+    assert demo.main() == 2
+    assert calls.commands == ["simulate", "train"]
+
+
+def test_the_new_path_is_in_no_run():
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        new = scene_from_config(compose("rollout", ["scene=quick_excavation", "checkpoint=x", *demo.NEW_SCENE]))
+        base = compose("simulate", ["scene=quick_excavation", "dataset=quick"])
+    campaign = plan(OmegaConf.to_container(base.dataset), scene_from_config(base).to_dict(), {}, "float32", 0)
+    assert len(campaign.scenes) >= 16
+    for scene in campaign.scenes.values():
+        assert scene.arrangement_hash == new.arrangement_hash
+        assert (scene.rake, scene.depth, scene.speed) != (new.rake, new.depth, new.speed)
+        assert scene.blade.thickness >= 2 * scene.bed.spacing
