@@ -58,7 +58,9 @@ def test_it_stops_at_the_first_failure(calls):
 
 def test_the_new_path_is_in_no_run():
     with initialize_config_module("sgns.conf", version_base="1.3"):
-        new = scene_from_config(compose("rollout", ["scene=quick_excavation", "checkpoint=x", *demo.NEW_SCENE]))
+        new = scene_from_config(
+            compose("rollout", ["scene=quick_excavation", "checkpoint=x", *demo.NEW_SCENE])
+        )
         base = compose("simulate", ["scene=quick_excavation", "dataset=quick"])
     campaign = plan(OmegaConf.to_container(base.dataset), scene_from_config(base).to_dict(), {}, "float32", 0)
     assert len(campaign.scenes) >= 16
