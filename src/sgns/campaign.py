@@ -96,27 +96,30 @@ def plan(
     rng = np.random.default_rng(seed)
     chosen = sorted(rng.choice(len(combinations), size=count, replace=False).tolist())
     scenes: dict[str, Scene] = {}
+    grids: dict[int, list[str]] = {}
     for index in chosen:
+        grid, values = combinations[index]
         data = OmegaConf.create(dict(base))
-        for key, value in combinations[index].items():
+        for key, value in values.items():
             OmegaConf.update(data, key, value, force_add=True)
-        label = "_".join(f"{key.split('.')[-1]}-{value}" for key, value in combinations[index].items())
-        scenes[f"{index:04d}_{label}"] = Scene.from_dict(OmegaConf.to_container(data, resolve=True))
+        name = f"{index:04d}_" + "_".join(f"{key.split('.')[-1]}-{value}" for key, value in values.items())
+        scenes[name] = Scene.from_dict(OmegaConf.to_container(data, resolve=True))
+        grids.setdefault(grid, []).append(name)
     return Campaign(
         name=settings["name"],
         path=Path(settings["path"]),
         scenes=scenes,
-        split=_split(list(scenes), settings.get("split", [0.8, 0.1, 0.1]), rng),
+        split=_split(list(grids.values()), settings.get("split", [0.8, 0.1, 0.1]), rng),
         effects=effects,
         precision=precision,
         seed=seed,
     )
 
 
-def _combinations(draw: Any) -> list[dict[str, Any]]:
-    """Every combination of one grid (key → values) or of each of several."""
+def _combinations(draw: Any) -> list[tuple[int, dict[str, Any]]]:
+    """Number of the grid and combination, for every combination of one grid (key → values) or of several."""
     combinations = []
-    for grid in draw if isinstance(draw, list) else [draw]:
+    for number, grid in enumerate(draw if isinstance(draw, list) else [draw]):
         if not isinstance(grid, Mapping) or not grid:
             raise UserError(
                 f"dataset.draw holds {grid!r}; it must be a grid, key: [values], or a list of such grids"
@@ -124,22 +127,25 @@ def _combinations(draw: Any) -> list[dict[str, Any]]:
         for key, values in grid.items():
             if not isinstance(values, list) or not values:
                 raise UserError(f"dataset.draw.{key} is {values!r}; it must be a list of at least one value")
-        combinations += [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+        products = itertools.product(*grid.values())
+        combinations += [(number, dict(zip(grid, values, strict=True))) for values in products]
     return combinations
 
 
-def _split(names: list[str], shares: list[float], rng: np.random.Generator) -> dict[str, str]:
-    """Each name's part, by chance; validation and test get at least one run if their share is above 0."""
+def _split(grids: list[list[str]], shares: list[float], rng: np.random.Generator) -> dict[str, str]:
+    """Each name's part, by chance within each grid, so that every part has its share of every grid."""
     if len(shares) != 3 or min(shares) < 0 or abs(sum(shares) - 1.0) > 1e-6:
         raise UserError(
             f"dataset.split is {shares}; it needs three shares (train, validation, test) that sum to 1"
         )
-    counts = [max(round(s * len(names)), 1 if s > 0 else 0) for s in shares[1:]]
-    order = rng.permutation(len(names))
     part = {}
-    for rank, index in enumerate(order):
-        part[names[index]] = "validation" if rank < counts[0] else "test" if rank < sum(counts) else "train"
-    return {name: part[name] for name in names}
+    for names in grids:
+        validation, test = (max(round(s * len(names)), 1 if s > 0 else 0) for s in shares[1:])
+        for rank, index in enumerate(rng.permutation(len(names))):
+            part[names[index]] = (
+                "validation" if rank < validation else "test" if rank < validation + test else "train"
+            )
+    return {name: part[name] for names in grids for name in names}
 
 
 @dataclass(frozen=True)
