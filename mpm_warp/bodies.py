@@ -31,9 +31,9 @@ class Plate:
     def __post_init__(self) -> None:
         for name in ("length", "width", "thickness"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise SceneError(f"plate.{name} is {getattr(self, name)}; it must be above 0 m")
+                raise SceneError(f"blade.{name} is {getattr(self, name)}; it must be above 0 m")
         if not self.friction >= 0:
-            raise SceneError(f"plate.friction is {self.friction}; it must be 0 or more")
+            raise SceneError(f"blade.friction is {self.friction}; it must be 0 or more")
 
     @property
     def half_size(self) -> np.ndarray:
