@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("--runs", default="data/published_forces", help="folder for the run files")
     parser.add_argument("--workers", type=int, default=None, help="runs at once (default: one per core)")
     parser.add_argument("overrides", nargs="*", help="changes of the scene, for example scene.courant=0.4")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
     with initialize_config_module("sgns.conf", version_base="1.3"):
