@@ -33,35 +33,52 @@ def grid_struct(real: type) -> type:
 
 
 @cache
-def grid_step(real: type) -> wp.Kernel:
-    """Kernel that turns momentum into velocity, applies gravity and the no-slip floor and walls, clears the
-    momentum for the next step, and counts the step."""
+def grid_step(real: type):
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     Grid = grid_struct(real)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def step(
+    def start(
         grid: Grid,
         nodes: wp.array(dtype=vec4),
         velocity: wp.array(dtype=vec4),
-        substep: wp.array(dtype=int),
+        start_velocity: wp.array(dtype=vec4),
+        forces: wp.array(dtype=vec4),
     ):
         n = wp.tid()
-        if n == 0:
-            substep[0] = substep[0] + 1
         node = nodes[n]
         mass = node[3]
+        result = vec4()
         if mass > real(0.0):
             nodes[n] = vec4()
-            v = vec3(node[0], node[1], node[2]) / mass
-            v = v - vec3(real(0.0), real(0.0), grid.gravity * grid.dt)
             k = n % grid.nz
             j = (n // grid.nz) % grid.ny
             i = n // (grid.nz * grid.ny)
             low = grid.low
             high = grid.high
             if i <= low[0] or j <= low[1] or k <= low[2] or i >= high[0] or j >= high[1] or k >= high[2]:
-                v = vec3()
-            velocity[n] = vec4(v[0], v[1], v[2], real(0.0))
+                forces[n] = vec4()
+            else:
+                result = vec4(node[0] / mass, node[1] / mass, node[2] / mass, real(1.0) / mass)
+        velocity[n] = result
+        start_velocity[n] = result
 
-    return step
+    @wp.kernel(module="unique", enable_backward=False)
+    def step(
+        grid: Grid,
+        velocity: wp.array(dtype=vec4),
+        forces: wp.array(dtype=vec4),
+        substep: wp.array(dtype=int),
+    ):
+        n = wp.tid()
+        if n == 0:
+            substep[0] = substep[0] + 1
+        v = velocity[n]
+        inverse_mass = v[3]
+        if inverse_mass > real(0.0):
+            v += inverse_mass * forces[n]
+            v[2] = v[2] - grid.gravity * grid.dt
+            velocity[n] = vec4(v[0], v[1], v[2], inverse_mass)
+            forces[n] = vec4()
+
+    return start, step

@@ -185,17 +185,24 @@ class Solver:
         self._body = body
 
         kernels = transfer(real, self.effects, with_body=plate is not None, atomic=self.device.is_cuda)
-        particles = [self._x, self._v, self._c, self._e, self._ln_j, grid, soil]
+        self._forces = wp.zeros(node_count, dtype=vec4, **new)
+        self._start_velocity = wp.zeros(node_count, dtype=vec4, **new)
+        self._home = wp.zeros(n, dtype=vec3, **new)
+        particles = [self._x, self._home, self._v, self._c, self._e, self._ln_j, grid, soil, body]
         record = {"device": self.device, "record_cmd": True}
-        self._launches = [
-            wp.launch(kernels.to_grid, n, [*particles, body, self._nodes, self._substep], **record),
-            wp.launch(
-                grid_step(real), node_count, [grid, self._nodes, self._velocity, self._substep], **record
-            ),
-            wp.launch(
-                kernels.to_particles, n, [*particles, self._velocity, self._substep, self._stray], **record
-            ),
-        ]
+        start, step = grid_step(real)
+        self._to_grid = wp.launch(kernels.to_grid, n, [*particles, self._nodes, self._forces, self._substep], **record)
+        self._start = wp.launch(start, node_count, [grid, self._nodes, self._velocity, self._start_velocity, self._forces], **record)
+        self._step = wp.launch(step, node_count, [grid, self._velocity, self._forces, self._substep], **record)
+        import os
+        period = float(os.environ.get("REMAP", "2e-3"))
+        tau = float(os.environ.get("TAU", "0"))
+        self.intervals = max(1, min(self.substeps_per_frame, round((1.0 / scene.frame_rate) / period)))
+        real_period = (1.0 / scene.frame_rate) / self.intervals
+        keep = math.exp(-real_period / tau) if tau > 0 else 0.0
+        adv = [*particles, self._velocity, self._start_velocity, self._forces, self._substep, self._stray]
+        self._advance_k = wp.launch(kernels.advance, n, [*adv, 0, keep], **record)
+        self._finish = wp.launch(kernels.advance, n, [*adv, 1, keep], **record)
         self._graph: wp.Graph | None = None
 
     # --- stepping -----------------------------------------------------------------------------------------
@@ -219,9 +226,19 @@ class Solver:
             array.assign(values)
 
     def _substeps(self) -> None:
-        for _ in range(self.substeps_per_frame):
-            for launch in self._launches:
-                launch.launch()
+        ends = {round(self.substeps_per_frame * (i + 1) / self.intervals) - 1 for i in range(self.intervals)}
+        fresh = True
+        for s in range(self.substeps_per_frame):
+            if fresh:
+                self._to_grid.launch()
+                self._start.launch()
+                fresh = False
+            self._step.launch()
+            if s in ends:
+                self._finish.launch()
+                fresh = True
+            else:
+                self._advance_k.launch()
 
     def _advance(self, index: int) -> None:
         if self.device.is_cuda:

@@ -60,37 +60,12 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         else:
             nodes[at] = nodes[at] + amount
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def to_grid(
-        x: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        c: wp.array(dtype=mat33),
-        e: wp.array(dtype=vec6),
-        ln_j: wp.array(dtype=real),
-        grid: Grid,
-        soil: Soil,
-        body: Body,
-        nodes: wp.array(dtype=vec4),
-        substep: wp.array(dtype=int),
-    ):
-        p = wp.tid()
-        base, f = base_and_offset(x[p], grid)
-        wx = weights(f[0])
-        wy = weights(f[1])
-        wz = weights(f[2])
-        h = grid.spacing
-        # Affine momentum m C - dt V D^-1 tau, D = dx^2 / 4, times dx: momentum change per cell.
-        force = kirchhoff(e[p], ln_j[p], soil) * (
-            real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing
-        )
-        q = c[p] * (grid.particle_mass * h) + force
-        start = grid.particle_mass * v[p] - q * f
-        if wp.static(with_body):
-            start += push(x[p], v[p], grid.particle_mass, grid.dt, substep[0], body)
-        qx = vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0))
-        qy = vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0))
-        qz = vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0))
-        corner = vec4(start[0], start[1], start[2], grid.particle_mass)
+    @wp.func
+    def spread(
+        corner: vec4, qx: vec4, qy: vec4, qz: vec4, base: wp.vec3i, wx: vec3, wy: vec3, wz: vec3,
+        grid: Grid, nodes: wp.array(dtype=vec4),
+    ):  # fmt: skip
+        # Adds an affine field (value at the lowest node, change per cell along x, y, z) times the weights.
         plane = corner
         for i in range(3):
             at = plane
@@ -103,22 +78,75 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
                 at += qy
             plane += qx
 
+    @wp.func
+    def scatter_force(
+        e: vec6, ln_j: real, load: vec3, f: vec3, base: wp.vec3i, wx: vec3, wy: vec3, wz: vec3,
+        grid: Grid, soil: Soil, forces: wp.array(dtype=vec4),
+    ):  # fmt: skip
+        # Impulse of one step: -dt V D^-1 tau (x_i - x_p), D = dx^2 / 4, and the body's push.
+        q = kirchhoff(e, ln_j, soil) * (real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing)
+        start = load - q * f
+        spread(
+            vec4(start[0], start[1], start[2], real(0.0)),
+            vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0)),
+            vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0)),
+            vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0)),
+            base, wx, wy, wz, grid, forces,
+        )  # fmt: skip
+
     @wp.kernel(module="unique", enable_backward=False)
-    def to_particles(
+    def to_grid(
         x: wp.array(dtype=vec3),
+        home: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         c: wp.array(dtype=mat33),
         e: wp.array(dtype=vec6),
         ln_j: wp.array(dtype=real),
         grid: Grid,
         soil: Soil,
-        velocity: wp.array(dtype=vec4),
+        body: Body,
+        nodes: wp.array(dtype=vec4),
+        forces: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
-        stray: wp.array(dtype=int),
     ):
         p = wp.tid()
-        position = x[p]
-        base, f = base_and_offset(position, grid)
+        home[p] = x[p]
+        base, f = base_and_offset(x[p], grid)
+        wx = weights(f[0])
+        wy = weights(f[1])
+        wz = weights(f[2])
+        q = c[p] * (grid.particle_mass * grid.spacing)
+        start = grid.particle_mass * v[p] - q * f
+        qx = vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0))
+        qy = vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0))
+        qz = vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0))
+        spread(vec4(start[0], start[1], start[2], grid.particle_mass), qx, qy, qz, base, wx, wy, wz, grid, nodes)
+        load = vec3()
+        if wp.static(with_body):
+            load = push(x[p], v[p], grid.particle_mass, grid.dt, substep[0], body)
+        scatter_force(e[p], ln_j[p], load, f, base, wx, wy, wz, grid, soil, forces)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def advance(
+        x: wp.array(dtype=vec3),
+        home: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        c: wp.array(dtype=mat33),
+        e: wp.array(dtype=vec6),
+        ln_j: wp.array(dtype=real),
+        grid: Grid,
+        soil: Soil,
+        body: Body,
+        velocity: wp.array(dtype=vec4),
+        start_velocity: wp.array(dtype=vec4),
+        forces: wp.array(dtype=vec4),
+        substep: wp.array(dtype=int),
+        stray: wp.array(dtype=int),
+        last: int,
+        keep: real,
+    ):
+        p = wp.tid()
+        base, f = base_and_offset(home[p], grid)
         wx = weights(f[0])
         wy = weights(f[1])
         wz = weights(f[2])
@@ -155,7 +183,7 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
             gx[2] * scale, gy[2] * scale, gz[2] * scale,
         )  # fmt: skip
         speed = vec3(total[0], total[1], total[2])
-        moved = position + grid.dt * speed
+        moved = x[p] + grid.dt * speed
         g = (moved - grid.origin) * grid.inverse_spacing
         inside = (
             g[0] >= real(0.5) and g[1] >= real(0.5) and g[2] >= real(0.5)
@@ -166,11 +194,30 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         slow = wp.length_sq(speed) < grid.speed_limit * grid.speed_limit  # false for a NaN, too
         if inside and slow:
             state = update(e[p], ln_j[p], grid.dt * gradient, grid.dt, soil)
+            new_e = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
             x[p] = moved
-            v[p] = speed
-            c[p] = gradient
-            e[p] = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
+            e[p] = new_e
             ln_j[p] = state[6]
+            if last != 0:
+                c[p] = gradient
+                if keep > real(0.0):
+                    before = vec4()
+                    for i in range(3):
+                        for j in range(3):
+                            row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
+                            line = (
+                                wz[0] * start_velocity[row] + wz[1] * start_velocity[row + 1]
+                                + wz[2] * start_velocity[row + 2]
+                            )
+                            before += (wx[i] * wy[j]) * line
+                    v[p] = speed + keep * (v[p] - vec3(before[0], before[1], before[2]))
+                else:
+                    v[p] = speed
+            else:
+                load = vec3()
+                if wp.static(with_body):
+                    load = push(moved, speed, grid.particle_mass, grid.dt, substep[0], body)
+                scatter_force(new_e, state[6], load, f, base, wx, wy, wz, grid, soil, forces)
         else:
             # The particle keeps its last good state; the solver stops at the end of the frame.
             if wp.atomic_add(stray, 0, 1) == 0:
@@ -178,4 +225,4 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
                 stray[2] = substep[0]
                 stray[3] = wp.where(slow, 1, 0)
 
-    return SimpleNamespace(to_grid=to_grid, to_particles=to_particles)
+    return SimpleNamespace(to_grid=to_grid, advance=advance)
