@@ -1,6 +1,7 @@
-"""The background grid and its step: momentum to velocity, gravity, floor and walls."""
+"""The background grid: momentum to velocity, gravity, floor and walls."""
 
 from functools import cache
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -27,47 +28,56 @@ def grid_struct(real: type) -> type:
         high: wp.vec3i
         particle_mass: real  # [kg]
         particle_volume: real  # at the critical density [m^3]
-        speed_limit: real  # one cell per step [m/s]
 
     return Grid
 
 
 @cache
-def grid_step(real: type):
+def grid_step(real: type) -> SimpleNamespace:
+    """Kernels on the nodes in precision `real`.
+
+    - `begin`: momentum and mass to velocity and 1 / mass after a remap; floor and walls hold their nodes by a 1 / mass of 0.
+    - `step`: velocity from the step's impulse and gravity; counts the step.
+
+    Both clear what they have used for the next sum.
+    """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     Grid = grid_struct(real)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def start(
+    def begin(
         grid: Grid,
-        nodes: wp.array(dtype=vec4),
+        momentum: wp.array(dtype=vec4),
         velocity: wp.array(dtype=vec4),
-        start_velocity: wp.array(dtype=vec4),
-        forces: wp.array(dtype=vec4),
+        before: wp.array(dtype=vec4),
+        impulse: wp.array(dtype=vec4),
     ):
         n = wp.tid()
-        node = nodes[n]
+        node = momentum[n]
         mass = node[3]
-        result = vec4()
+        v = vec3()
+        inverse_mass = real(0.0)
         if mass > real(0.0):
-            nodes[n] = vec4()
-            k = n % grid.nz
-            j = (n // grid.nz) % grid.ny
-            i = n // (grid.nz * grid.ny)
-            low = grid.low
-            high = grid.high
-            if i <= low[0] or j <= low[1] or k <= low[2] or i >= high[0] or j >= high[1] or k >= high[2]:
-                forces[n] = vec4()
-            else:
-                result = vec4(node[0] / mass, node[1] / mass, node[2] / mass, real(1.0) / mass)
-        velocity[n] = result
-        start_velocity[n] = result
+            momentum[n] = vec4()
+            v = vec3(node[0], node[1], node[2]) / mass
+            inverse_mass = real(1.0) / mass
+        before[n] = vec4(v[0], v[1], v[2], inverse_mass)
+        k = n % grid.nz
+        j = (n // grid.nz) % grid.ny
+        i = n // (grid.nz * grid.ny)
+        low = grid.low
+        high = grid.high
+        if i <= low[0] or j <= low[1] or k <= low[2] or i >= high[0] or j >= high[1] or k >= high[2]:
+            v = vec3()
+            inverse_mass = real(0.0)
+            impulse[n] = vec4()
+        velocity[n] = vec4(v[0], v[1], v[2], inverse_mass)
 
     @wp.kernel(module="unique", enable_backward=False)
     def step(
         grid: Grid,
         velocity: wp.array(dtype=vec4),
-        forces: wp.array(dtype=vec4),
+        impulse: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
     ):
         n = wp.tid()
@@ -76,9 +86,9 @@ def grid_step(real: type):
         v = velocity[n]
         inverse_mass = v[3]
         if inverse_mass > real(0.0):
-            v += inverse_mass * forces[n]
-            v[2] = v[2] - grid.gravity * grid.dt
-            velocity[n] = vec4(v[0], v[1], v[2], inverse_mass)
-            forces[n] = vec4()
+            change = inverse_mass * impulse[n]
+            impulse[n] = vec4()
+            fall = grid.gravity * grid.dt
+            velocity[n] = vec4(v[0] + change[0], v[1] + change[1], v[2] + change[2] - fall, inverse_mass)
 
-    return start, step
+    return SimpleNamespace(begin=begin, step=step)

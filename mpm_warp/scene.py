@@ -103,6 +103,12 @@ class Scene:
     """Distance from the body's surface at which it begins to act on particles [grid spacings]; see contact.py."""
     courant: float = 0.6
     """Time step as a share of spacing / wave speed."""
+    remap_time: float = 4.0e-3
+    """Longest time between two remaps of the velocities [s]; see solver.py."""
+    remap_distance: float = 0.1
+    """Longest way of soil between two remaps [grid spacings]."""
+    velocity_memory: float = 0.1
+    """Time after which 63 % of the velocities that the grid does not resolve are gone [s]."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.gravity) and self.gravity >= 0):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -17,7 +18,7 @@ from .grid import grid_step, grid_struct
 from .rotation import angular_velocity, rotate
 from .scene import Scene
 from .start import start_warp
-from .transfer import transfer
+from .transfer import ADVANCE, FINISH, START, transfer
 
 __all__ = ["PRECISIONS", "Frame", "Solver"]
 
@@ -82,7 +83,8 @@ class Solver:
         self._real = PRECISIONS[precision]
 
         frame_time = 1.0 / scene.frame_rate
-        limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + self._top_body_speed())
+        self._top_body = self._top_body_speed()
+        limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + self._top_body)
         self.substeps_per_frame = max(1, math.ceil(frame_time / limit - 1e-9))
         self.time_step = frame_time / self.substeps_per_frame
         """Substep [s]."""
@@ -139,7 +141,6 @@ class Solver:
         grid.low = wp.vec3i(_PADDING, _PADDING, _PADDING)
         grid.high = wp.vec3i(_PADDING + cells[0], _PADDING + cells[1], 2**30)
         grid.particle_volume, grid.particle_mass = volume, volume * material.bulk_density
-        grid.speed_limit = h / self.time_step
         self._grid = grid
 
         soil = soil_struct(real)()
@@ -162,10 +163,13 @@ class Solver:
         self._c = wp.zeros(n, dtype=wp.types.matrix((3, 3), real), **new)
         self._e = wp.zeros(n, dtype=wp.types.vector(6, real), **new)
         self._ln_j = wp.array(ln_j, dtype=real, **new)
+        self._home = wp.zeros(n, dtype=vec3, **new)
         node_count = grid.nx * grid.ny * grid.nz
-        self._nodes = wp.zeros(node_count, dtype=vec4, **new)
-        self._velocity = wp.zeros(node_count, dtype=vec4, **new)
+        self._momentum, self._velocity, self._before, self._impulse = (
+            wp.zeros(node_count, dtype=vec4, **new) for _ in range(4)
+        )
         self._substep = wp.zeros(1, dtype=int, **new)
+        self._top_speed = wp.zeros(1, dtype=real, **new)
         self._stray = wp.zeros(4, dtype=int, **new)
 
         body, plate, m = body_struct(real)(), scene.plate, self.substeps_per_frame
@@ -185,25 +189,25 @@ class Solver:
         self._body = body
 
         kernels = transfer(real, self.effects, with_body=plate is not None, atomic=self.device.is_cuda)
-        self._forces = wp.zeros(node_count, dtype=vec4, **new)
-        self._start_velocity = wp.zeros(node_count, dtype=vec4, **new)
-        self._home = wp.zeros(n, dtype=vec3, **new)
-        particles = [self._x, self._home, self._v, self._c, self._e, self._ln_j, grid, soil, body]
-        record = {"device": self.device, "record_cmd": True}
-        start, step = grid_step(real)
-        self._to_grid = wp.launch(kernels.to_grid, n, [*particles, self._nodes, self._forces, self._substep], **record)
-        self._start = wp.launch(start, node_count, [grid, self._nodes, self._velocity, self._start_velocity, self._forces], **record)
-        self._step = wp.launch(step, node_count, [grid, self._velocity, self._forces, self._substep], **record)
-        import os
-        period = float(os.environ.get("REMAP", "2e-3"))
-        tau = float(os.environ.get("TAU", "0"))
-        self.intervals = max(1, min(self.substeps_per_frame, round((1.0 / scene.frame_rate) / period)))
-        real_period = (1.0 / scene.frame_rate) / self.intervals
-        keep = math.exp(-real_period / tau) if tau > 0 else 0.0
-        adv = [*particles, self._velocity, self._start_velocity, self._forces, self._substep, self._stray]
-        self._advance_k = wp.launch(kernels.advance, n, [*adv, 0, keep], **record)
-        self._finish = wp.launch(kernels.advance, n, [*adv, 1, keep], **record)
-        self._graph: wp.Graph | None = None
+        nodes = grid_step(real)
+
+        def record(kernel: wp.Kernel, count: int, *arguments: Any) -> wp.Launch:
+            return wp.launch(kernel, count, arguments, device=self.device, record_cmd=True)
+
+        particles = (self._x, self._v, self._c, self._home)
+        fields = (self._velocity, self._before, self._impulse, self._substep, self._top_speed, self._stray)
+        self._to_grid = record(kernels.to_grid, n, *particles, grid, self._momentum)
+        self._begin = record(
+            nodes.begin, node_count, grid, self._momentum, self._velocity, self._before, self._impulse
+        )
+        self._step = record(nodes.step, node_count, grid, self._velocity, self._impulse, self._substep)
+        self._stage = {
+            stage: record(
+                kernels.advance, n, *particles, self._e, self._ln_j, grid, soil, body, *fields, stage, 0.0
+            )
+            for stage in (START, ADVANCE, FINISH)
+        }
+        self._graphs: dict[int, wp.Graph] = {}
 
     # --- stepping -----------------------------------------------------------------------------------------
 
@@ -225,32 +229,52 @@ class Solver:
         ):
             array.assign(values)
 
-    def _substeps(self) -> None:
-        ends = {round(self.substeps_per_frame * (i + 1) / self.intervals) - 1 for i in range(self.intervals)}
-        fresh = True
-        for s in range(self.substeps_per_frame):
-            if fresh:
-                self._to_grid.launch()
-                self._start.launch()
-                fresh = False
+    def _steps_to_remap(self) -> int:
+        """Number of substeps until momentum is carried to a fresh grid: a power of two, or 3 times one.
+
+        Soil must not travel far from the place its weights belong to, and the time is bounded because remaps damp the
+        velocities that the grid does not resolve.
+        """
+        speed = max(self._top_body, float(self._top_speed.numpy()[0]))
+        limit = self.scene.remap_time
+        # Travel in the time t: speed t + g t^2.
+        room = self.scene.remap_distance * self.scene.bed.spacing
+        fall = self.scene.gravity
+        if fall * limit**2 + speed * limit > room:
+            limit = 2.0 * room / (speed + math.sqrt(speed**2 + 4.0 * fall * room))
+        most = max(1, int(limit / self.time_step))
+        power = 1 << (most.bit_length() - 1)
+        return power + power // 2 if most >= power + power // 2 else power
+
+    def _interval(self, steps: int) -> None:
+        """A remap and the substeps until the next one."""
+        self._to_grid.launch()
+        self._begin.launch()
+        self._top_speed.zero_()
+        self._stage[START].launch()
+        for _ in range(steps - 1):
             self._step.launch()
-            if s in ends:
-                self._finish.launch()
-                fresh = True
-            else:
-                self._advance_k.launch()
+            self._stage[ADVANCE].launch()
+        self._step.launch()
+        keep = math.exp(-steps * self.time_step / self.scene.velocity_memory)
+        self._stage[FINISH].set_param_by_name("keep", keep)
+        self._stage[FINISH].launch()
 
     def _advance(self, index: int) -> None:
-        if self.device.is_cuda:
-            if self._graph is None:
-                for launch in self._launches:
+        left = self.substeps_per_frame
+        while left:
+            steps = min(left, self._steps_to_remap())
+            left -= steps
+            if not self.device.is_cuda:
+                self._interval(steps)
+                continue
+            if steps not in self._graphs:
+                for launch in (self._to_grid, self._begin, self._step, *self._stage.values()):
                     wp.load_module(launch.kernel.module, device=self.device)
                 with wp.ScopedCapture(device=self.device) as capture:
-                    self._substeps()
-                self._graph = capture.graph
-            wp.capture_launch(self._graph)
-        else:
-            self._substeps()
+                    self._interval(steps)
+                self._graphs[steps] = capture.graph
+            wp.capture_launch(self._graphs[steps])
         count, particle, substep, slow = (int(i) for i in self._stray.numpy())
         if count:
             time = (index - 1) / self.scene.frame_rate + substep * self.time_step
@@ -258,7 +282,7 @@ class Solver:
             cause = (
                 "it left the grid: soil was thrown or pushed beyond it, raise scene.bed.headroom"
                 if slow
-                else "its speed is not finite or above one cell per step: lower scene.courant or the body's speed"
+                else "it is not finite or moved by more than a cell between two remaps: lower scene.courant"
             )
             raise SolverStopped(
                 f"particle {particle} at ({at}) m went wrong at {time:.5f} s, substep {substep} of frame {index}: "

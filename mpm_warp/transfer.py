@@ -1,7 +1,10 @@
-"""Particle-grid transfers with quadratic B-splines (APIC / MLS), and the material update between them.
+"""Particle-grid transfers with quadratic B-splines, and the material update between them.
 
-Both kernels visit the 27 nodes around a particle. Node (i, j, k) is entry (i ny + j) nz + k of a flat array of
-4-vectors: momentum and mass on the way to the grid, velocity (and an unused number) on the way back.
+Momentum is carried to the grid only now and then (`to_grid`, a remap); in between the velocities live on the grid and
+particles only feel them (`advance`), with the spline weights of the place they had at the remap, their `home`. A remap
+smooths velocities over a grid spacing; done in every step that smoothing acts as a viscosity that grows with 1 / dt.
+
+Kernels visit the 27 nodes around a particle. Node (i, j, k) is entry (i ny + j) nz + k of a flat array of 4-vectors.
 """
 
 from functools import cache
@@ -14,12 +17,16 @@ from .contact import body_struct, contact
 from .effects import Effects
 from .grid import grid_struct
 
-__all__ = ["transfer"]
+__all__ = ["ADVANCE", "FINISH", "START", "transfer"]
+
+# What `advance` does: give the first forces after a remap; make a step and give the next forces; make the last step
+# before a remap and take the velocity along.
+START, ADVANCE, FINISH = range(3)
 
 
 @cache
 def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> SimpleNamespace:
-    """Kernels `to_grid` and `to_particles` in precision `real` with only the physics in `effects`.
+    """Kernels `to_grid` and `advance` in precision `real` with only the physics in `effects`.
 
     `atomic` is needed where many threads write to the grid at once (a GPU).
     """
@@ -30,6 +37,7 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
     Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real)
     push = contact(real, atomic).push
     update, kirchhoff = law.update, law.kirchhoff
+    first, last = wp.constant(START), wp.constant(FINISH)
 
     @wp.func
     def base_and_offset(x: vec3, grid: Grid):
@@ -62,10 +70,18 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
 
     @wp.func
     def spread(
-        corner: vec4, qx: vec4, qy: vec4, qz: vec4, base: wp.vec3i, wx: vec3, wy: vec3, wz: vec3,
-        grid: Grid, nodes: wp.array(dtype=vec4),
-    ):  # fmt: skip
-        # Adds an affine field (value at the lowest node, change per cell along x, y, z) times the weights.
+        corner: vec4,
+        qx: vec4,
+        qy: vec4,
+        qz: vec4,
+        base: wp.vec3i,
+        wx: vec3,
+        wy: vec3,
+        wz: vec3,
+        grid: Grid,
+        nodes: wp.array(dtype=vec4),
+    ):
+        # Adds weight times an affine field: its value at the lowest node and its change per cell along x, y, z.
         plane = corner
         for i in range(3):
             at = plane
@@ -78,71 +94,51 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
                 at += qy
             plane += qx
 
-    @wp.func
-    def scatter_force(
-        e: vec6, ln_j: real, load: vec3, f: vec3, base: wp.vec3i, wx: vec3, wy: vec3, wz: vec3,
-        grid: Grid, soil: Soil, forces: wp.array(dtype=vec4),
-    ):  # fmt: skip
-        # Impulse of one step: -dt V D^-1 tau (x_i - x_p), D = dx^2 / 4, and the body's push.
-        q = kirchhoff(e, ln_j, soil) * (real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing)
-        start = load - q * f
-        spread(
-            vec4(start[0], start[1], start[2], real(0.0)),
-            vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0)),
-            vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0)),
-            vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0)),
-            base, wx, wy, wz, grid, forces,
-        )  # fmt: skip
-
     @wp.kernel(module="unique", enable_backward=False)
     def to_grid(
         x: wp.array(dtype=vec3),
-        home: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         c: wp.array(dtype=mat33),
-        e: wp.array(dtype=vec6),
-        ln_j: wp.array(dtype=real),
+        home: wp.array(dtype=vec3),
         grid: Grid,
-        soil: Soil,
-        body: Body,
-        nodes: wp.array(dtype=vec4),
-        forces: wp.array(dtype=vec4),
-        substep: wp.array(dtype=int),
+        momentum: wp.array(dtype=vec4),
     ):
         p = wp.tid()
         home[p] = x[p]
         base, f = base_and_offset(x[p], grid)
-        wx = weights(f[0])
-        wy = weights(f[1])
-        wz = weights(f[2])
         q = c[p] * (grid.particle_mass * grid.spacing)
         start = grid.particle_mass * v[p] - q * f
-        qx = vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0))
-        qy = vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0))
-        qz = vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0))
-        spread(vec4(start[0], start[1], start[2], grid.particle_mass), qx, qy, qz, base, wx, wy, wz, grid, nodes)
-        load = vec3()
-        if wp.static(with_body):
-            load = push(x[p], v[p], grid.particle_mass, grid.dt, substep[0], body)
-        scatter_force(e[p], ln_j[p], load, f, base, wx, wy, wz, grid, soil, forces)
+        spread(
+            vec4(start[0], start[1], start[2], grid.particle_mass),
+            vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0)),
+            vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0)),
+            vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0)),
+            base,
+            weights(f[0]),
+            weights(f[1]),
+            weights(f[2]),
+            grid,
+            momentum,
+        )
 
     @wp.kernel(module="unique", enable_backward=False)
     def advance(
         x: wp.array(dtype=vec3),
-        home: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         c: wp.array(dtype=mat33),
+        home: wp.array(dtype=vec3),
         e: wp.array(dtype=vec6),
         ln_j: wp.array(dtype=real),
         grid: Grid,
         soil: Soil,
         body: Body,
         velocity: wp.array(dtype=vec4),
-        start_velocity: wp.array(dtype=vec4),
-        forces: wp.array(dtype=vec4),
+        before: wp.array(dtype=vec4),
+        impulse: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
+        top_speed: wp.array(dtype=real),
         stray: wp.array(dtype=int),
-        last: int,
+        stage: int,
         keep: real,
     ):
         p = wp.tid()
@@ -183,46 +179,65 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
             gx[2] * scale, gy[2] * scale, gz[2] * scale,
         )  # fmt: skip
         speed = vec3(total[0], total[1], total[2])
-        moved = x[p] + grid.dt * speed
-        g = (moved - grid.origin) * grid.inverse_spacing
-        inside = (
-            g[0] >= real(0.5) and g[1] >= real(0.5) and g[2] >= real(0.5)
-            and g[0] < real(grid.nx) - real(1.5)
-            and g[1] < real(grid.ny) - real(1.5)
-            and g[2] < real(grid.nz) - real(1.5)
-        )  # fmt: skip
-        slow = wp.length_sq(speed) < grid.speed_limit * grid.speed_limit  # false for a NaN, too
-        if inside and slow:
-            state = update(e[p], ln_j[p], grid.dt * gradient, grid.dt, soil)
-            new_e = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
-            x[p] = moved
-            e[p] = new_e
-            ln_j[p] = state[6]
-            if last != 0:
-                c[p] = gradient
-                if keep > real(0.0):
-                    before = vec4()
-                    for i in range(3):
-                        for j in range(3):
-                            row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
-                            line = (
-                                wz[0] * start_velocity[row] + wz[1] * start_velocity[row + 1]
-                                + wz[2] * start_velocity[row + 2]
-                            )
-                            before += (wx[i] * wy[j]) * line
-                    v[p] = speed + keep * (v[p] - vec3(before[0], before[1], before[2]))
-                else:
-                    v[p] = speed
-            else:
-                load = vec3()
-                if wp.static(with_body):
-                    load = push(moved, speed, grid.particle_mass, grid.dt, substep[0], body)
-                scatter_force(new_e, state[6], load, f, base, wx, wy, wz, grid, soil, forces)
-        else:
-            # The particle keeps its last good state; the solver stops at the end of the frame.
-            if wp.atomic_add(stray, 0, 1) == 0:
-                stray[1] = p
-                stray[2] = substep[0]
-                stray[3] = wp.where(slow, 1, 0)
+        position = x[p]
+        strain = e[p]
+        volume = ln_j[p]
+        if stage != first:
+            position += grid.dt * speed
+            g = (position - grid.origin) * grid.inverse_spacing
+            inside = (
+                g[0] >= real(0.5) and g[1] >= real(0.5) and g[2] >= real(0.5)
+                and g[0] < real(grid.nx) - real(1.5)
+                and g[1] < real(grid.ny) - real(1.5)
+                and g[2] < real(grid.nz) - real(1.5)
+            )  # fmt: skip
+            near = wp.length_sq(position - home[p]) < grid.spacing * grid.spacing  # false for a NaN, too
+            if not (inside and near):
+                # The particle keeps its last good state; the solver stops at the end of the frame.
+                if wp.atomic_add(stray, 0, 1) == 0:
+                    stray[1] = p
+                    stray[2] = substep[0]
+                    stray[3] = wp.where(near, 1, 0)
+                return
+            state = update(strain, volume, grid.dt * gradient, grid.dt, soil)
+            strain = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
+            volume = state[6]
+            x[p] = position
+            e[p] = strain
+            ln_j[p] = volume
+        if stage == last:
+            # The particle's own velocity is changed by what changed on the grid; the part of it that the grid does not
+            # resolve is kept in part.
+            smooth = vec4()
+            for i in range(3):
+                plane = vec4()
+                for j in range(3):
+                    row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
+                    plane += wy[j] * (wz[0] * before[row] + wz[1] * before[row + 1] + wz[2] * before[row + 2])
+                smooth += wx[i] * plane
+            v[p] = speed + keep * (v[p] - vec3(smooth[0], smooth[1], smooth[2]))
+            c[p] = gradient
+            wp.atomic_max(top_speed, 0, wp.length(v[p]))
+            return
+        load = vec3()
+        if wp.static(with_body):
+            load = push(position, speed, grid.particle_mass, grid.dt, substep[0], body)
+        # Impulse of one step at the nodes: -dt V D^-1 tau (x_i - x_p), D = dx^2 / 4, and the body's push.
+        q = kirchhoff(strain, volume, soil) * (
+            real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing
+        )
+        start = load - q * f
+        spread(
+            vec4(start[0], start[1], start[2], real(0.0)),
+            vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0)),
+            vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0)),
+            vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0)),
+            base,
+            wx,
+            wy,
+            wz,
+            grid,
+            impulse,
+        )
 
     return SimpleNamespace(to_grid=to_grid, advance=advance)
