@@ -28,6 +28,7 @@ def grid_struct(real: type) -> type:
         high: wp.vec3i
         particle_mass: real  # [kg]
         particle_volume: real  # at the critical density [m^3]
+        speed_limit: real  # one cell per step [m/s]
 
     return Grid
 
@@ -57,10 +58,11 @@ def grid_step(real: type) -> SimpleNamespace:
         mass = node[3]
         v = vec3()
         inverse_mass = real(0.0)
-        if mass > real(0.0):
-            momentum[n] = vec4()
+        # A node that a particle on a cell's face barely touches has no mass to speak of, and 1 / mass no value.
+        if mass > real(1.0e-20) * grid.particle_mass:
             v = vec3(node[0], node[1], node[2]) / mass
             inverse_mass = real(1.0) / mass
+        momentum[n] = vec4()
         before[n] = vec4(v[0], v[1], v[2], inverse_mass)
         k = n % grid.nz
         j = (n // grid.nz) % grid.ny
@@ -70,7 +72,7 @@ def grid_step(real: type) -> SimpleNamespace:
         if i <= low[0] or j <= low[1] or k <= low[2] or i >= high[0] or j >= high[1] or k >= high[2]:
             v = vec3()
             inverse_mass = real(0.0)
-            impulse[n] = vec4()
+        impulse[n] = vec4()
         velocity[n] = vec4(v[0], v[1], v[2], inverse_mass)
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -140,6 +140,7 @@ class Solver:
         grid.dt, grid.gravity = self.time_step, scene.gravity
         grid.low = wp.vec3i(_PADDING, _PADDING, _PADDING)
         grid.high = wp.vec3i(_PADDING + cells[0], _PADDING + cells[1], 2**30)
+        grid.speed_limit = h / self.time_step
         grid.particle_volume, grid.particle_mass = volume, volume * material.bulk_density
         self._grid = grid
 
@@ -195,8 +196,10 @@ class Solver:
             return wp.launch(kernel, count, arguments, device=self.device, record_cmd=True)
 
         particles = (self._x, self._v, self._c, self._home)
-        fields = (self._velocity, self._before, self._impulse, self._substep, self._top_speed, self._stray)
-        self._to_grid = record(kernels.to_grid, n, *particles, grid, self._momentum)
+        fields = (self._velocity, self._before, self._impulse, self._substep, self._stray)
+        self._to_grid = record(
+            kernels.to_grid, n, *particles, grid, self._momentum, self._substep, self._top_speed, self._stray
+        )
         self._begin = record(
             nodes.begin, node_count, grid, self._momentum, self._velocity, self._before, self._impulse
         )
@@ -247,10 +250,8 @@ class Solver:
         return power + power // 2 if most >= power + power // 2 else power
 
     def _interval(self, steps: int) -> None:
-        """A remap and the substeps until the next one."""
-        self._to_grid.launch()
+        """The substeps from one remap to the next."""
         self._begin.launch()
-        self._top_speed.zero_()
         self._stage[START].launch()
         for _ in range(steps - 1):
             self._step.launch()
@@ -263,13 +264,15 @@ class Solver:
     def _advance(self, index: int) -> None:
         left = self.substeps_per_frame
         while left:
+            self._top_speed.zero_()
+            self._to_grid.launch()
             steps = min(left, self._steps_to_remap())
             left -= steps
             if not self.device.is_cuda:
                 self._interval(steps)
                 continue
             if steps not in self._graphs:
-                for launch in (self._to_grid, self._begin, self._step, *self._stage.values()):
+                for launch in (self._begin, self._step, *self._stage.values()):
                     wp.load_module(launch.kernel.module, device=self.device)
                 with wp.ScopedCapture(device=self.device) as capture:
                     self._interval(steps)
@@ -282,7 +285,8 @@ class Solver:
             cause = (
                 "it left the grid: soil was thrown or pushed beyond it, raise scene.bed.headroom"
                 if slow
-                else "it is not finite or moved by more than a cell between two remaps: lower scene.courant"
+                else "its speed is not finite or carried it further than a cell between two remaps: "
+                "lower scene.courant or the body's speed"
             )
             raise SolverStopped(
                 f"particle {particle} at ({at}) m went wrong at {time:.5f} s, substep {substep} of frame {index}: "

@@ -102,8 +102,19 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         home: wp.array(dtype=vec3),
         grid: Grid,
         momentum: wp.array(dtype=vec4),
+        substep: wp.array(dtype=int),
+        top_speed: wp.array(dtype=real),
+        stray: wp.array(dtype=int),
     ):
         p = wp.tid()
+        speed = wp.length(v[p])
+        if not (speed < grid.speed_limit):  # true for a NaN, too
+            if wp.atomic_add(stray, 0, 1) == 0:
+                stray[1] = p
+                stray[2] = substep[0]
+                stray[3] = 0
+            return
+        wp.atomic_max(top_speed, 0, speed)
         home[p] = x[p]
         base, f = base_and_offset(x[p], grid)
         q = c[p] * (grid.particle_mass * grid.spacing)
@@ -136,7 +147,6 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         before: wp.array(dtype=vec4),
         impulse: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
-        top_speed: wp.array(dtype=real),
         stray: wp.array(dtype=int),
         stage: int,
         keep: real,
@@ -217,7 +227,6 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
                 smooth += wx[i] * plane
             v[p] = speed + keep * (v[p] - vec3(smooth[0], smooth[1], smooth[2]))
             c[p] = gradient
-            wp.atomic_max(top_speed, 0, wp.length(v[p]))
             return
         load = vec3()
         if wp.static(with_body):
