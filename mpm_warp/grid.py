@@ -55,9 +55,11 @@ def grid_step(real: type) -> wp.Kernel:
             nodes[n] = vec4()
             v = vec3(node[0], node[1], node[2]) / mass
             v = v - vec3(real(0.0), real(0.0), grid.gravity * grid.dt)
-            k = n % grid.nz
-            j = (n // grid.nz) % grid.ny
-            i = n // (grid.nz * grid.ny)
+            # `/` of whole numbers is one instruction; `//` and `%` follow Python's rule for negative numbers.
+            column = n / grid.nz
+            i = column / grid.ny
+            j = column - i * grid.ny
+            k = n - column * grid.nz
             low = grid.low
             high = grid.high
             if i <= low[0] or j <= low[1] or k <= low[2] or i >= high[0] or j >= high[1] or k >= high[2]:
