@@ -163,8 +163,8 @@ class Solver:
         self._e = wp.zeros(n, dtype=wp.types.vector(6, real), **new)
         self._ln_j = wp.array(ln_j, dtype=real, **new)
         node_count = grid.nx * grid.ny * grid.nz
-        self._nodes = wp.zeros(node_count, dtype=vec4, **new)
-        self._velocity = wp.zeros(node_count, dtype=vec4, **new)
+        self._nodes = wp.zeros(node_count + 1, dtype=vec4, **new)  # + 1: see rows.py
+        self._velocity = wp.zeros(node_count + 1, dtype=vec4, **new)
         self._substep = wp.zeros(1, dtype=int, **new)
         self._stray = wp.zeros(4, dtype=int, **new)
 
@@ -185,16 +185,25 @@ class Solver:
         self._body = body
 
         kernels = transfer(real, self.effects, with_body=plate is not None, atomic=self.device.is_cuda)
-        particles = [self._x, self._v, self._c, self._e, self._ln_j, grid, soil]
+        particles, state = [self._x, self._v, self._c], [self._e, self._ln_j]
         record = {"device": self.device, "record_cmd": True}
         self._launches = [
-            wp.launch(kernels.to_grid, n, [*particles, body, self._nodes, self._substep], **record),
+            wp.launch(
+                kernels.to_grid,
+                n,
+                [*particles, *state, grid, soil, body, self._nodes, self._substep],
+                **record,
+            ),
             wp.launch(
                 grid_step(real), node_count, [grid, self._nodes, self._velocity, self._substep], **record
             ),
             wp.launch(
-                kernels.to_particles, n, [*particles, self._velocity, self._substep, self._stray], **record
+                kernels.to_particles,
+                n,
+                [*particles, grid, self._velocity, self._substep, self._stray],
+                **record,
             ),
+            wp.launch(kernels.material, n, [self._c, *state, grid, soil], **record),
         ]
         self._graph: wp.Graph | None = None
 

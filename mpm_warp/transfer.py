@@ -1,7 +1,7 @@
-"""Particle-grid transfers with quadratic B-splines (APIC / MLS), and the material update between them.
+"""Particle-grid transfers with quadratic B-splines (APIC / MLS), and the material update after them.
 
-Both kernels visit the 27 nodes around a particle. Node (i, j, k) is entry (i ny + j) nz + k of a flat array of
-4-vectors: momentum and mass on the way to the grid, velocity (and an unused number) on the way back.
+The transfers visit the 27 nodes around a particle, as 9 rows along z. Node (i, j, k) is entry (i ny + j) nz + k of a
+flat array of 4-vectors: momentum and mass on the way to the grid, velocity (and an unused number) on the way back.
 """
 
 from functools import cache
@@ -13,16 +13,19 @@ from .constitutive import constitutive, soil_struct
 from .contact import body_struct, contact
 from .effects import Effects
 from .grid import grid_struct
+from .rows import rows
 
 __all__ = ["transfer"]
 
 
 @cache
 def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> SimpleNamespace:
-    """Kernels `to_grid` and `to_particles` in precision `real` with only the physics in `effects`.
+    """Kernels `to_grid`, `to_particles` and `material` in precision `real` with only the physics in `effects`.
 
     `atomic` is needed where many threads write to the grid at once (a GPU).
     """
+    # Warp writes a product and the sum it goes into as two statements: without the flag they stay two instructions.
+    fused = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast"}
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
     law = constitutive(real, effects)
@@ -30,6 +33,10 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
     Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real)
     push = contact(real, atomic).push
     update, kirchhoff = law.update, law.kirchhoff
+    lanes = rows(real, gpu=atomic)
+    row, plus, gather, scatter, spread, fold = (
+        lanes.row, lanes.plus, lanes.gather, lanes.scatter, lanes.spread, lanes.fold
+    )  # fmt: skip
 
     @wp.func
     def base_and_offset(x: vec3, grid: Grid):
@@ -52,15 +59,7 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
     def moments(w: vec3, f: real):
         return vec3(-f * w[0], (real(1.0) - f) * w[1], (real(2.0) - f) * w[2])
 
-    @wp.func
-    def deposit(nodes: wp.array(dtype=vec4), at: int, amount: vec4):
-        # On the CPU one thread runs the kernel, and a plain sum is faster than an atomic one.
-        if wp.static(atomic):
-            wp.atomic_add(nodes, at, amount)
-        else:
-            nodes[at] = nodes[at] + amount
-
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
     def to_grid(
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
@@ -91,27 +90,25 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         qy = vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0))
         qz = vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0))
         corner = vec4(start[0], start[1], start[2], grid.particle_mass)
-        plane = corner
+        # The amount for node (i, j, k) is w_i w_j w_k (corner + i qx + j qy + k qz): the sum over k is the same
+        # for all nine rows.
+        plane = spread(wz, corner, qz)
+        row_x = spread(wz, qx, vec4())
+        row_y = spread(wz, qy, vec4())
         for i in range(3):
             at = plane
             for j in range(3):
-                row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
-                w = wx[i] * wy[j]
-                deposit(nodes, row, (w * wz[0]) * at)
-                deposit(nodes, row + 1, (w * wz[1]) * (at + qz))
-                deposit(nodes, row + 2, (w * wz[2]) * (at + real(2.0) * qz))
-                at += qy
-            plane += qx
+                first = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
+                scatter(nodes, first, plus(row(), wx[i] * wy[j], at))
+                at = plus(at, real(1.0), row_y)
+            plane = plus(plane, real(1.0), row_x)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
     def to_particles(
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         c: wp.array(dtype=mat33),
-        e: wp.array(dtype=vec6),
-        ln_j: wp.array(dtype=real),
         grid: Grid,
-        soil: Soil,
         velocity: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
         stray: wp.array(dtype=int),
@@ -126,28 +123,24 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         ax = moments(wx, f[0])
         ay = moments(wy, f[1])
         az = moments(wz, f[2])
-        total = vec4()
-        gx = vec4()
-        gy = vec4()
-        gz = vec4()
+        all_v = row()
+        all_x = row()
+        all_y = row()
         for i in range(3):
-            plane = vec4()
-            plane_y = vec4()
-            plane_z = vec4()
+            plane = row()
+            plane_y = row()
             for j in range(3):
-                row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
-                v0 = velocity[row]
-                v1 = velocity[row + 1]
-                v2 = velocity[row + 2]
-                line = wz[0] * v0 + wz[1] * v1 + wz[2] * v2
-                line_z = az[0] * v0 + az[1] * v1 + az[2] * v2
-                plane += wy[j] * line
-                plane_y += ay[j] * line
-                plane_z += wy[j] * line_z
-            total += wx[i] * plane
-            gx += ax[i] * plane
-            gy += wx[i] * plane_y
-            gz += wx[i] * plane_z
+                first = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
+                v_row = gather(velocity, first)
+                plane = plus(plane, wy[j], v_row)
+                plane_y = plus(plane_y, ay[j], v_row)
+            all_v = plus(all_v, wx[i], plane)
+            all_x = plus(all_x, ax[i], plane)
+            all_y = plus(all_y, wx[i], plane_y)
+        total = fold(wz, all_v)
+        gx = fold(wz, all_x)
+        gy = fold(wz, all_y)
+        gz = fold(az, all_v)
         scale = real(4.0) * grid.inverse_spacing
         gradient = mat33(
             gx[0] * scale, gy[0] * scale, gz[0] * scale,
@@ -165,17 +158,29 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         )  # fmt: skip
         slow = wp.length_sq(speed) < grid.speed_limit * grid.speed_limit  # false for a NaN, too
         if inside and slow:
-            state = update(e[p], ln_j[p], grid.dt * gradient, grid.dt, soil)
             x[p] = moved
             v[p] = speed
             c[p] = gradient
-            e[p] = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
-            ln_j[p] = state[6]
         else:
             # The particle keeps its last good state; the solver stops at the end of the frame.
+            c[p] = mat33()
             if wp.atomic_add(stray, 0, 1) == 0:
                 stray[1] = p
                 stray[2] = substep[0]
                 stray[3] = wp.where(slow, 1, 0)
 
-    return SimpleNamespace(to_grid=to_grid, to_particles=to_particles)
+    # A kernel of its own: in one with the transfer the C++ compiler makes both slower.
+    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
+    def material(
+        c: wp.array(dtype=mat33),
+        e: wp.array(dtype=vec6),
+        ln_j: wp.array(dtype=real),
+        grid: Grid,
+        soil: Soil,
+    ):
+        p = wp.tid()
+        state = update(e[p], ln_j[p], grid.dt * c[p], grid.dt, soil)
+        e[p] = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
+        ln_j[p] = state[6]
+
+    return SimpleNamespace(to_grid=to_grid, to_particles=to_particles, material=material)
