@@ -17,7 +17,7 @@ import warp as wp
 from mpm_warp import Bed, Effects, Excavation, Material, Scene, Solver
 
 MATERIAL = Material(youngs_modulus=1.0e6)
-SUBSTEPS_PER_BLOCK = 2e6  # particle-steps between two looks at the clock
+BLOCK = 1e7  # particle-steps between two looks at the clock
 
 
 def bed(particles: int) -> Bed:
@@ -75,7 +75,7 @@ def main() -> None:
     else:
         soil = bed(options.particles)
         # Frames so short that the clock is looked at often, also with many particles.
-        steps = max(1, round(SUBSTEPS_PER_BLOCK / len(soil.filled[0])))
+        steps = max(1, round(BLOCK / len(soil.filled[0])))
         scene = Scene(
             bed=soil,
             material=MATERIAL,

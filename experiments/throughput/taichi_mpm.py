@@ -172,7 +172,7 @@ def main() -> None:
     while warm < 3 or time.perf_counter() - begin < 0.3 * options.seconds:
         step()
         warm += 1
-    block = max(1, round(2e6 / n))
+    block = max(1, round(1e7 / n))
     rates, stop = [], time.perf_counter() + options.seconds
     while len(rates) < 3 or time.perf_counter() < stop:
         begin = time.perf_counter()
