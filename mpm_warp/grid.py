@@ -63,10 +63,12 @@ def grid_step(real: type) -> SimpleNamespace:
             v = vec3(node[0], node[1], node[2]) / mass
             inverse_mass = real(1.0) / mass
         momentum[n] = vec4()
-        before[n] = vec4(v[0], v[1], v[2], inverse_mass)
-        k = n % grid.nz
-        j = (n // grid.nz) % grid.ny
-        i = n // (grid.nz * grid.ny)
+        before[n] = vec4(v[0], v[1], v[2], real(0.0))
+        # `/` of whole numbers is one instruction; `//` and `%` follow Python's rule for negative numbers.
+        column = n / grid.nz
+        i = column / grid.ny
+        j = column - i * grid.ny
+        k = n - column * grid.nz
         low = grid.low
         high = grid.high
         if i <= low[0] or j <= low[1] or k <= low[2] or i >= high[0] or j >= high[1] or k >= high[2]:

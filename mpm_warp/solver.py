@@ -18,7 +18,7 @@ from .grid import grid_step, grid_struct
 from .rotation import angular_velocity, rotate
 from .scene import Scene
 from .start import start_warp
-from .transfer import ADVANCE, FINISH, START, transfer
+from .transfer import transfer
 
 __all__ = ["PRECISIONS", "Frame", "Solver"]
 
@@ -164,10 +164,11 @@ class Solver:
         self._c = wp.zeros(n, dtype=wp.types.matrix((3, 3), real), **new)
         self._e = wp.zeros(n, dtype=wp.types.vector(6, real), **new)
         self._ln_j = wp.array(ln_j, dtype=real, **new)
+        self._u = wp.zeros(n, dtype=vec3, **new)  # velocity of the grid where the particle is
         self._home = wp.zeros(n, dtype=vec3, **new)
         node_count = grid.nx * grid.ny * grid.nz
         self._momentum, self._velocity, self._before, self._impulse = (
-            wp.zeros(node_count, dtype=vec4, **new) for _ in range(4)
+            wp.zeros(node_count + 1, dtype=vec4, **new) for _ in range(4)  # + 1: see rows.py
         )
         self._substep = wp.zeros(1, dtype=int, **new)
         self._top_speed = wp.zeros(1, dtype=real, **new)
@@ -195,21 +196,21 @@ class Solver:
         def record(kernel: wp.Kernel, count: int, *arguments: Any) -> wp.Launch:
             return wp.launch(kernel, count, arguments, device=self.device, record_cmd=True)
 
-        particles = (self._x, self._v, self._c, self._home)
-        fields = (self._velocity, self._before, self._impulse, self._substep, self._stray)
+        x, u, v, c, home, e, ln_j = self._x, self._u, self._v, self._c, self._home, self._e, self._ln_j
+        watch = (self._substep, self._stray)
         self._to_grid = record(
-            kernels.to_grid, n, *particles, grid, self._momentum, self._substep, self._top_speed, self._stray
+            kernels.to_grid, n, x, v, c, home, grid, self._momentum, self._top_speed, *watch
         )
         self._begin = record(
             nodes.begin, node_count, grid, self._momentum, self._velocity, self._before, self._impulse
         )
-        self._step = record(nodes.step, node_count, grid, self._velocity, self._impulse, self._substep)
-        self._stage = {
-            stage: record(
-                kernels.advance, n, *particles, self._e, self._ln_j, grid, soil, body, *fields, stage, 0.0
-            )
-            for stage in (START, ADVANCE, FINISH)
-        }
+        self._step = [
+            record(kernels.scatter, n, x, home, u, e, ln_j, grid, soil, body, self._impulse, self._substep),
+            record(nodes.step, node_count, grid, self._velocity, self._impulse, self._substep),
+            record(kernels.gather, n, x, home, u, c, grid, self._velocity, *watch),
+            record(kernels.material, n, c, e, ln_j, grid, soil),
+        ]
+        self._from_grid = record(kernels.from_grid, n, home, u, v, grid, self._before, 0.0)
         self._graphs: dict[int, wp.Graph] = {}
 
     # --- stepping -----------------------------------------------------------------------------------------
@@ -252,14 +253,12 @@ class Solver:
     def _interval(self, steps: int) -> None:
         """The substeps from one remap to the next."""
         self._begin.launch()
-        self._stage[START].launch()
-        for _ in range(steps - 1):
-            self._step.launch()
-            self._stage[ADVANCE].launch()
-        self._step.launch()
+        for _ in range(steps):
+            for launch in self._step:
+                launch.launch()
         keep = math.exp(-steps * self.time_step / self.scene.velocity_memory)
-        self._stage[FINISH].set_param_by_name("keep", keep)
-        self._stage[FINISH].launch()
+        self._from_grid.set_param_by_name("keep", keep)
+        self._from_grid.launch()
 
     def _advance(self, index: int) -> None:
         left = self.substeps_per_frame
@@ -272,7 +271,7 @@ class Solver:
                 self._interval(steps)
                 continue
             if steps not in self._graphs:
-                for launch in (self._begin, self._step, *self._stage.values()):
+                for launch in (self._begin, *self._step, self._from_grid):
                     wp.load_module(launch.kernel.module, device=self.device)
                 with wp.ScopedCapture(device=self.device) as capture:
                     self._interval(steps)
@@ -301,7 +300,7 @@ class Solver:
             index=index,
             time=index / scene.frame_rate,
             position=self._x.numpy().astype(np.float32),
-            velocity=self._v.numpy().astype(np.float32),
+            velocity=self._u.numpy().astype(np.float32),
             body_pose=pose,
             body_points=rotate(pose[3:], scene.body_points()) + pose[:3],
             force=impulse[0],

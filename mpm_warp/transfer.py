@@ -1,10 +1,12 @@
-"""Particle-grid transfers with quadratic B-splines, and the material update between them.
+"""Particle-grid transfers with quadratic B-splines (APIC / MLS), and the material update.
 
-Momentum is carried to the grid only now and then (`to_grid`, a remap); in between the velocities live on the grid and
-particles only feel them (`advance`), with the spline weights of the place they had at the remap, their `home`. A remap
-smooths velocities over a grid spacing; done in every step that smoothing acts as a viscosity that grows with 1 / dt.
+Momentum is carried to the grid only now and then (`to_grid`, `from_grid`: a remap). In between the velocities live on
+the grid: particles give impulses (`scatter`) and feel the velocity and its gradient (`gather`), with the spline weights
+of the place they had at the remap, their `home`. A remap smooths velocities over a grid spacing; done in every step,
+that smoothing acts as a viscosity that grows with 1 / dt.
 
-Kernels visit the 27 nodes around a particle. Node (i, j, k) is entry (i ny + j) nz + k of a flat array of 4-vectors.
+The transfers visit the 27 nodes around a particle, as 9 rows along z. Node (i, j, k) is entry (i ny + j) nz + k of a
+flat array of 4-vectors: momentum and mass, velocity and 1 / mass, or impulse.
 """
 
 from functools import cache
@@ -16,20 +18,20 @@ from .constitutive import constitutive, soil_struct
 from .contact import body_struct, contact
 from .effects import Effects
 from .grid import grid_struct
+from .rows import rows
 
-__all__ = ["ADVANCE", "FINISH", "START", "transfer"]
-
-# What `advance` does: give the first forces after a remap; make a step and give the next forces; make the last step
-# before a remap and take the velocity along.
-START, ADVANCE, FINISH = range(3)
+__all__ = ["transfer"]
 
 
 @cache
 def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> SimpleNamespace:
-    """Kernels `to_grid` and `advance` in precision `real` with only the physics in `effects`.
+    """Kernels in precision `real` with only the physics in `effects`: `to_grid` and `from_grid` at a remap;
+    `scatter`, `gather` and `material` in every step.
 
     `atomic` is needed where many threads write to the grid at once (a GPU).
     """
+    # Warp writes a product and the sum it goes into as two statements: without the flag they stay two instructions.
+    fused = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast"}
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
     law = constitutive(real, effects)
@@ -37,7 +39,10 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
     Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real)
     push = contact(real, atomic).push
     update, kirchhoff = law.update, law.kirchhoff
-    first, last = wp.constant(START), wp.constant(FINISH)
+    lanes = rows(real, gpu=atomic)
+    row, plus, gather_row, scatter_row, spread, fold = (
+        lanes.row, lanes.plus, lanes.gather, lanes.scatter, lanes.spread, lanes.fold
+    )  # fmt: skip
 
     @wp.func
     def base_and_offset(x: vec3, grid: Grid):
@@ -61,40 +66,36 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         return vec3(-f * w[0], (real(1.0) - f) * w[1], (real(2.0) - f) * w[2])
 
     @wp.func
-    def deposit(nodes: wp.array(dtype=vec4), at: int, amount: vec4):
-        # On the CPU one thread runs the kernel, and a plain sum is faster than an atomic one.
-        if wp.static(atomic):
-            wp.atomic_add(nodes, at, amount)
-        else:
-            nodes[at] = nodes[at] + amount
+    def node_index(base: wp.vec3i, i: int, j: int, grid: Grid):
+        return ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
 
     @wp.func
-    def spread(
-        corner: vec4,
-        qx: vec4,
-        qy: vec4,
-        qz: vec4,
-        base: wp.vec3i,
-        wx: vec3,
-        wy: vec3,
-        wz: vec3,
-        grid: Grid,
-        nodes: wp.array(dtype=vec4),
-    ):
-        # Adds weight times an affine field: its value at the lowest node and its change per cell along x, y, z.
-        plane = corner
+    def fault(stray: wp.array(dtype=int), p: int, substep: int, left_grid: int):
+        # The first faulty particle is remembered; the solver stops at the end of the frame.
+        if wp.atomic_add(stray, 0, 1) == 0:
+            stray[1] = p
+            stray[2] = substep
+            stray[3] = left_grid
+
+    @wp.func
+    def deposit(base: wp.vec3i, f: vec3, corner: vec4, q: mat33, grid: Grid, nodes: wp.array(dtype=vec4)):
+        # Adds weight times an affine field: `corner` at the lowest node, the columns of q more with every cell along
+        # x, y, z. The sum over a row is the same for all nine rows but for the weights.
+        wx = weights(f[0])
+        wy = weights(f[1])
+        wz = weights(f[2])
+        zero = real(0.0)
+        plane = spread(wz, corner, vec4(q[0, 2], q[1, 2], q[2, 2], zero))
+        row_x = spread(wz, vec4(q[0, 0], q[1, 0], q[2, 0], zero), vec4())
+        row_y = spread(wz, vec4(q[0, 1], q[1, 1], q[2, 1], zero), vec4())
         for i in range(3):
             at = plane
             for j in range(3):
-                row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
-                w = wx[i] * wy[j]
-                deposit(nodes, row, (w * wz[0]) * at)
-                deposit(nodes, row + 1, (w * wz[1]) * (at + qz))
-                deposit(nodes, row + 2, (w * wz[2]) * (at + real(2.0) * qz))
-                at += qy
-            plane += qx
+                scatter_row(nodes, node_index(base, i, j, grid), plus(row(), wx[i] * wy[j], at))
+                at = plus(at, real(1.0), row_y)
+            plane = plus(plane, real(1.0), row_x)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
     def to_grid(
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
@@ -102,54 +103,56 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         home: wp.array(dtype=vec3),
         grid: Grid,
         momentum: wp.array(dtype=vec4),
-        substep: wp.array(dtype=int),
         top_speed: wp.array(dtype=real),
+        substep: wp.array(dtype=int),
         stray: wp.array(dtype=int),
     ):
         p = wp.tid()
         speed = wp.length(v[p])
         if not (speed < grid.speed_limit):  # true for a NaN, too
-            if wp.atomic_add(stray, 0, 1) == 0:
-                stray[1] = p
-                stray[2] = substep[0]
-                stray[3] = 0
+            fault(stray, p, substep[0], 0)
             return
         wp.atomic_max(top_speed, 0, speed)
         home[p] = x[p]
         base, f = base_and_offset(x[p], grid)
         q = c[p] * (grid.particle_mass * grid.spacing)
         start = grid.particle_mass * v[p] - q * f
-        spread(
-            vec4(start[0], start[1], start[2], grid.particle_mass),
-            vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0)),
-            vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0)),
-            vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0)),
-            base,
-            weights(f[0]),
-            weights(f[1]),
-            weights(f[2]),
-            grid,
-            momentum,
-        )
+        deposit(base, f, vec4(start[0], start[1], start[2], grid.particle_mass), q, grid, momentum)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def advance(
+    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
+    def scatter(
         x: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        c: wp.array(dtype=mat33),
         home: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
         e: wp.array(dtype=vec6),
         ln_j: wp.array(dtype=real),
         grid: Grid,
         soil: Soil,
         body: Body,
-        velocity: wp.array(dtype=vec4),
-        before: wp.array(dtype=vec4),
         impulse: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
+    ):
+        p = wp.tid()
+        base, f = base_and_offset(home[p], grid)
+        # Of the stress: -dt V D^-1 tau (x_i - x_p), D = dx^2 / 4; q is per cell.
+        q = kirchhoff(e[p], ln_j[p], soil) * (
+            real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing
+        )
+        start = -(q * f)
+        if wp.static(with_body):
+            start += push(x[p], u[p], grid.particle_mass, grid.dt, substep[0], body)
+        deposit(base, f, vec4(start[0], start[1], start[2], real(0.0)), q, grid, impulse)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
+    def gather(
+        x: wp.array(dtype=vec3),
+        home: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        c: wp.array(dtype=mat33),
+        grid: Grid,
+        velocity: wp.array(dtype=vec4),
+        substep: wp.array(dtype=int),
         stray: wp.array(dtype=int),
-        stage: int,
-        keep: real,
     ):
         p = wp.tid()
         base, f = base_and_offset(home[p], grid)
@@ -160,93 +163,82 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         ax = moments(wx, f[0])
         ay = moments(wy, f[1])
         az = moments(wz, f[2])
-        total = vec4()
-        gx = vec4()
-        gy = vec4()
-        gz = vec4()
+        all_v = row()
+        all_x = row()
+        all_y = row()
         for i in range(3):
-            plane = vec4()
-            plane_y = vec4()
-            plane_z = vec4()
+            plane = row()
+            plane_y = row()
             for j in range(3):
-                row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
-                v0 = velocity[row]
-                v1 = velocity[row + 1]
-                v2 = velocity[row + 2]
-                line = wz[0] * v0 + wz[1] * v1 + wz[2] * v2
-                line_z = az[0] * v0 + az[1] * v1 + az[2] * v2
-                plane += wy[j] * line
-                plane_y += ay[j] * line
-                plane_z += wy[j] * line_z
-            total += wx[i] * plane
-            gx += ax[i] * plane
-            gy += wx[i] * plane_y
-            gz += wx[i] * plane_z
+                v_row = gather_row(velocity, node_index(base, i, j, grid))
+                plane = plus(plane, wy[j], v_row)
+                plane_y = plus(plane_y, ay[j], v_row)
+            all_v = plus(all_v, wx[i], plane)
+            all_x = plus(all_x, ax[i], plane)
+            all_y = plus(all_y, wx[i], plane_y)
+        total = fold(wz, all_v)
+        gx = fold(wz, all_x)
+        gy = fold(wz, all_y)
+        gz = fold(az, all_v)
         scale = real(4.0) * grid.inverse_spacing
-        gradient = mat33(
-            gx[0] * scale, gy[0] * scale, gz[0] * scale,
-            gx[1] * scale, gy[1] * scale, gz[1] * scale,
-            gx[2] * scale, gy[2] * scale, gz[2] * scale,
+        felt = vec3(total[0], total[1], total[2])
+        moved = x[p] + grid.dt * felt
+        g = (moved - grid.origin) * grid.inverse_spacing
+        inside = (
+            g[0] >= real(0.5) and g[1] >= real(0.5) and g[2] >= real(0.5)
+            and g[0] < real(grid.nx) - real(1.5)
+            and g[1] < real(grid.ny) - real(1.5)
+            and g[2] < real(grid.nz) - real(1.5)
         )  # fmt: skip
-        speed = vec3(total[0], total[1], total[2])
-        position = x[p]
-        strain = e[p]
-        volume = ln_j[p]
-        if stage != first:
-            position += grid.dt * speed
-            g = (position - grid.origin) * grid.inverse_spacing
-            inside = (
-                g[0] >= real(0.5) and g[1] >= real(0.5) and g[2] >= real(0.5)
-                and g[0] < real(grid.nx) - real(1.5)
-                and g[1] < real(grid.ny) - real(1.5)
-                and g[2] < real(grid.nz) - real(1.5)
+        near = wp.length_sq(moved - home[p]) < grid.spacing * grid.spacing  # false for a NaN, too
+        if inside and near:
+            x[p] = moved
+            u[p] = felt
+            c[p] = mat33(
+                gx[0] * scale, gy[0] * scale, gz[0] * scale,
+                gx[1] * scale, gy[1] * scale, gz[1] * scale,
+                gx[2] * scale, gy[2] * scale, gz[2] * scale,
             )  # fmt: skip
-            near = wp.length_sq(position - home[p]) < grid.spacing * grid.spacing  # false for a NaN, too
-            if not (inside and near):
-                # The particle keeps its last good state; the solver stops at the end of the frame.
-                if wp.atomic_add(stray, 0, 1) == 0:
-                    stray[1] = p
-                    stray[2] = substep[0]
-                    stray[3] = wp.where(near, 1, 0)
-                return
-            state = update(strain, volume, grid.dt * gradient, grid.dt, soil)
-            strain = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
-            volume = state[6]
-            x[p] = position
-            e[p] = strain
-            ln_j[p] = volume
-        if stage == last:
-            # The particle's own velocity is changed by what changed on the grid; the part of it that the grid does not
-            # resolve is kept in part.
-            smooth = vec4()
-            for i in range(3):
-                plane = vec4()
-                for j in range(3):
-                    row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
-                    plane += wy[j] * (wz[0] * before[row] + wz[1] * before[row + 1] + wz[2] * before[row + 2])
-                smooth += wx[i] * plane
-            v[p] = speed + keep * (v[p] - vec3(smooth[0], smooth[1], smooth[2]))
-            c[p] = gradient
-            return
-        load = vec3()
-        if wp.static(with_body):
-            load = push(position, speed, grid.particle_mass, grid.dt, substep[0], body)
-        # Impulse of one step at the nodes: -dt V D^-1 tau (x_i - x_p), D = dx^2 / 4, and the body's push.
-        q = kirchhoff(strain, volume, soil) * (
-            real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing
-        )
-        start = load - q * f
-        spread(
-            vec4(start[0], start[1], start[2], real(0.0)),
-            vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0)),
-            vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0)),
-            vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0)),
-            base,
-            wx,
-            wy,
-            wz,
-            grid,
-            impulse,
-        )
+        else:
+            c[p] = mat33()  # the particle keeps its last good state
+            fault(stray, p, substep[0], wp.where(near, 1, 0))
 
-    return SimpleNamespace(to_grid=to_grid, advance=advance)
+    # A kernel of its own: in one with the transfer the C++ compiler makes both slower.
+    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
+    def material(
+        c: wp.array(dtype=mat33),
+        e: wp.array(dtype=vec6),
+        ln_j: wp.array(dtype=real),
+        grid: Grid,
+        soil: Soil,
+    ):
+        p = wp.tid()
+        state = update(e[p], ln_j[p], grid.dt * c[p], grid.dt, soil)
+        e[p] = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
+        ln_j[p] = state[6]
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
+    def from_grid(
+        home: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        grid: Grid,
+        before: wp.array(dtype=vec4),
+        keep: real,
+    ):
+        # The particle's own velocity changes by what changed on the grid; of the part that the grid does not resolve
+        # the share `keep` is left.
+        p = wp.tid()
+        base, f = base_and_offset(home[p], grid)
+        wx = weights(f[0])
+        wy = weights(f[1])
+        total = row()
+        for i in range(3):
+            for j in range(3):
+                total = plus(total, wx[i] * wy[j], gather_row(before, node_index(base, i, j, grid)))
+        smooth = fold(weights(f[2]), total)
+        v[p] = u[p] + keep * (v[p] - vec3(smooth[0], smooth[1], smooth[2]))
+
+    return SimpleNamespace(
+        to_grid=to_grid, scatter=scatter, gather=gather, material=material, from_grid=from_grid
+    )

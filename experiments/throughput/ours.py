@@ -1,0 +1,114 @@
+"""mpm_warp on a bin, one core; writes the case file the others read, or prints its rates as JSON.
+
+python ours.py --particles 29700 --blade --seconds 5
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from mpm_warp import Bed, Effects, Excavation, Material, Scene, Solver
+
+MATERIAL = Material(youngs_modulus=1.0e6)
+BLOCK = 1e7  # particle-steps between two looks at the clock
+
+
+def bed(particles: int) -> Bed:
+    """The paper's bin with about so many particles, one per cell."""
+    size = (0.8, 0.6, 0.15)
+    return Bed(size=size, spacing=(size[0] * size[1] * size[2] / particles) ** (1.0 / 3.0))
+
+
+def cut(particles: int) -> Excavation:
+    """The paper's excavation: 8 cm deep, 10 cm/s, rake 10 degrees."""
+    return Excavation(bed=bed(particles), material=MATERIAL, depth=0.08, speed=0.10, rake=10.0)
+
+
+def time_step(particles: int) -> float:
+    """Substep of the bed without a body [s]."""
+    return Solver(Scene(bed=bed(particles), material=MATERIAL)).time_step
+
+
+def write_case(path: Path, particles: int) -> None:
+    """What the other solvers need to know, as plain arrays."""
+    soil, scene = bed(particles), cut(30_000)
+    positions, volume = soil.filled
+    np.savez(
+        path,
+        position=positions,
+        volume=volume,
+        spacing=soil.spacing,
+        size=soil.size,
+        headroom=soil.headroom,
+        dt=time_step(particles),
+        density=MATERIAL.bulk_density,
+        youngs_modulus=MATERIAL.youngs_modulus,
+        poissons_ratio=MATERIAL.poissons_ratio,
+        friction=MATERIAL.static_friction,
+        poses=scene.body_poses(),
+        half_size=scene.blade.half_size,
+        body_friction=scene.blade.friction,
+        frame_rate=scene.frame_rate,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--particles", type=int, default=30_000)
+    parser.add_argument(
+        "--blade", action="store_true", help="full law and contact; else a bed at constant friction"
+    )
+    parser.add_argument("--core", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--warm", type=int, default=5, help="frames before timing starts, with --blade")
+    options = parser.parse_args()
+    os.sched_setaffinity(0, {options.core})
+    if options.blade:
+        scene, effects = cut(options.particles), Effects()
+    else:
+        soil = bed(options.particles)
+        # Frames so short that the clock is looked at often, also with many particles.
+        steps = max(1, round(BLOCK / len(soil.filled[0])))
+        scene = Scene(
+            bed=soil,
+            material=MATERIAL,
+            duration=60.0,
+            frame_rate=1.0 / (steps * time_step(options.particles)),
+        )
+        effects = Effects(rate_dependence=False)
+    solver = Solver(scene, effects)
+    frames = solver.frames()
+    begin, warm = time.perf_counter(), 0
+    while (
+        warm < (options.warm if options.blade else 3) or time.perf_counter() - begin < 0.3 * options.seconds
+    ):
+        next(frames)
+        warm += 1
+    rates, costs, stop = [], [], time.perf_counter() + options.seconds
+    while len(rates) < 3 or time.perf_counter() < stop:
+        begin = time.perf_counter()
+        next(frames)
+        wall = time.perf_counter() - begin
+        rates.append(solver.particle_count * solver.substeps_per_frame / wall)
+        costs.append(wall * scene.frame_rate)
+    print(
+        json.dumps(
+            {
+                "version": f"warp {wp.__version__}",
+                "particles": solver.particle_count,
+                "rates": rates,
+                "s_per_simulated_s": costs,
+            }
+        )
+    )
+
+
+if __name__ == "__main__":
+    main()
