@@ -6,7 +6,7 @@ from .effects import Effects
 from .errors import SceneError, SolverStopped
 from .material import Material
 from .scene import Bed, Excavation, Scene
-from .solver import Frame, Solver
+from .solver import Frame, Solver, substeps_per_frame
 
 __all__ = [
     "Bed",
@@ -20,4 +20,5 @@ __all__ = [
     "Solver",
     "SolverStopped",
     "arrange",
+    "substeps_per_frame",
 ]

@@ -19,7 +19,7 @@ from .scene import Scene
 from .start import start_warp
 from .transfer import transfer
 
-__all__ = ["PRECISIONS", "Frame", "Solver"]
+__all__ = ["PRECISIONS", "Frame", "Solver", "substeps_per_frame"]
 
 PRECISIONS = {"float32": wp.float32, "float64": wp.float64}
 _PADDING = 3  # cells outside the bin, so that the nodes around a particle at a wall exist
@@ -44,6 +44,21 @@ class Frame:
     """By the soil on the body, world frame, mean since the previous frame [N], shape (3,); frame 0: zeros."""
     torque: np.ndarray
     """About the body's centre of mass, likewise [N m], shape (3,)."""
+
+
+def substeps_per_frame(scene: Scene) -> int:
+    """Steps between two recorded frames, as many as `scene.courant` asks for."""
+    fastest = scene.material.wave_speed + _top_body_speed(scene)
+    limit = scene.courant * scene.bed.spacing / fastest
+    return max(1, math.ceil(1.0 / scene.frame_rate / limit - 1e-9))
+
+
+def _top_body_speed(scene: Scene) -> float:
+    """Fastest motion of the body between frames [m/s]."""
+    if scene.plate is None:
+        return 0.0
+    step = np.diff(scene.body_poses()[:, :3], axis=0)
+    return float(np.max(np.linalg.norm(step, axis=1), initial=0.0) * scene.frame_rate)
 
 
 class Solver:
@@ -81,10 +96,8 @@ class Solver:
         self.precision = precision
         self._real = PRECISIONS[precision]
 
-        frame_time = 1.0 / scene.frame_rate
-        limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + self._top_body_speed())
-        self.substeps_per_frame = max(1, math.ceil(frame_time / limit - 1e-9))
-        self.time_step = frame_time / self.substeps_per_frame
+        self.substeps_per_frame = substeps_per_frame(scene)
+        self.time_step = 1.0 / scene.frame_rate / self.substeps_per_frame
         """Substep [s]."""
         self._allocate()
 
@@ -106,13 +119,6 @@ class Solver:
             yield self._frame(index)
 
     # --- set-up -------------------------------------------------------------------------------------------
-
-    def _top_body_speed(self) -> float:
-        """Fastest motion of the body between frames [m/s]."""
-        if self.scene.plate is None:
-            return 0.0
-        step = np.diff(self.scene.body_poses()[:, :3], axis=0)
-        return float(np.max(np.linalg.norm(step, axis=1), initial=0.0) * self.scene.frame_rate)
 
     def _allocate(self) -> None:
         scene, bed, material, real = self.scene, self.scene.bed, self.scene.material, self._real
