@@ -50,8 +50,12 @@ def simulate_campaign(
         UserError: before anything is made, when the disk is too full; after all other runs are done, when some could
             not be made.
     """
-    if not 0 <= shard < shards:
-        raise UserError(f"shard is {shard}; with shards={shards} it must be from 0 to {shards - 1}")
+    if type(shards) is not int or shards < 1:
+        raise UserError(f"shards is {shards!r}; it must be a whole number, 1 or more")
+    if type(shard) is not int or not 0 <= shard < shards:
+        raise UserError(
+            f"shard is {shard!r}; with shards={shards} it must be a whole number from 0 to {shards - 1}"
+        )
     campaign.record()
     costs = {name: run_cost(scene) for name, scene in campaign.scenes.items()}
     by_length = sorted(costs, key=lambda name: costs[name].work, reverse=True)
@@ -173,6 +177,7 @@ class _Production:
                 if bar.disable and now - last_line > _LOG_EVERY:
                     log.info("%s, %s left", done, self._left())
                     last_line = now
+            bar.set_postfix_str(f"{len(self._jobs)} of {len(self._jobs)} runs", refresh=False)
             bar.update(total - bar.n)
 
     def _work_made(self) -> int:

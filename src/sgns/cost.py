@@ -14,12 +14,12 @@ from sgns.errors import UserError
 
 __all__ = ["RunCost", "duration_words", "finishing_time", "require_space", "run_cost", "size_words"]
 
-# A recorded particle is a position and a velocity in float32; a frame has its body and its share of the layout
-# besides, and a file about 50 kB of scene and structure.
+# A recorded particle is a position and a velocity in float32, a body point a position in float64. The others are those
+# of files: pose, force, torque, time and HDF5's own for each frame; scene and structure.
 _BYTES_PER_PARTICLE = 24
-_BYTES_PER_FRAME = 500
+_BYTES_PER_FRAME = 240
 _BYTES_PER_BODY_POINT = 24
-_BYTES_PER_FILE = 50_000
+_BYTES_PER_FILE = 30_000
 
 
 @dataclass(frozen=True)

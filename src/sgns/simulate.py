@@ -33,6 +33,8 @@ def _base_scene(settings: dict[str, Any]) -> dict[str, Any]:
     if any(o.startswith("scene=") for o in overrides):
         raise UserError(f"dataset={settings['name']} brings its own scene; leave out scene=")
     kept = [o for o in overrides if not o.lstrip("+~").startswith("dataset")]
+    if not isinstance(settings.get("change") or {}, dict):
+        raise UserError(f"dataset.change is {settings['change']!r}; it must be a group of keys of the scene")
     change = [f"scene.{key}={json.dumps(value)}" for key, value in (settings.get("change") or {}).items()]
     cfg = compose("simulate", [f"scene={settings['scene']}", *change, *kept])
     return scene_from_config(cfg).to_dict()

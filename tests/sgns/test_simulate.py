@@ -6,14 +6,13 @@ import subprocess
 import sys
 
 import h5py
-import numpy as np
 import pytest
 from test_campaign import campaign
 
 from mpm_warp import Effects, SolverStopped
 from sgns.errors import UserError
 from sgns.runs import Run, check_run
-from sgns.simulate import simulate_campaign, simulate_scene
+from sgns.simulate import simulate_scene
 
 SMALL = [
     "scene.duration=0.05",
@@ -72,22 +71,6 @@ def test_nan_in_a_path(tmp_path):
     assert done.returncode == 2
     assert "not finite in row 2, column 2" in done.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["path.csv"]
-
-
-def test_campaign_is_resumed(tmp_path):
-    c = campaign(tmp_path, runs=3)
-    simulate_campaign(c, device="cpu", workers=2)
-    files = [c.file(name) for name in c.scenes]
-    assert all(check_run(f) == [] for f in files)
-    before = [f.stat().st_mtime_ns for f in files]
-    force = Run(files[1]).force
-    files[1].unlink()
-    files[2].write_bytes(files[2].read_bytes()[:5000])  # a torn file is made again
-    simulate_campaign(c, device="cpu", workers=1)
-    after = [f.stat().st_mtime_ns for f in files]
-    assert after[0] == before[0]
-    assert check_run(files[2]) == []
-    np.testing.assert_array_equal(Run(files[1]).force, force)
 
 
 def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
