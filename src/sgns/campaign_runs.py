@@ -278,5 +278,5 @@ def _done(file: Path, scene: Scene) -> bool:
         with Run(file) as run:
             return run.scene == scene.to_dict()
     except UserError as error:
-        log.warning("%s; it is made again", error)
+        log.info("%s; it is made again", error)
         return False

@@ -71,7 +71,10 @@ def main(cfg: DictConfig) -> float | None:
         )
     with Run(output) as run:
         force = run.force[1:]
-        log.info("%s: %d particles, %d frames", output, run.particle_count, run.frame_count)
+        every = scene.bed.store_every
+        kept = f" (one of every {every} recorded)" if every > 1 else ""
+        count = run.extra["particles_simulated"]
+        log.info("%s: %d particles%s, %d frames", output, count, kept, run.frame_count)
     log.info("mean draft %.1f N, vertical force %.1f N", -np.mean(force[:, 0]), np.mean(force[:, 2]))
     log.info(
         "%.1f s for %.2f simulated s: %.2f s per simulated second, %.2f M particle-steps/s on %s",

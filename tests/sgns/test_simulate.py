@@ -44,6 +44,14 @@ def test_command_writes_a_complete_run(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
 
 
+def test_command_writes_fewer_particles(tmp_path):
+    done = sgns(tmp_path, "simulate", *SMALL, "scene.bed.store_every=7")
+    assert done.returncode == 0, done.stderr
+    assert "run.h5: 200 particles (one of every 7 recorded), 4 frames" in done.stdout
+    with Run(tmp_path / "run.h5") as run:
+        assert run.particle_count == 29
+
+
 @pytest.mark.parametrize(
     ("override", "words"),
     [
@@ -52,6 +60,8 @@ def test_command_writes_a_complete_run(tmp_path):
         ("effects.gravity=true", "effects"),
         ("solver.precision=float16", "allowed: float32, float64"),
         ("device=tpu", "device is 'tpu'"),
+        ("scene.bed.store_every=0", "bed.store_every is 0"),
+        ("shards=4", "give dataset=..."),
         ("scene.depth=deep", "scene.depth is 'deep'"),
         ("scene.path=nowhere.csv", "scene.path"),
     ],

@@ -99,6 +99,7 @@ def test_settings_of_a_command(command: str) -> None:
         "scene material effects solver dataset reduction model training preset checkpoint output seed device"
     )
     own = {
+        "simulate": {"shard", "shards"},
         "evaluate": {"split", "new_rollouts", "timing_repeats"},
         "check": {"files"},
     }
