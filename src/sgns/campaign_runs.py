@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 import multiprocessing
 import os
+import signal
 import threading
 import time
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -29,6 +31,7 @@ __all__ = ["simulate_campaign"]
 log = logging.getLogger(__name__)
 
 _MEASURED = 0.3  # seconds of stepping, at least, that the first estimate rests on
+_MEMORY = 600.0  # seconds after which what was seen of the speed counts 1/e
 _LOG_EVERY = 60.0  # seconds between lines about the progress where there is no terminal for a bar
 
 
@@ -168,8 +171,7 @@ class _Production:
             while rest := self._rest():
                 time.sleep(0.2)
                 now, work = time.monotonic(), self._work_made()
-                self._seconds_seen += (now - last) * min(self.workers, len(rest))
-                self._work_seen += work - made
+                self._see(work - made, now - last, busy=min(self.workers, len(rest)))
                 made, last = work, now
                 done = f"{len(self._jobs) - len(rest)} of {len(self._jobs)} runs"
                 bar.set_postfix_str(f"{done}, {self._left()} left", refresh=False)
@@ -179,6 +181,12 @@ class _Production:
                     last_line = now
             bar.set_postfix_str(f"{len(self._jobs)} of {len(self._jobs)} runs", refresh=False)
             bar.update(total - bar.n)
+
+    def _see(self, work: float, elapsed: float, busy: int) -> None:
+        """Add the particle-steps of `busy` workers in the last `elapsed` seconds; a machine's speed may change."""
+        kept = math.exp(-elapsed / _MEMORY)
+        self._work_seen = kept * self._work_seen + work
+        self._seconds_seen = kept * self._seconds_seen + elapsed * busy
 
     def _work_made(self) -> int:
         """Particle-steps in all frames so far; a run's first frame takes none."""
@@ -214,6 +222,8 @@ _barrier: Any = None
 def _start_worker(frames_done: Any, barrier: Any) -> None:
     global _frames_done, _barrier
     _frames_done, _barrier = frames_done, barrier
+    # Ctrl-C reaches all processes of the terminal; the first one ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def leave_with_parent() -> None:
         # Without this a worker would go on alone after its parent was killed.

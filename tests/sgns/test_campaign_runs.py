@@ -151,8 +151,9 @@ def test_time_left_follows_from_the_work_left_and_the_speed_seen(tmp_path):
         # A frame takes a worker 100 s; six runs of three steps on four workers end after two runs.
         production._work_seen, production._seconds_seen = 10 * per_frame, 1000.0
         assert production._left() == "10 min"
-        # Everything turns out to be half as fast: the estimate says so.
-        production._work_seen, production._seconds_seen = 10 * per_frame, 2000.0
+        # Then an hour at half that speed, with three of the workers busy: the estimate says so.
+        for _ in range(60):
+            production._see(0.9 * per_frame, elapsed=60.0, busy=3)
         assert production._left() == "20 min"
         # Four runs have only one step left (frames 0 to 2 are there), two have not begun.
         production._frames_done[:] = [3, 3, 3, 3, 0, 0]
