@@ -7,6 +7,7 @@ from .errors import SceneError, SolverStopped
 from .material import Material
 from .scene import Bed, Excavation, Scene
 from .solver import Frame, Solver
+from .time_step import substeps_per_frame
 
 __all__ = [
     "Bed",
@@ -20,4 +21,5 @@ __all__ = [
     "Solver",
     "SolverStopped",
     "arrange",
+    "substeps_per_frame",
 ]

@@ -41,6 +41,8 @@ class Bed:
     """geostatic: isotropic pressure rho g depth; none: stress-free, settles in the first frames."""
     headroom: float = 0.25
     """Height above the surface up to which soil may be thrown or piled [m]."""
+    store_every: int = 1
+    """Particles per particle that is recorded; the solver computes all of them."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "size", tuple(float(s) for s in self.size))
@@ -68,6 +70,8 @@ class Bed:
             )
         if not self.headroom > 0:
             raise SceneError(f"bed.headroom is {self.headroom} m; it must be above 0")
+        if not (self.store_every >= 1 and self.store_every == int(self.store_every)):
+            raise SceneError(f"bed.store_every is {self.store_every}; it must be a whole number, 1 or more")
 
     @cached_property
     def filled(self) -> tuple[np.ndarray, float]:
@@ -76,12 +80,25 @@ class Bed:
             self.arrangement, self.size, self.spacing / self.particles_per_cell ** (1.0 / 3.0), self.seed
         )
 
+    @cached_property
+    def stored(self) -> np.ndarray:
+        """Indices of the particles that are recorded, increasing: one of every `store_every` that follow each other.
+
+        Which one is drawn at random, always the same way: at fixed steps a lattice would be recorded in some of
+        its layers only.
+        """
+        first = np.arange(0, len(self.filled[0]), self.store_every)
+        left = np.minimum(self.store_every, len(self.filled[0]) - first)
+        return first + np.random.default_rng(0).integers(left)
+
     @property
     def arrangement_hash(self) -> str:
-        """Same for every run whose particles start at the same places in the same order."""
+        """Same for every run whose recorded particles start at the same places in the same order."""
         key = [self.size, self.spacing, self.particles_per_cell, self.arrangement]
         if self.arrangement != "lattice":
             key.append(self.seed)
+        if self.store_every != 1:
+            key.append(f"one of {self.store_every}")
         return hashlib.blake2b(json.dumps(key).encode(), digest_size=8).hexdigest()
 
 

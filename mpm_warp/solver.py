@@ -18,6 +18,7 @@ from .grid import grid_step, grid_struct
 from .rotation import angular_velocity, rotate
 from .scene import Scene
 from .start import start_warp
+from .time_step import steps_to_remap, substeps_per_frame, top_body_speed
 from .transfer import transfer
 
 __all__ = ["PRECISIONS", "Frame", "Solver"]
@@ -82,11 +83,9 @@ class Solver:
         self.precision = precision
         self._real = PRECISIONS[precision]
 
-        frame_time = 1.0 / scene.frame_rate
-        self._top_body = self._top_body_speed()
-        limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + self._top_body)
-        self.substeps_per_frame = max(1, math.ceil(frame_time / limit - 1e-9))
-        self.time_step = frame_time / self.substeps_per_frame
+self._top_body = top_body_speed(scene)
+        self.substeps_per_frame = substeps_per_frame(scene)
+        self.time_step = 1.0 / scene.frame_rate / self.substeps_per_frame
         """Substep [s]."""
         self._allocate()
 
@@ -108,13 +107,6 @@ class Solver:
             yield self._frame(index)
 
     # --- set-up -------------------------------------------------------------------------------------------
-
-    def _top_body_speed(self) -> float:
-        """Fastest motion of the body between frames [m/s]."""
-        if self.scene.plate is None:
-            return 0.0
-        step = np.diff(self.scene.body_poses()[:, :3], axis=0)
-        return float(np.max(np.linalg.norm(step, axis=1), initial=0.0) * self.scene.frame_rate)
 
     def _allocate(self) -> None:
         scene, bed, material, real = self.scene, self.scene.bed, self.scene.material, self._real
@@ -233,23 +225,6 @@ class Solver:
         ):
             array.assign(values)
 
-    def _steps_to_remap(self) -> int:
-        """Number of substeps until momentum is carried to a fresh grid: a power of two, or 3 times one.
-
-        Soil must not travel far from the place its weights belong to, and the time is bounded because remaps damp the
-        velocities that the grid does not resolve.
-        """
-        speed = max(self._top_body, float(self._top_speed.numpy()[0]))
-        limit = self.scene.remap_time
-        # Travel in the time t: speed t + g t^2.
-        room = self.scene.remap_distance * self.scene.bed.spacing
-        fall = self.scene.gravity
-        if fall * limit**2 + speed * limit > room:
-            limit = 2.0 * room / (speed + math.sqrt(speed**2 + 4.0 * fall * room))
-        most = max(1, int(limit / self.time_step))
-        power = 1 << (most.bit_length() - 1)
-        return power + power // 2 if most >= power + power // 2 else power
-
     def _interval(self, steps: int) -> None:
         """The substeps from one remap to the next."""
         self._begin.launch()
@@ -265,7 +240,8 @@ class Solver:
         while left:
             self._top_speed.zero_()
             self._to_grid.launch()
-            steps = min(left, self._steps_to_remap())
+            speed = max(self._top_body, float(self._top_speed.numpy()[0]))
+            steps = min(left, steps_to_remap(self.scene, self.time_step, speed))
             left -= steps
             if not self.device.is_cuda:
                 self._interval(steps)

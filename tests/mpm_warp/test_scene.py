@@ -54,6 +54,21 @@ def test_arrangement_hash_names_the_start():
         Bed(arrangement="jittered").arrangement_hash != Bed(arrangement="jittered", seed=5).arrangement_hash
     )
     assert Bed().arrangement_hash != Bed(spacing=0.02).arrangement_hash
+    assert len({Bed(store_every=k).arrangement_hash for k in (1, 2, 5)}) == 3
+
+
+def test_recorded_particles_are_one_of_every_few():
+    bed = Bed(spacing=0.02)
+    assert (bed.stored == np.arange(len(bed.filled[0]))).all()
+    thinned = Bed(spacing=0.02, store_every=8)
+    count = len(thinned.filled[0])
+    assert (thinned.stored // 8 == np.arange(-(-count // 8))).all()
+    assert (Bed(spacing=0.02, store_every=8).stored == thinned.stored).all()
+    # The bed is 8 layers deep: a fixed step of 8 would leave a single layer.
+    depth = thinned.filled[0][thinned.stored, 2]
+    share = np.unique(np.round(depth, 6), return_counts=True)[1] / len(depth)
+    np.testing.assert_allclose(share, 1 / 8, atol=0.05)
+    assert len(share) == 8
 
 
 @pytest.mark.parametrize(
@@ -87,6 +102,8 @@ def test_what_a_scene_refuses(change, words):
         (Bed, {"spacing": 0.2}, "half the bin"),
         (Bed, {"spacing": 1e-4}, "particles; at most"),
         (Bed, {"arrangement": "heap"}, "allowed: lattice, jittered, poisson"),
+        (Bed, {"store_every": 0}, "bed.store_every is 0; it must be a whole number"),
+        (Bed, {"store_every": 2.5}, "bed.store_every is 2.5; it must be a whole number"),
         (Bed, {"initial_stress": "some"}, "allowed: geostatic, none"),
         (Plate, {"thickness": 0.0}, "blade.thickness"),
         (Plate, {"friction": -1.0}, "blade.friction"),

@@ -6,14 +6,13 @@ import subprocess
 import sys
 
 import h5py
-import numpy as np
 import pytest
 from test_campaign import campaign
 
 from mpm_warp import Effects, SolverStopped
 from sgns.errors import UserError
 from sgns.runs import Run, check_run
-from sgns.simulate import simulate_campaign, simulate_scene
+from sgns.simulate import simulate_scene
 
 SMALL = [
     "scene.duration=0.05",
@@ -45,6 +44,14 @@ def test_command_writes_a_complete_run(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
 
 
+def test_command_writes_fewer_particles(tmp_path):
+    done = sgns(tmp_path, "simulate", *SMALL, "scene.bed.store_every=7")
+    assert done.returncode == 0, done.stderr
+    assert "run.h5: 200 particles (one of every 7 recorded), 4 frames" in done.stdout
+    with Run(tmp_path / "run.h5") as run:
+        assert run.particle_count == 29
+
+
 @pytest.mark.parametrize(
     ("override", "words"),
     [
@@ -53,6 +60,8 @@ def test_command_writes_a_complete_run(tmp_path):
         ("effects.gravity=true", "effects"),
         ("solver.precision=float16", "allowed: float32, float64"),
         ("device=tpu", "device is 'tpu'"),
+        ("scene.bed.store_every=0", "bed.store_every is 0"),
+        ("shards=4", "give dataset=..."),
         ("scene.depth=deep", "scene.depth is 'deep'"),
         ("scene.path=nowhere.csv", "scene.path"),
     ],
@@ -74,22 +83,6 @@ def test_nan_in_a_path(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["path.csv"]
 
 
-def test_campaign_is_resumed(tmp_path):
-    c = campaign(tmp_path, runs=3)
-    simulate_campaign(c, device="cpu", workers=2)
-    files = [c.file(name) for name in c.scenes]
-    assert all(check_run(f) == [] for f in files)
-    before = [f.stat().st_mtime_ns for f in files]
-    force = Run(files[1]).force
-    files[1].unlink()
-    files[2].write_bytes(files[2].read_bytes()[:5000])  # a torn file is made again
-    simulate_campaign(c, device="cpu", workers=1)
-    after = [f.stat().st_mtime_ns for f in files]
-    assert after[0] == before[0]
-    assert check_run(files[2]) == []
-    np.testing.assert_array_equal(Run(files[1]).force, force)
-
-
 def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
     scene = next(iter(campaign(tmp_path).scenes.values()))
 
@@ -97,7 +90,7 @@ def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
         raise SolverStopped("particle 1 went wrong")
         yield
 
-    monkeypatch.setattr("sgns.simulate.Solver.frames", stops)
+    monkeypatch.setattr("sgns.scene_run.Solver.frames", stops)
     with pytest.raises(SolverStopped):
         simulate_scene(scene, tmp_path / "run.h5", effects=Effects())
     assert not list(tmp_path.glob("*"))

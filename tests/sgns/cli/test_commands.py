@@ -99,6 +99,7 @@ def test_settings_of_a_command(command: str) -> None:
         "scene material effects solver dataset reduction model training preset checkpoint output seed device"
     )
     own = {
+        "simulate": {"shard", "shards"},
         "evaluate": {"split", "new_rollouts", "timing_repeats"},
         "check": {"files"},
     }
@@ -151,7 +152,10 @@ def test_settings_can_be_shown(empty_folder: Path) -> None:
         (["rollout", "checkpoint=a.ckpt", "output=null"], ["output is null"]),
         (["rollout", "checkpoint=a.ckpt", "solver.precision=float64"], ["solver: no such key"]),
         (["evaluate", "checkpoint=a.ckpt", "dataset=null"], ["a group is null"]),
-        (["evaluate", "checkpoint=a.ckpt", "~dataset"], ["dataset is missing", "allowed: quick"]),
+        (
+            ["evaluate", "checkpoint=a.ckpt", "~dataset"],
+            ["dataset is missing", "allowed: desktop_excavation"],
+        ),
         (["evaluate", "checkpoint=a.ckpt", "dataset.path=nope"], ["no dataset in nope"]),
         (["evaluate", "checkpoint=a.ckpt", "timing_repeats=x"], ["timing_repeats is 'x'"]),
         (["train", "dataset.path=null"], ["dataset.path is null"]),

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from mpm_warp import Bed
 from sgns.evaluation.surface import SurfaceGrid, height_map, particle_spacing, surface_grid
 
 
@@ -53,3 +54,23 @@ def test_thin_and_tiny_beds_have_a_grid():
     assert surface_grid(np.zeros((1, 3))).shape == (1, 1)
     line = np.stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)], axis=1)
     assert surface_grid(line).shape[1] == 1
+
+
+@pytest.mark.parametrize("arrangement", ["lattice", "jittered"])
+def test_surface_error_of_a_thinned_bed_is_that_of_the_bed(arrangement):
+    bed = Bed(store_every=5, arrangement=arrangement)
+
+    def error(start):
+        hill = 0.03 * np.exp(
+            -((start[:, 0] - 0.4) ** 2 + (start[:, 1] - 0.3) ** 2) / 0.01 + start[:, 2] / 0.05
+        )
+        grid = surface_grid(start)
+        raised = height_map(start + np.stack([0 * hill, 0 * hill, hill], axis=1), grid)
+        return np.sqrt(
+            np.mean((raised - height_map(start, grid)) ** 2)
+        )  # a column without particles makes it NaN
+
+    full = bed.filled[0]
+    thinned = full[bed.stored]
+    assert error(thinned) == pytest.approx(error(full), rel=0.05)
+    assert particle_spacing(thinned) == pytest.approx(5 ** (1 / 3) * particle_spacing(full), rel=0.05)

@@ -1,0 +1,40 @@
+"""How long a step may be, and how many of them pass between two remaps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .scene import Scene
+
+__all__ = ["steps_to_remap", "substeps_per_frame", "top_body_speed"]
+
+
+def substeps_per_frame(scene: Scene) -> int:
+    """Equal steps in a frame: as many as elastic waves and the body's motion ask for."""
+    limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + top_body_speed(scene))
+    return max(1, math.ceil(1.0 / scene.frame_rate / limit - 1e-9))
+
+
+def top_body_speed(scene: Scene) -> float:
+    """Fastest motion of the body between frames [m/s]."""
+    if scene.plate is None:
+        return 0.0
+    step = np.diff(scene.body_poses()[:, :3], axis=0)
+    return float(np.max(np.linalg.norm(step, axis=1), initial=0.0) * scene.frame_rate)
+
+
+def steps_to_remap(scene: Scene, time_step: float, speed: float) -> int:
+    """Number of steps of `time_step` [s] until momentum is carried to a fresh grid: 2^n or 3 2^n.
+
+    Soil of at most `speed` [m/s] must not travel far from the place that its weights belong to: at most
+    `scene.remap_distance` grid spacings, free fall included, and never longer than `scene.remap_time`.
+    """
+    room, limit = scene.remap_distance * scene.bed.spacing, scene.remap_time
+    if speed * limit + scene.gravity * limit**2 > room:
+        limit = 2.0 * room / (speed + math.sqrt(speed**2 + 4.0 * scene.gravity * room))
+    most = max(1, int(limit / time_step * (1.0 + 1e-9)))
+    # Few different numbers, because on a GPU each is recorded once.
+    power = 1 << (most.bit_length() - 1)
+    return power + power // 2 if most >= power + power // 2 else power
