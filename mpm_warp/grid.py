@@ -37,7 +37,8 @@ def grid_struct(real: type) -> type:
 def grid_step(real: type) -> SimpleNamespace:
     """Kernels on the nodes in precision `real`.
 
-    - `begin`: momentum and mass to velocity and 1 / mass after a remap; floor and walls hold their nodes by a 1 / mass of 0.
+    - `begin`: momentum and mass to velocity and 1 / mass after a remap; floor and
+      walls hold their nodes by a 1 / mass of 0.
     - `step`: velocity from the step's impulse and gravity; counts the step.
 
     Both clear what they have used for the next sum.

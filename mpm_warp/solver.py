@@ -83,7 +83,7 @@ class Solver:
         self.precision = precision
         self._real = PRECISIONS[precision]
 
-self._top_body = top_body_speed(scene)
+        self._top_body = top_body_speed(scene)
         self.substeps_per_frame = substeps_per_frame(scene)
         self.time_step = 1.0 / scene.frame_rate / self.substeps_per_frame
         """Substep [s]."""
