@@ -21,10 +21,11 @@ def grid_struct(real: type) -> type:
         ny: int
         nz: int
         dt: real  # [s]
-        gravity: real  # [m/s^2]
+        gravity: vec3  # [m/s^2]
         # Nodes with index <= low or >= high belong to the floor and the walls.
         low: wp.vec3i
         high: wp.vec3i
+        wall_friction: vec3  # Coulomb coefficient of the x walls, the y walls and the floor, where they have one
         particle_mass: real  # [kg]
         particle_volume: real  # at the critical density [m^3]
         speed_limit: real  # one cell per step [m/s]
@@ -33,11 +34,37 @@ def grid_struct(real: type) -> type:
 
 
 @cache
-def grid_step(real: type) -> wp.Kernel:
-    """Kernel that turns momentum into velocity, applies gravity and the no-slip floor and walls, clears the
-    momentum for the next step, and counts the step."""
+def grid_step(real: type, walls: tuple[str, str, str]) -> wp.Kernel:
+    """Kernel that turns momentum into velocity, applies gravity, walls and floor, clears the momentum for the next
+    step, and counts the step.
+
+    `walls` are the kinds of x walls, y walls and floor (`Walls.kinds`); the kernel holds no code of other kinds.
+    """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     Grid = grid_struct(real)
+
+    @wp.func
+    def no_slip(v: vec3, inward: vec3, friction: real):
+        return vec3()
+
+    @wp.func
+    def slip(v: vec3, inward: vec3, friction: real):
+        return v - wp.dot(v, inward) * inward
+
+    @wp.func
+    def rub(v: vec3, inward: vec3, friction: real):
+        # What moves into the wall is stopped, and slowed along the wall by Coulomb friction.
+        into = wp.dot(v, inward)
+        if into >= real(0.0):
+            return v
+        sliding = v - into * inward
+        speed = wp.length(sliding)
+        if speed <= -friction * into:
+            return vec3()
+        return sliding * (real(1.0) + friction * into / speed)
+
+    conditions = {"no_slip": no_slip, "slip": slip, "friction": rub, "periodic": slip}
+    at_x, at_y, at_floor = (conditions[kind] for kind in walls)
 
     @wp.kernel(module="unique", enable_backward=False)
     def step(
@@ -53,15 +80,25 @@ def grid_step(real: type) -> wp.Kernel:
         mass = node[3]
         if mass > real(0.0):
             nodes[n] = vec4()
-            v = vec3(node[0], node[1], node[2]) / mass
-            v = v - vec3(real(0.0), real(0.0), grid.gravity * grid.dt)
+            v = vec3(node[0], node[1], node[2]) / mass + grid.dt * grid.gravity
             k = n % grid.nz
             j = (n // grid.nz) % grid.ny
             i = n // (grid.nz * grid.ny)
             low = grid.low
             high = grid.high
-            if i <= low[0] or j <= low[1] or k <= low[2] or i >= high[0] or j >= high[1] or k >= high[2]:
-                v = vec3()
+            rough = grid.wall_friction
+            if wp.static(walls[0] != "periodic"):
+                if i <= low[0]:
+                    v = at_x(v, vec3(real(1.0), real(0.0), real(0.0)), rough[0])
+                if i >= high[0]:
+                    v = at_x(v, vec3(real(-1.0), real(0.0), real(0.0)), rough[0])
+            if wp.static(walls[1] != "periodic"):
+                if j <= low[1]:
+                    v = at_y(v, vec3(real(0.0), real(1.0), real(0.0)), rough[1])
+                if j >= high[1]:
+                    v = at_y(v, vec3(real(0.0), real(-1.0), real(0.0)), rough[1])
+            if k <= low[2]:
+                v = at_floor(v, vec3(real(0.0), real(0.0), real(1.0)), rough[2])
             velocity[n] = vec4(v[0], v[1], v[2], real(0.0))
 
     return step

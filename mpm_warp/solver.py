@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,9 +15,12 @@ from .contact import body_struct
 from .effects import Effects
 from .errors import SceneError, SolverStopped
 from .grid import grid_step, grid_struct
+from .images import images, mirror_pairs, seam_pairs
+from .initial_stress import initial_stress
 from .rotation import angular_velocity, rotate
 from .scene import Scene
 from .start import start_warp
+from .symmetry import asymmetry, half
 from .transfer import transfer
 
 __all__ = ["PRECISIONS", "Frame", "Solver"]
@@ -33,7 +37,7 @@ class Frame:
     time: float
     """[s]"""
     position: np.ndarray
-    """Soil [m], shape (n, 3), float32."""
+    """Soil [m], shape (n, 3), float32; along a periodic axis it goes on counting beyond the bin."""
     velocity: np.ndarray
     """Soil [m/s], shape (n, 3), float32."""
     body_pose: np.ndarray
@@ -80,6 +84,12 @@ class Solver:
         self.device = wp.get_device(device)
         self.precision = precision
         self._real = PRECISIONS[precision]
+        if self.effects.symmetry and (reason := asymmetry(scene)):
+            raise SceneError(
+                f"effects.symmetry needs a scene that is mirror symmetric about mid-width: {reason}; or set "
+                "effects.symmetry=false"
+            )
+        self._half = half(scene) if self.effects.symmetry else None
 
         frame_time = 1.0 / scene.frame_rate
         limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + self._top_body_speed())
@@ -90,7 +100,12 @@ class Solver:
 
     @property
     def particle_count(self) -> int:
-        """n."""
+        """n, of the whole bed."""
+        return len(self.scene.initial_positions())
+
+    @property
+    def computed_count(self) -> int:
+        """Particles that are computed: about half of them with mirror symmetry."""
         return len(self._x)
 
     def frames(self) -> Iterator[Frame]:
@@ -115,31 +130,15 @@ class Solver:
         return float(np.max(np.linalg.norm(step, axis=1), initial=0.0) * self.scene.frame_rate)
 
     def _allocate(self) -> None:
-        scene, bed, material, real = self.scene, self.scene.bed, self.scene.material, self._real
+        scene, material, real = self.scene, self.scene.material, self._real
         vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-        positions, volume = bed.filled
+        positions, volume = scene.filled
+        velocities, (ln_j, strain) = scene.initial_velocities(), initial_stress(scene)
+        if self._half is not None:
+            kept = self._half.kept
+            positions, velocities, ln_j, strain = positions[kept], velocities[kept], ln_j[kept], strain[kept]
         n = len(positions)
-
-        grid = grid_struct(real)()
-        h = bed.spacing
-        # Walls fall on nodes where the bin is a whole number of cells; otherwise the grid is centred in x and y,
-        # which keeps the scene's mirror symmetry, and the nodes just outside the bin are the walls.
-        cells = [math.ceil(s / h - 1e-6) for s in bed.size[:2]]
-        origin = [0.5 * (s - c * h) - _PADDING * h for s, c in zip(bed.size[:2], cells, strict=True)]
-        origin.append(-bed.size[2] - _PADDING * h)
-        top = math.ceil((bed.size[2] + bed.headroom) / h) + _PADDING
-        grid.origin = vec3(*origin)
-        grid.spacing, grid.inverse_spacing = h, 1.0 / h
-        grid.nx, grid.ny, grid.nz = (
-            cells[0] + 2 * _PADDING + 1,
-            cells[1] + 2 * _PADDING + 1,
-            top + _PADDING + 1,
-        )
-        grid.dt, grid.gravity = self.time_step, scene.gravity
-        grid.low = wp.vec3i(_PADDING, _PADDING, _PADDING)
-        grid.high = wp.vec3i(_PADDING + cells[0], _PADDING + cells[1], 2**30)
-        grid.particle_volume, grid.particle_mass = volume, volume * material.bulk_density
-        grid.speed_limit = h / self.time_step
+        grid, ghosts = self._lay_grid(volume)
         self._grid = grid
 
         soil = soil_struct(real)()
@@ -150,17 +149,11 @@ class Solver:
         )
         self._soil = soil
 
-        ln_j = np.zeros(n)
-        if bed.initial_stress == "geostatic":
-            # Isotropic: the vertical stress of rest at once, so nothing settles.
-            density = material.bulk_density * n * volume / np.prod(bed.size)
-            ln_j = -density * scene.gravity * np.maximum(-positions[:, 2], 0.0) / material.bulk_modulus
-
         new = {"device": self.device}
         self._x = wp.array(positions, dtype=vec3, **new)
-        self._v = wp.zeros(n, dtype=vec3, **new)
+        self._v = wp.array(velocities, dtype=vec3, **new)
         self._c = wp.zeros(n, dtype=wp.types.matrix((3, 3), real), **new)
-        self._e = wp.zeros(n, dtype=wp.types.vector(6, real), **new)
+        self._e = wp.array(strain, dtype=wp.types.vector(6, real), **new)
         self._ln_j = wp.array(ln_j, dtype=real, **new)
         node_count = grid.nx * grid.ny * grid.nz
         self._nodes = wp.zeros(node_count, dtype=vec4, **new)
@@ -171,7 +164,7 @@ class Solver:
         body, plate, m = body_struct(real)(), scene.plate, self.substeps_per_frame
         if plate is not None:
             body.half_size, body.friction = vec3(*plate.half_size), plate.friction
-            body.margin = scene.contact_margin * h
+            body.margin = scene.contact_margin * scene.bed.spacing
             body.reach = float(np.linalg.norm(plate.half_size + max(0.0, body.margin)))
             # The spring is as stiff as a layer of soil one particle thick; damping is critical.
             stiffness = material.wave_speed**2 * material.bulk_density * volume ** (1.0 / 3.0)
@@ -185,18 +178,112 @@ class Solver:
         self._body = body
 
         kernels = transfer(real, self.effects, with_body=plate is not None, atomic=self.device.is_cuda)
-        particles = [self._x, self._v, self._c, self._e, self._ln_j, grid, soil]
+        state = [self._x, self._v, self._c, self._e, self._ln_j]
         record = {"device": self.device, "record_cmd": True}
+        on_plane = self._half.on_plane if self._half is not None else 0
+        to_grid = [([a[on_plane:] for a in state], grid, body)]
+        if on_plane:
+            to_grid.append(([a[:on_plane] for a in state], *self._halved(grid, body)))
+        before, after = self._image_launches(ghosts, record)
         self._launches = [
-            wp.launch(kernels.to_grid, n, [*particles, body, self._nodes, self._substep], **record),
-            wp.launch(
-                grid_step(real), node_count, [grid, self._nodes, self._velocity, self._substep], **record
+            *(
+                wp.launch(
+                    kernels.to_grid, len(part[0]), [*part, g, soil, b, self._nodes, self._substep], **record
+                )
+                for part, g, b in to_grid
             ),
+            *before,
             wp.launch(
-                kernels.to_particles, n, [*particles, self._velocity, self._substep, self._stray], **record
+                grid_step(real, scene.bed.walls.kinds),
+                node_count,
+                [grid, self._nodes, self._velocity, self._substep],
+                **record,
             ),
+            *after,
+            wp.launch(
+                kernels.to_particles,
+                n,
+                [*state, grid, soil, self._velocity, self._substep, self._stray],
+                **record,
+            ),
+            *self._wrap_launches(record),
         ]
         self._graph: wp.Graph | None = None
+
+    def _lay_grid(self, volume: float) -> tuple[Any, dict[int, np.ndarray]]:
+        """The grid, and its ghost layers with their images for each axis that has any (images.py)."""
+        scene, bed, real = self.scene, self.scene.bed, self._real
+        vec3, h = wp.types.vector(3, real), self.scene.bed.spacing
+        # Walls fall on nodes where the bin is a whole number of cells; otherwise the grid is centred in x and y,
+        # which keeps the scene's mirror symmetry, and the nodes just outside the bin are the walls.
+        cells = [math.ceil(s / h - 1e-6) for s in bed.size[:2]]
+        origin = [0.5 * (s - c * h) - _PADDING * h for s, c in zip(bed.size[:2], cells, strict=True)]
+        origin.append(-bed.size[2] - _PADDING * h)
+        count = [c + 2 * _PADDING + 1 for c in cells]
+        count.append(math.ceil((bed.size[2] + bed.headroom) / h) + 2 * _PADDING + 1)
+        low = [_PADDING, _PADDING, _PADDING]
+        high = [_PADDING + cells[0], _PADDING + cells[1], 2**30]
+        ghosts = {
+            axis: seam_pairs(_PADDING, cells[axis])
+            for axis in (0, 1)
+            if bed.walls.kinds[axis] == "periodic"
+        }
+        if self._half is not None:
+            ghosts[1] = mirror_pairs(2 * _PADDING + cells[1])
+            left_out = ghosts[1].min()
+            ghosts[1] -= left_out
+            origin[1] += left_out * h
+            count[1] -= left_out
+            low[1], high[1] = -1, high[1] - left_out
+
+        grid = grid_struct(real)()
+        grid.origin = vec3(*origin)
+        grid.spacing, grid.inverse_spacing = h, 1.0 / h
+        grid.nx, grid.ny, grid.nz = (int(c) for c in count)
+        grid.dt, grid.gravity = self.time_step, vec3(*scene.gravity_vector)
+        grid.low, grid.high = wp.vec3i(*low), wp.vec3i(*(int(i) for i in high))
+        grid.wall_friction = vec3(*bed.walls.friction)
+        grid.particle_volume = volume
+        grid.particle_mass = volume * scene.material.bulk_density
+        grid.speed_limit = h / self.time_step
+        return grid, ghosts
+
+    def _halved(self, grid: Any, body: Any) -> tuple[Any, Any]:
+        """Grid and body for particles on the plane of symmetry: half their mass and volume, half the contact."""
+        grid_half, body_half = type(grid)(), type(body)()
+        grid_half.assign(grid)
+        body_half.assign(body)
+        grid_half.particle_mass, grid_half.particle_volume = 0.5 * grid.particle_mass, 0.5 * grid.particle_volume
+        body_half.stiffness, body_half.damping = 0.5 * body.stiffness, 0.5 * body.damping
+        return grid_half, body_half
+
+    def _image_launches(self, ghosts: dict[int, np.ndarray], record: dict[str, Any]) -> tuple[list, list]:
+        """What comes before and after the grid step so that ghost nodes and their images agree."""
+        grid, real = self._grid, self._real
+        vec4, kernels = wp.types.vector(4, real), images(real)
+        before, after = [], []
+        for axis, pairs in ghosts.items():
+            extent, stride = ((grid.nx, grid.ny * grid.nz), (grid.ny, grid.nz))[axis]
+            sign = np.ones(4)
+            if self._half is not None and axis == 1:
+                sign[1] = -1.0
+            layers = wp.array(pairs, dtype=wp.vec2i, device=self.device)
+            rows = grid.nx * grid.ny * grid.nz // extent
+            rest = [layers, vec4(*sign), stride, extent]
+            before.append(wp.launch(kernels.fold, rows, [self._nodes, *rest], **record))
+            after.insert(0, wp.launch(kernels.unfold, rows, [self._velocity, *rest], **record))
+        return before, after
+
+    def _wrap_launches(self, record: dict[str, Any]) -> list:
+        """Bring particles that left a periodic bin back in."""
+        self._turns: dict[int, wp.array] = {}
+        launches, n = [], len(self._x)
+        for axis, kind in enumerate(self.scene.bed.walls.kinds):
+            if kind == "periodic":
+                self._turns[axis] = wp.zeros(n, dtype=int, device=self.device)
+                inputs = [self._x, self._turns[axis], axis, self.scene.bed.size[axis]]
+                launches.append(wp.launch(images(self._real).wrap, n, inputs, **record))
+        return launches
 
     # --- stepping -----------------------------------------------------------------------------------------
 
@@ -238,6 +325,8 @@ class Solver:
         if count:
             time = (index - 1) / self.scene.frame_rate + substep * self.time_step
             at = ", ".join(f"{c:.4f}" for c in self._x.numpy()[particle])
+            if self._half is not None:
+                particle = int(self._half.kept[particle])
             cause = (
                 "it left the grid: soil was thrown or pushed beyond it, raise scene.bed.headroom"
                 if slow
@@ -252,11 +341,19 @@ class Solver:
         scene = self.scene
         pose = scene.poses_at(np.array([index / scene.frame_rate]))[0]
         impulse = self._body.impulse.numpy().astype(float) * (scene.frame_rate if index else 0.0)
+        position, velocity = self._x.numpy(), self._v.numpy()
+        for axis, turns in self._turns.items():
+            position = position.copy()  # on the CPU it is the solver's own memory
+            position[:, axis] += turns.numpy() * scene.bed.size[axis]
+        if self._half is not None:
+            position, velocity = self._half.whole(position, velocity)
+            # The other half doubles force along and moment within the plane of symmetry, and cancels the rest.
+            impulse *= [[2.0, 0.0, 2.0], [0.0, 2.0, 0.0]]
         return Frame(
             index=index,
             time=index / scene.frame_rate,
-            position=self._x.numpy().astype(np.float32),
-            velocity=self._v.numpy().astype(np.float32),
+            position=position.astype(np.float32),
+            velocity=velocity.astype(np.float32),
             body_pose=pose,
             body_points=rotate(pose[3:], scene.body_points()) + pose[:3],
             force=impulse[0],
