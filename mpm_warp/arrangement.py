@@ -52,11 +52,14 @@ def arrange(
         radius = POISSON_RADIUS * spacing
         margin = 2.0 * radius
         if mirrored:
-            # Half a radius off the plane: a point and its image are then no closer than any others.
+            # Points that would be too close to their own image go onto the plane.
             lx, ly, lz = size
-            points = poisson_disk((lx + 2.0 * margin, 0.5 * (ly - radius) + margin, lz + 2.0 * margin), radius, seed)
-            points += [-margin, 0.5 * (ly + radius), margin]
-            points = np.concatenate([points, points * [1.0, -1.0, 1.0] + [0.0, ly, 0.0]])
+            points = poisson_disk(
+                (lx + 2.0 * margin, 0.5 * ly + margin, lz + 2.0 * margin), radius, seed, snap=0.5 * radius
+            )
+            points += [-margin, 0.5 * ly, margin]
+            off_plane = points[points[:, 1] > 0.5 * ly]
+            points = np.concatenate([points, off_plane * [1.0, -1.0, 1.0] + [0.0, ly, 0.0]])
             points = points[_reading_order(points, radius)]
             inside = (points >= [0.0, 0.0, -lz]) & (points <= [lx, ly, 0.0])
             return points[inside.all(axis=1)], spacing**3
@@ -78,9 +81,12 @@ def lattice(size: tuple[float, float, float], spacing: float) -> tuple[np.ndarra
 
 
 def poisson_disk(
-    size: tuple[float, float, float], radius: float, seed: int, candidates: int = 30
+    size: tuple[float, float, float], radius: float, seed: int, candidates: int = 30, snap: float = 0.0
 ) -> np.ndarray:
-    """Random points no closer to each other than `radius` (Bridson 2007), shape (n, 3) [m]."""
+    """Random points no closer to each other than `radius` (Bridson 2007), shape (n, 3) [m].
+
+    What would come closer than `snap` [m] to the side y = 0 is put on it.
+    """
     rng = np.random.default_rng(seed)
     extent = np.asarray(size, dtype=float)
     cell = radius / np.sqrt(3.0)
@@ -98,6 +104,7 @@ def poisson_disk(
         return ((x // cell).astype(np.int64) + pad) @ strides
 
     points[0] = extent * rng.random(3)
+    points[0, 1] = points[0, 1] if points[0, 1] >= snap else 0.0
     flat[key(points[0])] = 0
     count, active = 1, [0]
     while active:
@@ -106,6 +113,7 @@ def poisson_disk(
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         distance = radius * (1.0 + 7.0 * rng.random((candidates, 1))) ** (1.0 / 3.0)
         trial = points[active[slot]] + direction * distance
+        trial[(trial[:, 1] >= 0.0) & (trial[:, 1] < snap), 1] = 0.0
         trial = trial[np.all((trial >= 0.0) & (trial < extent), axis=1)]
         near = points[flat[key(trial)[:, None] + flat_offsets]]
         free = np.all(np.sum((near - trial[:, None]) ** 2, axis=-1) >= radius**2, axis=1)

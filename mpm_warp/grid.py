@@ -25,7 +25,9 @@ def grid_struct(real: type) -> type:
         # Nodes with index <= low or >= high belong to the floor and the walls.
         low: wp.vec3i
         high: wp.vec3i
-        wall_friction: vec3  # Coulomb coefficient of the x walls, the y walls and the floor, where they have one
+        wall_friction: (
+            vec3  # Coulomb coefficient of the x walls, the y walls and the floor, where they have one
+        )
         particle_mass: real  # [kg]
         particle_volume: real  # at the critical density [m^3]
         speed_limit: real  # one cell per step [m/s]

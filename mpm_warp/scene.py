@@ -213,7 +213,7 @@ class Scene:
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Scene:
         """The scene described by plain nested data, checked."""
-        kinds = {"bed": Scene, "excavation": Excavation}
+        kinds = {cls.kind: cls for cls in (Scene, *_subclasses(Scene))}
         kind = data.get("kind", "bed")
         if kind not in kinds:
             raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(kinds)}")
@@ -332,6 +332,10 @@ def _edge_samples(plate: Plate, count: int = 9) -> np.ndarray:
     return np.array(
         [[sx * hx, sy * hy, z] for sx in (-1, 1) for sy in (-1, 1) for z in np.linspace(-hz, hz, count)]
     )
+
+
+def _subclasses(cls: type) -> list[type]:
+    return [c for sub in cls.__subclasses__() for c in (sub, *_subclasses(sub))]
 
 
 def _build(cls: type, data: dict[str, Any], where: str) -> Any:

@@ -224,9 +224,7 @@ class Solver:
         low = [_PADDING, _PADDING, _PADDING]
         high = [_PADDING + cells[0], _PADDING + cells[1], 2**30]
         ghosts = {
-            axis: seam_pairs(_PADDING, cells[axis])
-            for axis in (0, 1)
-            if bed.walls.kinds[axis] == "periodic"
+            axis: seam_pairs(_PADDING, cells[axis]) for axis in (0, 1) if bed.walls.kinds[axis] == "periodic"
         }
         if self._half is not None:
             ghosts[1] = mirror_pairs(2 * _PADDING + cells[1])
@@ -253,7 +251,10 @@ class Solver:
         grid_half, body_half = type(grid)(), type(body)()
         grid_half.assign(grid)
         body_half.assign(body)
-        grid_half.particle_mass, grid_half.particle_volume = 0.5 * grid.particle_mass, 0.5 * grid.particle_volume
+        grid_half.particle_mass, grid_half.particle_volume = (
+            0.5 * grid.particle_mass,
+            0.5 * grid.particle_volume,
+        )
         body_half.stiffness, body_half.damping = 0.5 * body.stiffness, 0.5 * body.damping
         return grid_half, body_half
 
