@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -106,10 +107,7 @@ def test_a_column_spreads_and_stops_below_the_angle_of_repose():
     assert end.position[:, 2].min() > -0.06
     assert np.linalg.norm(end.velocity, axis=1).max() < 0.15
     rings = np.linspace(0.0, away[1].max(), 12)
-    tops = [
-        end.position[(away[1] >= a) & (away[1] < b), 2].max(initial=-0.06)
-        for a, b in zip(rings[:-1], rings[1:], strict=True)
-    ]
+    tops = [end.position[(away[1] >= a) & (away[1] < b), 2].max(initial=-0.06) for a, b in pairwise(rings)]
     slope = -np.polyfit(0.5 * (rings[1:] + rings[:-1])[3:], tops[3:], 1)[0]
     assert 0.1 < slope < scene.material.static_friction
 
