@@ -315,7 +315,9 @@ class Excavation(Scene):
         points = rotate(poses[:, None, 3:], _edge_samples(self.blade)[None]) + poses[:, None, :3]
         lx, ly, lz = self.bed.size
         below = points[..., 2] < 0.0
-        for axis, low, high, name in ((0, 0.0, lx, "x"), (1, 0.0, ly, "y"), (2, -lz, math.inf, "z")):
+        # Nothing is in the way of a plate at the sides of a channel, whose walls stand for more of the same soil.
+        side = math.inf if self.bed.walls.kinds[1] in ("slip", "periodic") else 0.0
+        for axis, low, high, name in ((0, 0.0, lx, "x"), (1, -side, ly + side, "y"), (2, -lz, math.inf, "z")):
             outside = below & ((points[..., axis] < low) | (points[..., axis] > high))
             if outside.any():
                 frame, point = np.argwhere(outside)[0]
