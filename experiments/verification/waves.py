@@ -67,6 +67,8 @@ def draw(figure, rows: list[dict]) -> None:
             cells, errors = ([r[key] for r in found] for key in ("cells", "error"))
             axis.loglog(cells, errors, style, color=colour, label=f"{kind}, {ppc} per cell")
     axis.loglog([8, 64], [0.12, 0.12 / 64], "k:", label="second order")
+    axis.set_xticks([8, 16, 32, 64], ["8", "16", "32", "64"])
+    axis.minorticks_off()
     axis.set_xlabel("grid spacings in a wavelength")
     axis.set_ylabel("relative error of velocity after one period")
     axis.grid(alpha=0.3, which="both")
