@@ -16,7 +16,7 @@ POISSON_RADIUS = 0.897
 
 
 def arrange(
-    kind: str, size: tuple[float, float, float], spacing: float, seed: int
+    kind: str, size: tuple[float, float, float], spacing: float, seed: int, mirrored: bool = False
 ) -> tuple[np.ndarray, float]:
     """Particles of a bed 0 <= x <= Lx, 0 <= y <= Ly, -Lz <= z <= 0.
 
@@ -26,6 +26,7 @@ def arrange(
         size: (Lx, Ly, Lz) [m].
         spacing: nominal distance between particles [m].
         seed: of the random numbers.
+        mirrored: a random bed is its own mirror image about y = Ly / 2.
 
     Returns:
         Positions [m], shape (n, 3), float64, and the volume of one particle [m^3].
@@ -35,12 +36,33 @@ def arrange(
     if kind == "jittered":
         points, volume = lattice(size, spacing)
         rng = np.random.default_rng(seed)
-        step = np.asarray(size) / np.maximum(1, np.round(np.asarray(size) / spacing))
-        return points + step * rng.uniform(-0.5, 0.5, points.shape), volume
+        counts = np.maximum(1, np.round(np.asarray(size) / spacing)).astype(int)
+        moved = (np.asarray(size) / counts * rng.uniform(-0.5, 0.5, points.shape)).reshape(*counts, 3)
+        if mirrored:
+            # The far half of the rows moves as the near one does, mirrored; a row in the middle stays in the plane.
+            image = moved[:, ::-1] * [1.0, -1.0, 1.0]
+            far = np.arange(counts[1]) >= (counts[1] + 1) // 2
+            moved[:, far] = image[:, far]
+            if counts[1] % 2:
+                moved[:, counts[1] // 2, :, 1] = 0.0
+        points = points + moved.reshape(-1, 3)
+        return points, volume
     if kind == "poisson":
         # Sampled on a larger box and trimmed: points crowd at the edge of the box they were sampled in.
         radius = POISSON_RADIUS * spacing
         margin = 2.0 * radius
+        if mirrored:
+            # Points that would be too close to their own image go onto the plane.
+            lx, ly, lz = size
+            points = poisson_disk(
+                (lx + 2.0 * margin, 0.5 * ly + margin, lz + 2.0 * margin), radius, seed, snap=0.5 * radius
+            )
+            points += [-margin, 0.5 * ly, margin]
+            off_plane = points[points[:, 1] > 0.5 * ly]
+            points = np.concatenate([points, off_plane * [1.0, -1.0, 1.0] + [0.0, ly, 0.0]])
+            points = points[_reading_order(points, radius)]
+            inside = (points >= [0.0, 0.0, -lz]) & (points <= [lx, ly, 0.0])
+            return points[inside.all(axis=1)], spacing**3
         points = poisson_disk(tuple(s + 2.0 * margin for s in size), radius, seed)
         points += [-margin, -margin, margin]
         inside = (points >= [0.0, 0.0, -size[2]]) & (points <= [size[0], size[1], 0.0])
@@ -59,9 +81,12 @@ def lattice(size: tuple[float, float, float], spacing: float) -> tuple[np.ndarra
 
 
 def poisson_disk(
-    size: tuple[float, float, float], radius: float, seed: int, candidates: int = 30
+    size: tuple[float, float, float], radius: float, seed: int, candidates: int = 30, snap: float = 0.0
 ) -> np.ndarray:
-    """Random points no closer to each other than `radius` (Bridson 2007), shape (n, 3) [m]."""
+    """Random points no closer to each other than `radius` (Bridson 2007), shape (n, 3) [m].
+
+    What would come closer than `snap` [m] to the side y = 0 is put on it.
+    """
     rng = np.random.default_rng(seed)
     extent = np.asarray(size, dtype=float)
     cell = radius / np.sqrt(3.0)
@@ -79,6 +104,7 @@ def poisson_disk(
         return ((x // cell).astype(np.int64) + pad) @ strides
 
     points[0] = extent * rng.random(3)
+    points[0, 1] = points[0, 1] if points[0, 1] >= snap else 0.0
     flat[key(points[0])] = 0
     count, active = 1, [0]
     while active:
@@ -87,6 +113,7 @@ def poisson_disk(
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         distance = radius * (1.0 + 7.0 * rng.random((candidates, 1))) ** (1.0 / 3.0)
         trial = points[active[slot]] + direction * distance
+        trial[(trial[:, 1] >= 0.0) & (trial[:, 1] < snap), 1] = 0.0
         trial = trial[np.all((trial >= 0.0) & (trial < extent), axis=1)]
         near = points[flat[key(trial)[:, None] + flat_offsets]]
         free = np.all(np.sum((near - trial[:, None]) ** 2, axis=-1) >= radius**2, axis=1)
@@ -101,5 +128,9 @@ def poisson_disk(
             active.pop()
     # Sorted so that neighbours in space are near in memory: the transfers read the grid in order.
     found = points[:count]
-    order = np.lexsort((found[:, 2] // radius, found[:, 1] // radius, found[:, 0] // radius))
-    return found[order] - np.array([0.0, 0.0, extent[2]])
+    return found[_reading_order(found, radius)] - np.array([0.0, 0.0, extent[2]])
+
+
+def _reading_order(points: np.ndarray, radius: float) -> np.ndarray:
+    """Indices that sort points by cells of `radius` in x, then y, then z."""
+    return np.lexsort((points[:, 2] // radius, points[:, 1] // radius, points[:, 0] // radius))

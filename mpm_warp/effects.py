@@ -15,6 +15,7 @@ _REASONS = {
         "friction is the constant mu_s (Drucker-Prager)",
     ),
     "separation": ("soil below its critical density carries no stress", "soil may carry tension"),
+    "symmetry": ("half the bed is computed and mirrored", "the whole bed is computed"),
 }
 
 
@@ -28,6 +29,9 @@ class Effects:
     """mu(I) instead of a constant mu_s. Needs `yielding`."""
     separation: bool = True
     """A stress-free state below the critical density; off: the soil can carry tension."""
+    symmetry: bool = False
+    """Half the bed is computed, the other half is its mirror image. Needs a scene that is mirror symmetric about
+    y = Ly / 2."""
 
     def __post_init__(self) -> None:
         if self.rate_dependence and not self.yielding:

@@ -22,10 +22,13 @@ def grid_struct(real: type) -> type:
         ny: int
         nz: int
         dt: real  # [s]
-        gravity: real  # [m/s^2]
+        gravity: vec3  # [m/s^2]
         # Nodes with index <= low or >= high belong to the floor and the walls.
         low: wp.vec3i
         high: wp.vec3i
+        wall_friction: (
+            vec3  # Coulomb coefficient of the x walls, the y walls and the floor, where they have one
+        )
         particle_mass: real  # [kg]
         particle_volume: real  # at the critical density [m^3]
         speed_limit: real  # one cell per step [m/s]
@@ -34,17 +37,40 @@ def grid_struct(real: type) -> type:
 
 
 @cache
-def grid_step(real: type) -> SimpleNamespace:
+def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
     """Kernels on the nodes in precision `real`.
 
-    - `begin`: momentum and mass to velocity and 1 / mass after a remap; floor and
-      walls hold their nodes by a 1 / mass of 0.
-    - `step`: velocity from the step's impulse and gravity; counts the step.
+    - `begin`: momentum and mass to velocity and 1 / mass after a remap.
+    - `step`: velocity from the step's impulse and gravity, walls and floor; counts the step.
 
-    Both clear what they have used for the next sum.
+    Both clear what they have used for the next sum. `walls` are the kinds of x walls, y walls and floor
+    (`Walls.kinds`); the kernels hold no code of other kinds.
     """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     Grid = grid_struct(real)
+
+    @wp.func
+    def no_slip(v: vec3, inward: vec3, friction: real):
+        return vec3()
+
+    @wp.func
+    def slip(v: vec3, inward: vec3, friction: real):
+        return v - wp.dot(v, inward) * inward
+
+    @wp.func
+    def rub(v: vec3, inward: vec3, friction: real):
+        # What moves into the wall is stopped, and slowed along the wall by Coulomb friction.
+        into = wp.dot(v, inward)
+        if into >= real(0.0):
+            return v
+        sliding = v - into * inward
+        speed = wp.length(sliding)
+        if speed <= -friction * into:
+            return vec3()
+        return sliding * (real(1.0) + friction * into / speed)
+
+    conditions = {"no_slip": no_slip, "slip": slip, "friction": rub, "periodic": slip}
+    at_x, at_y, at_floor = (conditions[kind] for kind in walls)
 
     @wp.kernel(module="unique", enable_backward=False)
     def begin(
@@ -52,48 +78,60 @@ def grid_step(real: type) -> SimpleNamespace:
         momentum: wp.array(dtype=vec4),
         velocity: wp.array(dtype=vec4),
         before: wp.array(dtype=vec4),
+        inverse_mass: wp.array(dtype=real),
         impulse: wp.array(dtype=vec4),
     ):
         n = wp.tid()
         node = momentum[n]
         mass = node[3]
-        v = vec3()
-        inverse_mass = real(0.0)
+        result = vec4()
+        inverse = real(0.0)
         # A node that a particle on a cell's face barely touches has no mass to speak of, and 1 / mass no value.
         if mass > real(1.0e-20) * grid.particle_mass:
-            v = vec3(node[0], node[1], node[2]) / mass
-            inverse_mass = real(1.0) / mass
+            inverse = real(1.0) / mass
+            result = vec4(node[0] / mass, node[1] / mass, node[2] / mass, real(0.0))
         momentum[n] = vec4()
-        before[n] = vec4(v[0], v[1], v[2], real(0.0))
-        # `/` of whole numbers is one instruction; `//` and `%` follow Python's rule for negative numbers.
-        column = n / grid.nz
-        i = column / grid.ny
-        j = column - i * grid.ny
-        k = n - column * grid.nz
-        low = grid.low
-        high = grid.high
-        if i <= low[0] or j <= low[1] or k <= low[2] or i >= high[0] or j >= high[1] or k >= high[2]:
-            v = vec3()
-            inverse_mass = real(0.0)
         impulse[n] = vec4()
-        velocity[n] = vec4(v[0], v[1], v[2], inverse_mass)
+        velocity[n] = result
+        before[n] = result
+        inverse_mass[n] = inverse
 
     @wp.kernel(module="unique", enable_backward=False)
     def step(
         grid: Grid,
         velocity: wp.array(dtype=vec4),
+        inverse_mass: wp.array(dtype=real),
         impulse: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
     ):
         n = wp.tid()
         if n == 0:
             substep[0] = substep[0] + 1
-        v = velocity[n]
-        inverse_mass = v[3]
-        if inverse_mass > real(0.0):
-            change = inverse_mass * impulse[n]
+        inverse = inverse_mass[n]
+        if inverse > real(0.0):
+            now = velocity[n] + inverse * impulse[n]
             impulse[n] = vec4()
-            fall = grid.gravity * grid.dt
-            velocity[n] = vec4(v[0] + change[0], v[1] + change[1], v[2] + change[2] - fall, inverse_mass)
+            v = vec3(now[0], now[1], now[2]) + grid.dt * grid.gravity
+            # `/` of whole numbers is one instruction; `//` and `%` follow Python's rule for negative numbers.
+            column = n / grid.nz
+            i = column / grid.ny
+            j = column - i * grid.ny
+            k = n - column * grid.nz
+            low = grid.low
+            high = grid.high
+            rough = grid.wall_friction
+            if wp.static(walls[0] != "periodic"):
+                if i <= low[0]:
+                    v = at_x(v, vec3(real(1.0), real(0.0), real(0.0)), rough[0])
+                if i >= high[0]:
+                    v = at_x(v, vec3(real(-1.0), real(0.0), real(0.0)), rough[0])
+            if wp.static(walls[1] != "periodic"):
+                if j <= low[1]:
+                    v = at_y(v, vec3(real(0.0), real(1.0), real(0.0)), rough[1])
+                if j >= high[1]:
+                    v = at_y(v, vec3(real(0.0), real(-1.0), real(0.0)), rough[1])
+            if k <= low[2]:
+                v = at_floor(v, vec3(real(0.0), real(0.0), real(1.0)), rough[2])
+            velocity[n] = vec4(v[0], v[1], v[2], real(0.0))
 
     return SimpleNamespace(begin=begin, step=step)

@@ -17,6 +17,7 @@ from .errors import SceneError
 from .material import Material
 from .motion import MOTIONS, curved, ramp, sampled_poses
 from .rotation import about_y, rotate
+from .walls import Walls
 
 __all__ = ["Bed", "Excavation", "Scene"]
 
@@ -37,12 +38,16 @@ class Bed:
     """lattice | jittered | poisson (arrangement.py)."""
     seed: int = 0
     """Of the random arrangements."""
+    mirrored: bool = False
+    """A random arrangement is its own mirror image about y = Ly / 2, which mirror symmetry needs."""
     initial_stress: str = "geostatic"
     """geostatic: isotropic pressure rho g depth; none: stress-free, settles in the first frames."""
     headroom: float = 0.25
     """Height above the surface up to which soil may be thrown or piled [m]."""
     store_every: int = 1
     """Particles per particle that is recorded; the solver computes all of them."""
+    walls: Walls = field(default_factory=Walls)
+    """What soil may do at walls and floor."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "size", tuple(float(s) for s in self.size))
@@ -72,12 +77,24 @@ class Bed:
             raise SceneError(f"bed.headroom is {self.headroom} m; it must be above 0")
         if not (self.store_every >= 1 and self.store_every == int(self.store_every)):
             raise SceneError(f"bed.store_every is {self.store_every}; it must be a whole number, 1 or more")
+        if not isinstance(self.mirrored, bool):
+            raise SceneError(f"bed.mirrored is {self.mirrored!r}; allowed: true, false")
+        for name, kind, length in zip("xy", self.walls.kinds, self.size, strict=False):
+            if kind == "periodic" and abs(length / self.spacing - round(length / self.spacing)) > 1e-6:
+                raise SceneError(
+                    f"bed.walls.{name} is periodic but the bin's {length} m are {length / self.spacing:.3f} grid "
+                    "spacings; it must be a whole number of them: change bed.size or bed.spacing"
+                )
 
     @cached_property
     def filled(self) -> tuple[np.ndarray, float]:
         """Particle positions (n, 3) [m] and the volume of one [m^3]."""
         return arrange(
-            self.arrangement, self.size, self.spacing / self.particles_per_cell ** (1.0 / 3.0), self.seed
+            self.arrangement,
+            self.size,
+            self.spacing / self.particles_per_cell ** (1.0 / 3.0),
+            self.seed,
+            self.mirrored,
         )
 
     @cached_property
@@ -97,6 +114,8 @@ class Bed:
         key = [self.size, self.spacing, self.particles_per_cell, self.arrangement]
         if self.arrangement != "lattice":
             key.append(self.seed)
+            if self.mirrored:
+                key.append("mirrored")
         if self.store_every != 1:
             key.append(f"one of {self.store_every}")
         return hashlib.blake2b(json.dumps(key).encode(), digest_size=8).hexdigest()
@@ -112,6 +131,8 @@ class Scene:
     material: Material = field(default_factory=Material)
     gravity: float = 9.81
     """[m/s^2], downwards."""
+    tilt: float = 0.0
+    """The bin's slope, falling towards +x [degrees]: gravity is turned by it about y."""
     duration: float = 16.0 / 3.0
     """[s]."""
     frame_rate: float = 60.0
@@ -130,6 +151,8 @@ class Scene:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.gravity) and self.gravity >= 0):
             raise SceneError(f"scene.gravity is {self.gravity} m/s^2; it must be 0 or more")
+        if not -90.0 < self.tilt < 90.0:
+            raise SceneError(f"scene.tilt is {self.tilt} degrees; allowed: above -90, below 90")
         if not (math.isfinite(self.frame_rate) and self.frame_rate > 0):
             raise SceneError(f"scene.frame_rate is {self.frame_rate} Hz; it must be above 0")
         if not (math.isfinite(self.duration) and self.duration * self.frame_rate >= 1.0):
@@ -140,6 +163,26 @@ class Scene:
             raise SceneError(f"scene.courant is {self.courant}; allowed: above 0, at most 1")
 
     # --- what a solver or a rollout asks of a scene -------------------------------------------------------
+
+    @property
+    def gravity_vector(self) -> np.ndarray:
+        """[m/s^2], shape (3,)."""
+        angle = math.radians(self.tilt)
+        return self.gravity * np.array([math.sin(angle), 0.0, -math.cos(angle)])
+
+    @property
+    def filled(self) -> tuple[np.ndarray, float]:
+        """Particle positions (n, 3) [m] and the volume of one [m^3]."""
+        return self.bed.filled
+
+    @property
+    def soil_volume(self) -> float:
+        """Space that the soil takes up at the start [m^3]."""
+        return float(np.prod(self.bed.size))
+
+    def initial_velocities(self) -> np.ndarray:
+        """Soil at time 0 [m/s], shape (n, 3), float64."""
+        return np.zeros_like(self.filled[0])
 
     @property
     def plate(self) -> Plate | None:
@@ -169,7 +212,7 @@ class Scene:
 
     def initial_positions(self) -> np.ndarray:
         """Soil at time 0 [m], shape (n, 3), float64."""
-        return self.bed.filled[0]
+        return self.filled[0]
 
     @property
     def arrangement_hash(self) -> str:
@@ -193,7 +236,7 @@ class Scene:
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Scene:
         """The scene described by plain nested data, checked."""
-        kinds = {"bed": Scene, "excavation": Excavation}
+        kinds = {cls.kind: cls for cls in (Scene, *_subclasses(Scene))}
         kind = data.get("kind", "bed")
         if kind not in kinds:
             raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(kinds)}")
@@ -295,7 +338,9 @@ class Excavation(Scene):
         points = rotate(poses[:, None, 3:], _edge_samples(self.blade)[None]) + poses[:, None, :3]
         lx, ly, lz = self.bed.size
         below = points[..., 2] < 0.0
-        for axis, low, high, name in ((0, 0.0, lx, "x"), (1, 0.0, ly, "y"), (2, -lz, math.inf, "z")):
+        # Nothing is in the way of a plate at the sides of a channel, whose walls stand for more of the same soil.
+        side = math.inf if self.bed.walls.kinds[1] in ("slip", "periodic") else 0.0
+        for axis, low, high, name in ((0, 0.0, lx, "x"), (1, -side, ly + side, "y"), (2, -lz, math.inf, "z")):
             outside = below & ((points[..., axis] < low) | (points[..., axis] > high))
             if outside.any():
                 frame, point = np.argwhere(outside)[0]
@@ -314,11 +359,15 @@ def _edge_samples(plate: Plate, count: int = 9) -> np.ndarray:
     )
 
 
+def _subclasses(cls: type) -> list[type]:
+    return [c for sub in cls.__subclasses__() for c in (sub, *_subclasses(sub))]
+
+
 def _build(cls: type, data: dict[str, Any], where: str) -> Any:
     """A dataclass from nested plain data, refusing keys it does not have."""
     if not isinstance(data, dict):
         raise SceneError(f"{where} is {data!r}; it must be a group of keys")
-    nested = {"bed": Bed, "material": Material, "blade": Plate}
+    nested = {"bed": Bed, "material": Material, "blade": Plate, "walls": Walls}
     allowed = {f.name: f for f in fields(cls)}
     unknown = sorted(set(data) - set(allowed))
     if unknown:

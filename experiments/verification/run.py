@@ -1,0 +1,49 @@
+"""The solver against cases with known answers, resolved well enough to see how it converges.
+
+    python experiments/verification/run.py [bagnold passive runout silo slope waves]
+
+Writes NAME.csv and NAME.png beside this script; all of them take about ten minutes on one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import importlib
+import logging
+import time
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+HERE = Path(__file__).parent
+CASES = ("bagnold", "passive", "runout", "silo", "slope", "waves")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("cases", nargs="*", default=CASES, help=f"some of {', '.join(CASES)}; default: all")
+    options = parser.parse_args()
+    if unknown := set(options.cases) - set(CASES):
+        parser.error(f"no case {sorted(unknown)[0]}; there are {', '.join(CASES)}")
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    for name in options.cases:
+        case = importlib.import_module(name)
+        start = time.perf_counter()
+        rows = case.measure()
+        logging.info("%s: %.0f s", name, time.perf_counter() - start)
+        with (HERE / f"{name}.csv").open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, rows[0])
+            writer.writeheader()
+            for row in rows:
+                writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+        figure = plt.figure(figsize=(9, 5), layout="constrained")
+        case.draw(figure, rows)
+        figure.savefig(HERE / f"{name}.png", dpi=100)
+
+
+if __name__ == "__main__":
+    main()

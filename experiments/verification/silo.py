@@ -1,0 +1,100 @@
+"""A silo with rough walls whose bottom is lowered: the pressure on it saturates (Janssen)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpm_warp import Bed, Plate, Scene, Solver, Walls
+
+WIDTH = 0.1  # between the walls [m]
+CELLS = 8  # grid spacings between the walls
+
+
+@dataclass(frozen=True)
+class Silo(Scene):
+    """Soil between two rough walls, endless in y, on a smooth piston that goes down."""
+
+    kind: str = "silo"
+    height: float = 0.2
+    """Of the fill [m]."""
+    speed: float = 0.02
+    """Of the piston [m/s]."""
+
+    @property
+    def plate(self) -> Plate:
+        return Plate(length=4.0 * self.bed.spacing, width=1.0, thickness=1.0, friction=0.0)
+
+    @property
+    def filled(self) -> tuple[np.ndarray, float]:
+        positions, volume = self.bed.filled
+        return positions[positions[:, 2] > -self.height], volume
+
+    def poses_at(self, time: np.ndarray) -> np.ndarray:
+        poses = super().poses_at(time)
+        poses[:, 0] = 0.5 * self.bed.size[0]
+        # Soil rests where contact begins: `contact_margin` spacings off the piston's face.
+        face = -self.height - self.contact_margin * self.bed.spacing
+        poses[:, 2] = face - 0.5 * self.plate.length - self.speed * np.atleast_1d(time)
+        return poses
+
+
+def silo(height: float, friction: float, particles_per_cell: float = 8.0, cells: int = CELLS) -> Silo:
+    h = WIDTH / cells
+    bed = Bed(
+        size=(WIDTH, 4 * h, height + 8 * h),
+        spacing=h,
+        particles_per_cell=particles_per_cell,
+        headroom=0.05,
+        walls=Walls(friction, "periodic"),
+    )
+    return Silo(bed=bed, duration=0.6, frame_rate=100.0, height=height)
+
+
+def bottom_pressure(scene: Silo) -> float:
+    """Mean over the last third of the run [Pa]."""
+    force = [f.force[2] for f in Solver(scene).frames()]
+    return -float(np.mean(force[2 * len(force) // 3 :])) / (scene.bed.size[0] * scene.bed.size[1])
+
+
+def janssen(scene: Silo) -> float:
+    """Pressure on the bottom with the elastic lateral stress ratio K0 [Pa]."""
+    weight = scene.material.bulk_density * scene.gravity
+    length = WIDTH / (2.0 * scene.bed.walls.x * scene.material.lateral_stress_ratio)
+    return weight * length * (1.0 - math.exp(-scene.height / length))
+
+
+def measure() -> list[dict]:
+    rows = []
+    for friction in (0.2, 0.4):
+        for filled in (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0):
+            scene = silo(filled * WIDTH, friction)
+            rows.append(
+                {
+                    "friction": friction,
+                    "height_over_width": filled,
+                    "pressure": bottom_pressure(scene),
+                    "janssen": janssen(scene),
+                    "hydrostatic": scene.material.bulk_density * scene.gravity * scene.height,
+                }
+            )
+    return rows
+
+
+def draw(figure, rows: list[dict]) -> None:
+    axis = figure.subplots()
+    for colour, friction in (("C0", 0.2), ("C1", 0.4)):
+        found = [r for r in rows if r["friction"] == friction]
+        filled = [r["height_over_width"] for r in found]
+        axis.plot(
+            filled, [r["pressure"] for r in found], "o", color=colour, label=f"wall friction {friction}"
+        )
+        axis.plot(filled, [r["janssen"] for r in found], "-", color=colour, label="Janssen, K = ν/(1 − ν)")
+    axis.plot(filled, [r["hydrostatic"] for r in found], "k:", label="weight")
+    axis.set_ylim(0.0, 9000.0)
+    axis.set_xlabel("height over width")
+    axis.set_ylabel("pressure on the bottom [Pa]")
+    axis.grid(alpha=0.3)
+    axis.legend()

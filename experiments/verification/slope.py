@@ -1,0 +1,64 @@
+"""A layer at rest is tilted: it starts where tan(tilt) exceeds mu_s, and then slides as a block on its base would."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mpm_warp import Bed, Effects, Material, Scene, Solver, Walls
+
+SOIL = Material()
+
+
+def acceleration(tilt: float, particles_per_cell: float, duration: float = 0.3) -> float:
+    """Acceleration down the slope [m/s^2] of the upper half over the second half of `duration`, friction mu_s."""
+    h = 0.01
+    bed = Bed(
+        size=(4 * h, 4 * h, 0.1),
+        spacing=h,
+        particles_per_cell=particles_per_cell,
+        headroom=0.03,
+        walls=Walls("periodic", "periodic"),
+    )
+    scene = Scene(bed=bed, material=SOIL, tilt=tilt, duration=duration, frame_rate=50.0)
+    upper = scene.initial_positions()[:, 2] > -0.5 * bed.size[2]
+    frames = Solver(scene, Effects(rate_dependence=False)).frames()
+    speed = np.array([f.velocity[upper, 0].mean() for f in frames])
+    late = len(speed) // 2
+    return float(np.polyfit(scene.times()[late:], speed[late:], 1)[0])
+
+
+def expected(tilt: float) -> float:
+    """g cos(tilt) (tan(tilt) - mu_s) above the friction angle, 0 below [m/s^2]."""
+    angle = math.radians(tilt)
+    return 9.81 * math.cos(angle) * max(0.0, math.tan(angle) - SOIL.static_friction)
+
+
+def measure() -> list[dict]:
+    return [
+        {
+            "tilt": tilt,
+            "particles_per_cell": ppc,
+            "acceleration": acceleration(tilt, ppc),
+            "theory": expected(tilt),
+        }
+        for ppc in (1, 8)
+        for tilt in (25.0, 30.0, 34.0, 35.0, 36.0, 36.5, 37.0, 37.5, 38.0, 39.0, 41.0, 44.0)
+    ]
+
+
+def draw(figure, rows: list[dict]) -> None:
+    axis = figure.subplots()
+    for style, ppc in (("o", 1), ("s", 8)):
+        found = [r for r in rows if r["particles_per_cell"] == ppc]
+        axis.plot(
+            [r["tilt"] for r in found], [r["acceleration"] for r in found], style, label=f"{ppc} per cell"
+        )
+    tilts = np.linspace(25.0, 44.0, 200)
+    axis.plot(tilts, [expected(t) for t in tilts], "k-", lw=1, label="block on its base")
+    axis.axvline(math.degrees(math.atan(SOIL.static_friction)), color="k", ls=":", label="atan mu_s")
+    axis.set_xlabel("tilt [degrees]")
+    axis.set_ylabel("acceleration down the slope [m/s²]")
+    axis.grid(alpha=0.3)
+    axis.legend()

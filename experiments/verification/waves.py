@@ -1,0 +1,75 @@
+"""Elastic waves in a periodic bar, one period, against the exact standing start."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mpm_warp import Bed, Effects, Material, Scene, Solver, Walls
+
+ELASTIC = Effects(yielding=False, rate_dependence=False, separation=False)
+LENGTH = 0.16  # of the bar and the wave [m]
+
+
+def error_after_a_period(kind: str, cells: int, particles_per_cell: float, courant: float = 0.4) -> float:
+    """Relative L2 error of the particles' velocities in a standing wave after one period.
+
+    Args:
+        kind: `compression` (moves along the bar) or `shear` (moves across it).
+        cells: grid spacings in a wavelength.
+    """
+    h = LENGTH / cells
+    # Without Poisson's ratio a compression wave needs no lateral stress, so the free surface is no matter.
+    soil = Material(poissons_ratio=0.0)
+    axis = 0 if kind == "compression" else 1
+    speed = soil.wave_speed if axis == 0 else math.sqrt(soil.shear_modulus / soil.bulk_density)
+    period = LENGTH / speed
+    bed = Bed(
+        size=(LENGTH, 4 * h, 4 * h),
+        spacing=h,
+        particles_per_cell=particles_per_cell,
+        initial_stress="none",
+        headroom=2 * h,
+        walls=Walls("periodic", "periodic", "slip"),
+    )
+    scene = Scene(
+        bed=bed, material=soil, gravity=0.0, duration=period, frame_rate=1.0 / period, courant=courant
+    )
+    solver = Solver(scene, ELASTIC, precision="float64")
+    start = np.zeros((solver.particle_count, 3))
+    start[:, axis] = 1e-4 * speed * np.sin(2.0 * math.pi * scene.initial_positions()[:, 0] / LENGTH)
+    solver._v.assign(start)
+    for _ in solver.frames():
+        pass
+    return float(np.linalg.norm(solver._v.numpy() - start) / np.linalg.norm(start))
+
+
+def measure() -> list[dict]:
+    return [
+        {
+            "wave": kind,
+            "particles_per_cell": ppc,
+            "cells": cells,
+            "error": error_after_a_period(kind, cells, ppc),
+        }
+        for kind in ("compression", "shear")
+        for ppc in (1, 8)
+        for cells in (8, 16, 32, 64)
+    ]
+
+
+def draw(figure, rows: list[dict]) -> None:
+    axis = figure.subplots()
+    for colour, kind in zip(("C0", "C1"), ("compression", "shear"), strict=True):
+        for style, ppc in (("o-", 1), ("s--", 8)):
+            found = [r for r in rows if r["wave"] == kind and r["particles_per_cell"] == ppc]
+            cells, errors = ([r[key] for r in found] for key in ("cells", "error"))
+            axis.loglog(cells, errors, style, color=colour, label=f"{kind}, {ppc} per cell")
+    axis.loglog([8, 64], [0.12, 0.12 / 64], "k:", label="second order")
+    axis.set_xticks([8, 16, 32, 64], ["8", "16", "32", "64"])
+    axis.minorticks_off()
+    axis.set_xlabel("grid spacings in a wavelength")
+    axis.set_ylabel("relative error of velocity after one period")
+    axis.grid(alpha=0.3, which="both")
+    axis.legend()

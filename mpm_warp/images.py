@@ -1,0 +1,81 @@
+"""Ghost nodes: what lies across a mirror plane or a periodic seam.
+
+Particles near such a plane write to nodes on its other side. Those ghost nodes are images of nodes on this side:
+their momentum and mass are added to them (`fold`), and after the grid step they get the velocity back (`unfold`).
+A node on a mirror plane is its own image.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+__all__ = ["images", "mirror_pairs", "seam_pairs"]
+
+_REACH = 2  # layers of ghost nodes: one more than the splines of a particle on the plane reach
+
+
+def mirror_pairs(sum_of_indices: int) -> np.ndarray:
+    """Ghost layers and their images, shape (m, 2), where layers j and `sum_of_indices` - j mirror each other."""
+    first = (sum_of_indices + 1) // 2 - _REACH
+    return np.array([(j, sum_of_indices - j) for j in range(first, sum_of_indices // 2 + 1)])
+
+
+def seam_pairs(low: int, cells: int) -> np.ndarray:
+    """Ghost layers and their images, shape (m, 2), where layers j and j + `cells` are the same and layer `low` is
+    the first of the period."""
+    before = [(low - j, low - j + cells) for j in range(1, _REACH + 1)]
+    after = [(low + cells + j, low + j) for j in range(_REACH)]
+    return np.array(before + after)
+
+
+@cache
+def images(real: type) -> SimpleNamespace:
+    """Kernels `fold`, `unfold` (one thread per row of nodes across the plane) and `wrap` in precision `real`."""
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+
+    @wp.func
+    def node_of(row: int, layer: int, stride: int, extent: int):
+        return (row // stride) * stride * extent + row % stride + layer * stride
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def fold(
+        nodes: wp.array(dtype=vec4), pairs: wp.array(dtype=wp.vec2i), sign: vec4, stride: int, extent: int
+    ):
+        """Add ghost layers to their images; `sign` mirrors a node's momentum, `stride` and `extent` are the axis'."""
+        row = wp.tid()
+        for q in range(pairs.shape[0]):
+            ghost = node_of(row, pairs[q][0], stride, extent)
+            image = node_of(row, pairs[q][1], stride, extent)
+            amount = wp.cw_mul(sign, nodes[ghost])
+            nodes[image] = nodes[image] + amount
+            if ghost != image:
+                nodes[ghost] = vec4()
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def unfold(
+        velocity: wp.array(dtype=vec4), pairs: wp.array(dtype=wp.vec2i), sign: vec4, stride: int, extent: int
+    ):
+        """Give ghost layers the velocity of their images."""
+        row = wp.tid()
+        for q in range(pairs.shape[0]):
+            ghost = node_of(row, pairs[q][0], stride, extent)
+            image = node_of(row, pairs[q][1], stride, extent)
+            velocity[ghost] = wp.cw_mul(sign, velocity[image])
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def wrap(x: wp.array(dtype=vec3), turns: wp.array(dtype=int), axis: int, length: real):
+        """Bring particles back into 0 <= x < length along an axis and count the turns."""
+        p = wp.tid()
+        at = x[p]
+        if at[axis] < real(0.0):
+            at[axis] = at[axis] + length
+            turns[p] = turns[p] - 1
+            x[p] = at
+        elif at[axis] >= length:
+            at[axis] = at[axis] - length
+            turns[p] = turns[p] + 1
+            x[p] = at
+
+    return SimpleNamespace(fold=fold, unfold=unfold, wrap=wrap)

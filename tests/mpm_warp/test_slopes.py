@@ -1,0 +1,143 @@
+"""Columns and slopes: what the scenes hold and refuse, and that soil on them does what it must."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mpm_warp import Bed, Column, Effects, Incline, Material, Scene, SceneError, Solver, Walls
+
+BEADS = Material(
+    youngs_modulus=1.0e5,
+    grain_density=2450.0,
+    packing=0.6,
+    grain_diameter=0.003,
+    static_friction=0.3819,
+    limit_friction=0.6435,
+)
+
+
+def incline(**kw) -> Incline:
+    """A layer of glass beads, 3 cm thick, on a slope of 26 degrees: ten cells high, one particle per cell."""
+    bed = Bed(size=(0.012, 0.012, 0.03), spacing=0.003, headroom=0.006, walls=Walls("periodic", "periodic"))
+    return Incline(
+        **({"bed": bed, "material": BEADS, "tilt": 26.0, "duration": 0.5, "frame_rate": 20.0} | kw)
+    )
+
+
+def column(**kw) -> Column:
+    bed = Bed(size=(0.4, 0.4, 0.06), spacing=0.01, headroom=0.03)
+    return Column(**({"bed": bed, "radius": 0.06, "duration": 0.5, "frame_rate": 20.0} | kw))
+
+
+def test_the_steady_flow_is_bagnolds():
+    """The numbers of glass beads 3 cm thick at 26 degrees, and tan(tilt) = mu(I)."""
+    scene = incline()
+    assert scene.inertial_number == pytest.approx(0.1889, abs=1e-4)
+    assert scene.steady_velocity(np.array([0.03]))[0] == pytest.approx(0.5017, abs=1e-4)
+    heights = (np.arange(3000) + 0.5) * 1e-5
+    assert scene.steady_velocity(heights).mean() == pytest.approx(0.3010, abs=1e-4)
+    i, soil = scene.inertial_number, BEADS
+    mu = soil.static_friction + (soil.limit_friction - soil.static_friction) / (
+        1.0 + soil.reference_inertial_number / i
+    )
+    assert mu == pytest.approx(math.tan(math.radians(26.0)))
+    rate = np.gradient(scene.steady_velocity(heights), 1e-5)
+    pressure = soil.bulk_density * 9.81 * math.cos(math.radians(26.0)) * (0.03 - heights)
+    inertial = rate * soil.grain_diameter * np.sqrt(soil.grain_density / pressure)
+    np.testing.assert_allclose(inertial[10:-300], i, rtol=1e-3)
+
+
+def test_the_steady_flow_stays():
+    """Started in Bagnold's profile, the layer keeps it."""
+    scene = incline()
+    frame = list(Solver(scene).frames())[-1]
+    exact = scene.steady_velocity(frame.position[:, 2] + 0.03)
+    np.testing.assert_allclose(frame.velocity[:, 0], exact, atol=0.02 * exact.max())
+    assert np.abs(frame.velocity[:, 1:]).max() < 0.01 * exact.max()
+    travelled = frame.position[:, 0] - scene.initial_positions()[:, 0]
+    np.testing.assert_allclose(travelled, 0.5 * exact, atol=0.02 * 0.5 * exact.max())
+
+
+def test_the_flow_finds_its_speed():
+    """Slowed down by a tenth, it comes back towards the steady profile."""
+    scene = incline(duration=1.0)
+    solver = Solver(scene)
+    frames = solver.frames()
+    steady = next(frames).velocity[:, 0].mean()
+    solver._v.assign(0.9 * solver._v.numpy())
+    speed = [f.velocity[:, 0].mean() / steady for f in frames]
+    assert speed[0] < 0.93
+    assert speed[-1] > 0.95
+
+
+def test_no_flow_below_the_static_friction():
+    """A layer that moves comes to rest where tan(tilt) < mu_s, with the deceleration of friction."""
+    scene = incline(tilt=15.0, flowing=False, duration=0.3)
+    solver = Solver(scene, Effects(rate_dependence=False))
+    frames = solver.frames()
+    next(frames)
+    solver._v.assign(np.tile([0.2, 0.0, 0.0], (solver.particle_count, 1)))
+    speed = [f.velocity[:, 0].mean() for f in frames]
+    assert speed[0] > 0.05
+    assert np.abs(speed[-1]) < 2e-3
+
+
+@pytest.mark.parametrize("tilt", [20.0, 33.0])
+def test_slopes_without_steady_flow_are_refused(tilt):
+    with pytest.raises(
+        SceneError, match=r"flows steadily between 20.90 and 32.76 degrees.*scene.flowing=false"
+    ):
+        incline(tilt=tilt)
+    assert incline(tilt=tilt, flowing=False).initial_velocities().max() == 0.0
+
+
+def test_a_column_spreads_and_stops_below_the_angle_of_repose():
+    """It ends lower and wider, no soil is lost, and no slope is steeper than friction allows."""
+    scene = column()
+    frames = list(Solver(scene).frames())
+    start, end = frames[0], frames[-1]
+    away = [np.hypot(f.position[:, 0] - 0.2, f.position[:, 1] - 0.2) for f in (start, end)]
+    assert away[1].max() > away[0].max() + 0.01
+    assert end.position[:, 2].max() < start.position[:, 2].max()
+    assert end.position[:, 2].min() > -0.06
+    assert np.linalg.norm(end.velocity, axis=1).max() < 0.15
+    rings = np.linspace(0.0, away[1].max(), 12)
+    tops = [end.position[(away[1] >= a) & (away[1] < b), 2].max(initial=-0.06) for a, b in pairwise(rings)]
+    slope = -np.polyfit(0.5 * (rings[1:] + rings[:-1])[3:], tops[3:], 1)[0]
+    assert 0.1 < slope < scene.material.static_friction
+
+
+def test_a_column_is_round_and_as_heavy_as_it_should_be():
+    scene = column(bed=Bed(size=(0.4, 0.4, 0.06), spacing=0.005, headroom=0.03))
+    positions, volume = scene.filled
+    assert np.hypot(*(positions[:, :2] - 0.2).T).max() <= 0.06
+    assert len(positions) * volume == pytest.approx(scene.soil_volume, rel=0.02)
+    assert scene.aspect_ratio == pytest.approx(1.0)
+    slab = column(shape="slab")
+    assert np.ptp(slab.filled[0][:, 1]) > 0.38
+    assert len(slab.filled[0]) * slab.filled[1] == pytest.approx(slab.soil_volume)
+    assert len({scene.arrangement_hash, slab.arrangement_hash, column().arrangement_hash}) == 3
+
+
+@pytest.mark.parametrize(
+    ("make", "change", "words"),
+    [
+        (column, {"shape": "cone"}, "scene.shape is 'cone'; allowed: cylinder, slab"),
+        (column, {"radius": 0.3}, "scene.radius is 0.3 m; allowed: .* half the bin"),
+        (incline, {"flowing": 1}, "scene.flowing is 1; allowed: true, false"),
+        (incline, {"tilt": 95.0}, "scene.tilt is 95.0 degrees; allowed"),
+    ],
+)
+def test_what_is_refused(make, change, words):
+    with pytest.raises(SceneError, match=words):
+        make(**change)
+
+
+def test_they_survive_plain_data():
+    for scene in (incline(), replace(column(), shape="slab")):
+        assert Scene.from_dict(scene.to_dict()) == scene

@@ -1,0 +1,96 @@
+"""The benchmarks of experiments/verification, small: waves, slopes, silo, passive wall; and the scaling symmetry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import bagnold
+import numpy as np
+import passive
+import pytest
+import silo
+import slope
+import waves
+from beds import cut
+
+from mpm_warp import Bed, Material, Plate, Solver
+
+
+@pytest.mark.parametrize("kind", ["compression", "shear"])
+@pytest.mark.parametrize("particles_per_cell", [1, 8])
+def test_elastic_waves_converge_with_second_order(kind, particles_per_cell):
+    coarse, fine = (waves.error_after_a_period(kind, cells, particles_per_cell) for cells in (12, 24))
+    assert fine < 0.03
+    assert math.log2(coarse / fine) > 1.8
+
+
+def test_bagnold_flow_keeps_its_mean_speed():
+    """A layer that keeps flowing for a second, against theory; the profile itself is in test_slopes."""
+    _, speed, steady = bagnold.profile(bagnold.layer(0.003, 1, duration=1.0))
+    assert speed.mean() == pytest.approx(steady.mean(), rel=0.005)
+
+
+@pytest.mark.parametrize("tilt", [30.0, 36.5, 37.0])
+def test_a_layer_below_the_friction_angle_stays(tilt):
+    """tan 37.23 degrees is mu_s = 0.76."""
+    assert abs(slope.acceleration(tilt, 1, duration=0.2)) < 1e-3
+
+
+@pytest.mark.parametrize("tilt", [38.0, 41.0])
+def test_a_layer_above_the_friction_angle_slides_as_a_block(tilt):
+    """What holds it back is mu_s times its weight's pressure, to half a per cent."""
+    angle = math.radians(tilt)
+    friction = math.tan(angle) - slope.acceleration(tilt, 1, duration=0.2) / (9.81 * math.cos(angle))
+    assert friction == pytest.approx(0.76, rel=0.005)
+
+
+@pytest.mark.parametrize("filled", [1.0, 3.0])
+def test_a_silos_walls_carry_its_weight(filled):
+    """Janssen's pressure on the bottom; without friction it would be the weight, 1.7 times as much at 3 widths."""
+    scene = silo.silo(filled * silo.WIDTH, 0.4, particles_per_cell=1.0)
+    assert silo.bottom_pressure(scene) == pytest.approx(silo.janssen(scene), rel=0.1)
+
+
+def test_a_smooth_wall_meets_the_passive_force():
+    """Rankine with sin(phi) = mu_s: mean coefficient once the wall has moved by an eighth of the depth."""
+    found = passive.coefficient(passive.retaining_wall(0.3))
+    assert found[20:].mean() == pytest.approx(passive.expected(0.3), rel=0.05)
+
+
+def scaled_cut(length: float, gravity: float):
+    """A cut with all lengths x `length` and gravity x `gravity`, and everything else so that nothing else changes."""
+    rate, speed = math.sqrt(gravity / length), math.sqrt(gravity * length)
+    assert speed == pytest.approx(rate * length)
+    soil = Material()
+    rows = [(0.0, 0.13, 0.2, 0.105, 0, 0, 0, 1), (0.1, 0.16, 0.2, 0.06, 0, 0, 0, 1)]
+    path = tuple((t / rate, length * x, length * y, length * z, *q) for t, x, y, z, *q in rows)
+    return cut(
+        bed=Bed(
+            size=tuple(length * s for s in (0.48, 0.4, 0.16)), spacing=length * 0.02, headroom=length * 0.12
+        ),
+        blade=Plate(length=length * 0.2, width=length * 0.19, thickness=length * 0.044),
+        material=replace(
+            soil,
+            youngs_modulus=soil.youngs_modulus * gravity * length,
+            grain_diameter=soil.grain_diameter * length,
+        ),
+        gravity=9.81 * gravity,
+        motion="path",
+        path=path,
+        duration=0.1 / rate,
+        frame_rate=100.0 * rate,
+    )
+
+
+def test_exact_scaling():
+    """Lengths x r, gravity x q, times x sqrt(r / q), E x q r, d x r: forces x q r^3, torques x q r^4."""
+    r, q = 2.5, 0.3
+    one, other = scaled_cut(1.0, 1.0), scaled_cut(r, q)
+    frames = [list(Solver(s, precision="float64").frames()) for s in (one, other)]
+    force = [np.array([f.force for f in run]) for run in frames]
+    torque = [np.array([f.torque for f in run]) for run in frames]
+    assert np.abs(force[0]).max() > 10.0
+    np.testing.assert_allclose(force[1], q * r**3 * force[0], atol=1e-8 * np.abs(force[1]).max())
+    np.testing.assert_allclose(torque[1], q * r**4 * torque[0], atol=1e-8 * np.abs(torque[1]).max())
+    np.testing.assert_allclose(frames[1][-1].position, r * frames[0][-1].position, atol=1e-6 * r)
