@@ -10,11 +10,12 @@ import numpy as np
 import warp as wp
 
 from .constitutive import soil_struct
-from .contact import body_struct
+from .contact import ContactLaw, body_struct
 from .effects import Effects
 from .errors import SceneError, SolverStopped
 from .grid import grid_step, grid_struct
-from .rotation import angular_velocity, rotate
+from .rigid_body import RigidBody, longest_step
+from .rotation import rotate
 from .scene import Scene
 from .start import start_warp
 from .transfer import transfer
@@ -83,6 +84,7 @@ class Solver:
 
         frame_time = 1.0 / scene.frame_rate
         limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + self._top_body_speed())
+        limit = min(limit, longest_step(scene))
         self.substeps_per_frame = max(1, math.ceil(frame_time / limit - 1e-9))
         self.time_step = frame_time / self.substeps_per_frame
         """Substep [s]."""
@@ -101,7 +103,9 @@ class Solver:
         """
         for index in range(self.scene.frame_count):
             if index > 0:
-                self._load_motion(index - 1)
+                self._substep.zero_()
+                if self._body is not None:
+                    self._body.start_frame(index - 1)
                 self._advance(index)
             yield self._frame(index)
 
@@ -109,7 +113,7 @@ class Solver:
 
     def _top_body_speed(self) -> float:
         """Fastest motion of the body between frames [m/s]."""
-        if self.scene.plate is None:
+        if self.scene.body is None:
             return 0.0
         step = np.diff(self.scene.body_poses()[:, :3], axis=0)
         return float(np.max(np.linalg.norm(step, axis=1), initial=0.0) * self.scene.frame_rate)
@@ -168,27 +172,18 @@ class Solver:
         self._substep = wp.zeros(1, dtype=int, **new)
         self._stray = wp.zeros(4, dtype=int, **new)
 
-        body, plate, m = body_struct(real)(), scene.plate, self.substeps_per_frame
-        if plate is not None:
-            body.half_size, body.friction = vec3(*plate.half_size), plate.friction
-            body.margin = scene.contact_margin * h
-            body.reach = float(np.linalg.norm(plate.half_size + max(0.0, body.margin)))
-            # The spring is as stiff as a layer of soil one particle thick; damping is critical.
-            stiffness = material.wave_speed**2 * material.bulk_density * volume ** (1.0 / 3.0)
-            body.stiffness, body.damping = stiffness, 2.0 * math.sqrt(stiffness * grid.particle_mass)
-            body.separation_speed = 0.01 * material.wave_speed
-        body.position = wp.zeros(m, dtype=vec3, **new)
-        body.rotation = wp.zeros(m, dtype=wp.types.quaternion(real), **new)
-        body.velocity = wp.zeros(m, dtype=vec3, **new)
-        body.spin = wp.zeros(m, dtype=vec3, **new)
-        body.impulse = wp.zeros(2, dtype=vec3, **new)
-        self._body = body
+        self._body: RigidBody | None = None
+        if scene.body is not None:
+            self._body = RigidBody(scene, real, self.device, self.substeps_per_frame, self.time_step, volume)
+        law = self._body.law if self._body else None
+        body = self._body.data if self._body else body_struct(real, ContactLaw())()
 
-        kernels = transfer(real, self.effects, with_body=plate is not None, atomic=self.device.is_cuda)
+        kernels = transfer(real, self.effects, law, atomic=self.device.is_cuda)
         particles = [self._x, self._v, self._c, self._e, self._ln_j, grid, soil]
         record = {"device": self.device, "record_cmd": True}
         self._launches = [
             wp.launch(kernels.to_grid, n, [*particles, body, self._nodes, self._substep], **record),
+            *(self._body.launches if self._body else ()),
             wp.launch(
                 grid_step(real), node_count, [grid, self._nodes, self._velocity, self._substep], **record
             ),
@@ -199,24 +194,6 @@ class Solver:
         self._graph: wp.Graph | None = None
 
     # --- stepping -----------------------------------------------------------------------------------------
-
-    def _load_motion(self, frame: int) -> None:
-        """The body's pose and velocity in every substep of the frame that begins at `frame`."""
-        self._substep.zero_()
-        self._body.impulse.zero_()
-        if self.scene.plate is None:
-            return
-        m, dt = self.substeps_per_frame, self.time_step
-        poses = self.scene.poses_at((frame * m + np.arange(m + 1)) * dt)
-        velocity = np.diff(poses[:, :3], axis=0) / dt
-        spin = angular_velocity(poses[:-1, 3:], poses[1:, 3:], dt)
-        for array, values in (
-            (self._body.position, poses[:-1, :3]),
-            (self._body.rotation, poses[:-1, 3:]),
-            (self._body.velocity, velocity),
-            (self._body.spin, spin),
-        ):
-            array.assign(values)
 
     def _substeps(self) -> None:
         for _ in range(self.substeps_per_frame):
@@ -250,11 +227,14 @@ class Solver:
 
     def _frame(self, index: int) -> Frame:
         scene = self.scene
-        pose = scene.poses_at(np.array([index / scene.frame_rate]))[0]
-        impulse = self._body.impulse.numpy().astype(float) * (scene.frame_rate if index else 0.0)
+        time = index / scene.frame_rate
+        pose = scene.poses_at(np.array([time]))[0]
+        impulse = np.zeros((2, 3))
+        if self._body is not None:
+            pose, impulse = self._body.pose(time), self._body.impulse() * (scene.frame_rate if index else 0.0)
         return Frame(
             index=index,
-            time=index / scene.frame_rate,
+            time=time,
             position=self._x.numpy().astype(np.float32),
             velocity=self._v.numpy().astype(np.float32),
             body_pose=pose,

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .constitutive import constitutive, soil_struct
-from .contact import body_struct, contact
+from .contact import ContactLaw, body_struct, contact
 from .effects import Effects
 from .grid import grid_struct
 
@@ -18,17 +18,19 @@ __all__ = ["transfer"]
 
 
 @cache
-def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> SimpleNamespace:
+def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: bool) -> SimpleNamespace:
     """Kernels `to_grid` and `to_particles` in precision `real` with only the physics in `effects`.
 
-    `atomic` is needed where many threads write to the grid at once (a GPU).
+    `touch` is the contact with a body, None without one; `atomic` is needed where many threads write to the grid at
+    once (a GPU).
     """
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
     law = constitutive(real, effects)
     vec6, mat33 = law.vec6, law.mat33
-    Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real)
-    push = contact(real, atomic).push
+    Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real, touch or ContactLaw())
+    with_body = touch is not None
+    push = contact(real, touch or ContactLaw(), atomic).push
     update, kirchhoff = law.update, law.kirchhoff
 
     @wp.func
