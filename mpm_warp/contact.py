@@ -1,7 +1,10 @@
 """Contact between soil particles and a rigid body.
 
-A particle within the body is pushed out by a stiff damped spring along the body's normal and held back by Coulomb
-friction; the body receives the opposite. Particles move with the soil, so the force changes smoothly as the body
+A particle within the body is pushed out by a stiff damped spring along the body's normal. A spring like it holds it back
+along the surface: it is stretched by the sliding since contact began, and no further than Coulomb friction allows
+(Cundall & Strack 1979). Friction without such a memory could take no more from a particle than the momentum of its own
+sliding, which is far too little where soil slides at millimetres per second under a load. The body receives the
+opposite. Particles move with the soil, so the force changes smoothly as the body
 advances, while contact enforced at grid nodes comes and goes with every cell the body crosses.
 
 The grid spreads a push over the width of its B-splines, so a body acts about half a grid spacing further out than it
@@ -47,7 +50,7 @@ def body_struct(real: type, law: ContactLaw) -> type:
     @wp.struct
     class Body:
         shape: Shape
-        reach: real  # radius of the sphere around the body and everything in contact with it [m]
+        reach: real  # radius of a sphere that a particle in contact cannot leave within a substep [m]
         margin: real  # distance from the surface at which contact begins, negative inside [m]
         layer: real  # thickness of the layer that bilateral contact holds [m]
         stiffness: real  # of the spring [N/m]
@@ -61,6 +64,7 @@ def body_struct(real: type, law: ContactLaw) -> type:
         axle: wp.array(
             dtype=wp.float64
         )  # of a free body: height [m] and its rate [m/s] in place of the above
+        stick: wp.array(dtype=vec3)  # stretch of each particle's tangential spring, world frame [m]
         impulse: wp.array(
             dtype=vec3
         )  # [0] by the soil on the body [N s], [1] its moment about the centre of mass
@@ -70,7 +74,7 @@ def body_struct(real: type, law: ContactLaw) -> type:
 
 @cache
 def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
-    """Warp function `push(x, v, mass, dt, s, body)` -> impulse on a particle [N s] in substep s, in precision `real`.
+    """Warp function `push(p, x, v, mass, dt, s, body)` -> impulse on particle p [N s] in substep s, in precision `real`.
 
     The opposite impulse is added to the body; `atomic` is needed where many threads do so at once (a GPU).
     """
@@ -89,7 +93,7 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
             body.impulse[1] = body.impulse[1] - wp.cross(arm, impulse)
 
     @wp.func
-    def push(x: vec3, v: vec3, mass: real, dt: real, s: int, body: Body):
+    def push(p: int, x: vec3, v: vec3, mass: real, dt: real, s: int, body: Body):
         centre = body.position[s]
         if wp.static(free):
             centre = vec3(centre[0], centre[1], real(body.axle[0]))
@@ -99,6 +103,7 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
             rotation = body.rotation[s]
             found = outward(wp.quat_rotate_inv(rotation, arm), body.shape)
             overlap = body.margin - found[3]
+            stretch = vec3()
             if overlap > -body.layer:
                 normal = wp.quat_rotate(rotation, vec3(found[0], found[1], found[2]))
                 velocity = body.velocity[s]
@@ -106,21 +111,25 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
                     velocity = vec3(velocity[0], velocity[1], real(body.axle[1]))
                 relative = v - velocity - wp.cross(body.spin[s], arm)
                 leaving = wp.dot(relative, normal)
+                hold = wp.min(dt * body.damping, mass)  # dampers may stop the particle, not turn it back
                 pressed = real(0.0)
                 if wp.static(bilateral):
-                    # The damper may stop the particle, not turn it back.
-                    hold = wp.min(dt * body.damping, mass)
                     pressed = dt * body.stiffness * wp.max(overlap, real(0.0)) - hold * leaving
                 elif leaving < body.separation_speed:
                     pressed = wp.max(dt * (body.stiffness * overlap - body.damping * leaving), real(0.0))
                 if pressed != real(0.0):
-                    impulse = pressed * normal
                     sliding = relative - leaving * normal
-                    speed = wp.length(sliding)
-                    if speed > real(0.0):
-                        grip = wp.min(body.friction * wp.abs(pressed), mass * speed)
-                        impulse -= grip / speed * sliding
+                    stretch = body.stick[p]
+                    stretch += dt * sliding - wp.dot(stretch, normal) * normal
+                    grip = dt * body.stiffness * stretch + hold * sliding
+                    size = wp.length(grip)
+                    most = body.friction * wp.abs(pressed)
+                    if size > most:
+                        grip = grip * (most / size)
+                        stretch = grip / (dt * body.stiffness)
+                    impulse = pressed * normal - grip
                     add(body, impulse, arm)
+            body.stick[p] = stretch
         return impulse
 
     return SimpleNamespace(push=push)

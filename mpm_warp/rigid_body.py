@@ -51,11 +51,19 @@ class RigidBody:
         device: where it lives.
         substeps: per frame.
         dt: substep [s].
+        particles: how many there are.
         volume: of a particle [m^3].
     """
 
     def __init__(
-        self, scene: Scene, real: type, device: wp.Device, substeps: int, dt: float, volume: float
+        self,
+        scene: Scene,
+        real: type,
+        device: wp.Device,
+        substeps: int,
+        dt: float,
+        particles: int,
+        volume: float,
     ) -> None:
         vec3 = wp.types.vector(3, real)
         self.scene, self.substeps, self.dt = scene, substeps, dt
@@ -67,7 +75,7 @@ class RigidBody:
         data.layer = HOLDING_LAYER * h if scene.bilateral else 0.0
         outermost = max(0.0, scene.contact_margin * h + float(data.layer))
         data.shape, self._mesh = shape_data(shape, real, outermost, device)
-        data.reach = shape.reach + math.sqrt(3.0) * outermost
+        data.reach = shape.reach + math.sqrt(3.0) * outermost + h
         data.friction = shape.friction
         data.stiffness, data.damping = contact_spring(scene, volume)
         data.separation_speed = 0.01 * scene.material.wave_speed
@@ -75,6 +83,7 @@ class RigidBody:
         data.rotation = wp.zeros(substeps, dtype=wp.types.quaternion(real), device=device)
         data.velocity = wp.zeros(substeps, dtype=vec3, device=device)
         data.spin = wp.zeros(substeps, dtype=vec3, device=device)
+        data.stick = wp.zeros(particles, dtype=vec3, device=device)
         data.impulse = wp.zeros(2, dtype=vec3, device=device)
         self.launches: list[wp.Launch] = []
         """What has to run in every substep after the soil's push was added up."""

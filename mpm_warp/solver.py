@@ -174,7 +174,7 @@ class Solver:
 
         self._body: RigidBody | None = None
         if scene.body is not None:
-            self._body = RigidBody(scene, real, self.device, self.substeps_per_frame, self.time_step, volume)
+            self._body = RigidBody(scene, real, self.device, self.substeps_per_frame, self.time_step, n, volume)
         law = self._body.law if self._body else None
         body = self._body.data if self._body else body_struct(real, ContactLaw())()
 

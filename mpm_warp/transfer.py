@@ -88,7 +88,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         q = c[p] * (grid.particle_mass * h) + force
         start = grid.particle_mass * v[p] - q * f
         if wp.static(with_body):
-            start += push(x[p], v[p], grid.particle_mass, grid.dt, substep[0], body)
+            start += push(p, x[p], v[p], grid.particle_mass, grid.dt, substep[0], body)
         qx = vec4(q[0, 0], q[1, 0], q[2, 0], real(0.0))
         qy = vec4(q[0, 1], q[1, 1], q[2, 1], real(0.0))
         qz = vec4(q[0, 2], q[1, 2], q[2, 2], real(0.0))
