@@ -10,6 +10,7 @@ import warp as wp
 
 from .axle import axle_step, stable_step
 from .contact import HOLDING_LAYER, ContactLaw, body_struct
+from .errors import SolverStopped
 from .rotation import angular_velocity
 from .shapes import shape_data
 
@@ -119,6 +120,20 @@ class RigidBody:
         if self._axle is not None:
             pose[2] = self._axle.numpy()[0]
         return pose
+
+    def check(self, time: float) -> None:
+        """Stop where a free body's motion means nothing any more.
+
+        Raises:
+            SolverStopped: it reached the floor, or its height is not finite.
+        """
+        if self._axle is None:
+            return
+        lowest = self._axle.numpy()[0] - self.scene.body.half_size[2]
+        if not lowest > -self.scene.bed.size[2]:
+            raise SolverStopped(
+                f"the body reached the floor of the bin by {time:.3f} s: make scene.bed.size deeper or the load smaller"
+            )
 
     def impulse(self) -> np.ndarray:
         """By the soil on the body since the frame began [N s], and its moment [N m s], shape (2, 3)."""

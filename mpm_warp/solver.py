@@ -107,6 +107,8 @@ class Solver:
                 if self._body is not None:
                     self._body.start_frame(index - 1)
                 self._advance(index)
+                if self._body is not None:
+                    self._body.check(index / self.scene.frame_rate)
             yield self._frame(index)
 
     # --- set-up -------------------------------------------------------------------------------------------
@@ -174,7 +176,9 @@ class Solver:
 
         self._body: RigidBody | None = None
         if scene.body is not None:
-            self._body = RigidBody(scene, real, self.device, self.substeps_per_frame, self.time_step, n, volume)
+            self._body = RigidBody(
+                scene, real, self.device, self.substeps_per_frame, self.time_step, n, volume
+            )
         law = self._body.law if self._body else None
         body = self._body.data if self._body else body_struct(real, ContactLaw())()
 

@@ -80,7 +80,10 @@ class Wheel(Scene):
             raise SceneError(f"scene.damping is {self.damping} 1/s; it must be 0 or more")
         if not 0.0 <= self.start <= 1.0:
             raise SceneError(f"scene.start is {self.start}; allowed: 0 to 1, a share of the bin's length")
-        _ = self.body  # its sizes are checked
+        try:
+            _ = self.body
+        except SceneError as error:
+            raise SceneError(str(error).replace("tool.", "scene.")) from None
         raised = False
         if self.friction_angle is not None:
             material, raised = with_friction_angle(self.material, self.friction_angle)
@@ -166,7 +169,8 @@ class Wheel(Scene):
                 f"the axle moves from x = {first:.3f} to {last:.3f} m; allowed: 0 to {lx:g} m; change scene.start, "
                 "slip, rim_speed or duration"
             )
-        if self.clearance < -self.bed.size[2]:
+        if not -self.bed.size[2] < self.clearance < self.bed.headroom:
             raise SceneError(
-                f"scene.clearance is {self.clearance} m; the bin is only {self.bed.size[2]} m deep"
+                f"scene.clearance is {self.clearance} m; allowed: above the floor ({-self.bed.size[2]:g} m) and below "
+                f"bed.headroom ({self.bed.headroom:g} m)"
             )

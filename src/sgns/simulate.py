@@ -13,7 +13,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -266,9 +265,9 @@ def main(cfg: DictConfig) -> float | None:
             progress=bar.update,
         )
     with Run(output) as run:
-        force = run.force[1:]
         log.info("%s: %d particles, %d frames", output, run.particle_count, run.frame_count)
-    log.info("mean draft %.1f N, vertical force %.1f N", -np.mean(force[:, 0]), np.mean(force[:, 2]))
+        if words := scene.summary(run.force, run.torque, run.pose):
+            log.info("%s", words)
     log.info(
         "%.1f s for %.2f simulated s: %.2f s per simulated second, %.2f M particle-steps/s on %s",
         timing.wall_time,
