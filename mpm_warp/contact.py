@@ -1,11 +1,11 @@
 """Contact between soil particles and a rigid body.
 
-A particle within the body is pushed out by a stiff damped spring along the body's normal. A spring like it holds it back
-along the surface: it is stretched by the sliding since contact began, and no further than Coulomb friction allows
-(Cundall & Strack 1979). Friction without such a memory could take no more from a particle than the momentum of its own
-sliding, which is far too little where soil slides at millimetres per second under a load. The body receives the
-opposite. Particles move with the soil, so the force changes smoothly as the body
-advances, while contact enforced at grid nodes comes and goes with every cell the body crosses.
+A particle within the body is pushed out by a stiff damped spring along the body's normal. A second spring holds it back
+along the surface; it is stretched by the sliding since contact began, no further than Coulomb friction allows (Cundall
+& Strack 1979). Friction without such a memory could take no more from a particle than the momentum of its own sliding,
+far too little where soil slides at millimetres per second under a load. The body receives the opposite of both.
+Particles move with the soil, so the force changes smoothly as the body advances, while contact enforced at grid nodes
+comes and goes with every cell the body crosses.
 
 The grid spreads a push over the width of its B-splines, so a body acts about half a grid spacing further out than it
 is. Contact therefore begins at a margin of -1/2 grid spacings: when a particle's centre is that far inside.
@@ -74,7 +74,7 @@ def body_struct(real: type, law: ContactLaw) -> type:
 
 @cache
 def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
-    """Warp function `push(p, x, v, mass, dt, s, body)` -> impulse on particle p [N s] in substep s, in precision `real`.
+    """Warp function `push(p, x, v, mass, dt, s, body)` in precision `real`: impulse on particle p in substep s [N s].
 
     The opposite impulse is added to the body; `atomic` is needed where many threads do so at once (a GPU).
     """

@@ -72,10 +72,10 @@ def test_bad_mesh_files(tmp_path):
         MeshBody(file=str(tmp_path / "a.ply"))
     with pytest.raises(SceneError, match="cannot read"):
         MeshBody(file=str(tmp_path / "none.stl"))
-    with pytest.raises(SceneError, match="tool.file is missing"):
+    with pytest.raises(SceneError, match=r"tool\.file is missing"):
         MeshBody()
     flat = write_obj(tmp_path / "flat.obj", CORNERS * [1, 1, 0], BOX_FACES)
-    with pytest.raises(SceneError, match="tool.file"):
+    with pytest.raises(SceneError, match=r"tool\.file"):
         MeshBody(file=str(flat))
 
 
