@@ -1,33 +1,41 @@
 """A 3D material point method for granular soil, in NVIDIA Warp. Usable alone; needs warp and numpy only."""
 
 from .arrangement import arrange
-from .bodies import Plate
+from .bodies import Box, Cylinder, MeshBody, Plate
 from .column import Column
 from .effects import Effects
 from .errors import SceneError, SolverStopped
+from .excavation import Excavation
 from .incline import Incline
 from .material import Material
-from .scene import Bed, Excavation, Scene
+from .push import Push
+from .scene import Bed, Scene
 from .solver import Frame, Solver
-from .time_step import substeps_per_frame
 from .symmetry import asymmetry
+from .time_step import substeps_per_frame
 from .walls import Walls
+from .wheel import Wheel
 
 __all__ = [
     "Bed",
+    "Box",
     "Column",
+    "Cylinder",
     "Effects",
     "Excavation",
     "Frame",
     "Incline",
     "Material",
+    "MeshBody",
     "Plate",
+    "Push",
     "Scene",
     "SceneError",
     "Solver",
     "SolverStopped",
     "Walls",
+    "Wheel",
     "arrange",
-    "substeps_per_frame",
     "asymmetry",
+    "substeps_per_frame",
 ]

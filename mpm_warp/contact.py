@@ -1,31 +1,58 @@
 """Contact between soil particles and a rigid body.
 
-A particle within the body is pushed out by a stiff damped spring along the body's normal and held back by Coulomb
-friction; the body receives the opposite. Particles move with the soil, so the force changes smoothly as the body
-advances, while contact enforced at grid nodes comes and goes with every cell the body crosses.
+A particle within the body is pushed out by a stiff damped spring along the body's normal. A second spring holds it back
+along the surface; it is stretched by the sliding since contact began, no further than Coulomb friction allows (Cundall
+& Strack 1979). Friction without such a memory could take no more from a particle than the momentum of its own sliding,
+far too little where soil slides at millimetres per second under a load. The body receives the opposite of both.
+Particles move with the soil, so the force changes smoothly as the body advances, while contact enforced at grid nodes
+comes and goes with every cell the body crosses.
 
 The grid spreads a push over the width of its B-splines, so a body acts about half a grid spacing further out than it
 is. Contact therefore begins at a margin of -1/2 grid spacings: when a particle's centre is that far inside.
+
+Bilateral contact holds the soil as well: within a layer half a grid spacing thick outside the place where the spring
+begins, the damper takes away the particle's normal velocity relative to the body, towards it or away from it.
 """
 
+from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-__all__ = ["body_struct", "contact"]
+from .shapes import shape_struct, signed_distance
+
+__all__ = ["HOLDING_LAYER", "ContactLaw", "body_struct", "contact"]
+
+HOLDING_LAYER = 0.5
+"""Thickness of the layer of soil that bilateral contact holds, outside the place where the spring begins [grid
+spacings]."""
+
+
+@dataclass(frozen=True)
+class ContactLaw:
+    """What the contact kernel is compiled for."""
+
+    shape: str = "box"
+    """Of the body: box | cylinder | mesh."""
+    bilateral: bool = False
+    """Soil in contact may not leave along the normal."""
+    free: bool = False
+    """The body's height is not prescribed but computed (axle.py)."""
 
 
 @cache
-def body_struct(real: type) -> type:
-    """Struct of a box-shaped body and its prescribed motion over the substeps of one frame."""
+def body_struct(real: type, law: ContactLaw) -> type:
+    """Struct of a body and its motion over the substeps of one frame."""
     vec3, quat = wp.types.vector(3, real), wp.types.quaternion(real)
+    Shape = shape_struct(real, law.shape)
 
     @wp.struct
     class Body:
-        half_size: vec3  # [m]
-        reach: real  # radius of the sphere around the box and everything in contact with it [m]
+        shape: Shape
+        reach: real  # radius of a sphere that a particle in contact cannot leave within a substep [m]
         margin: real  # distance from the surface at which contact begins, negative inside [m]
+        layer: real  # thickness of the layer that bilateral contact holds [m]
         stiffness: real  # of the spring [N/m]
         damping: real  # [N s/m]
         separation_speed: real  # no push on soil that leaves faster than this [m/s]
@@ -34,6 +61,10 @@ def body_struct(real: type) -> type:
         rotation: wp.array(dtype=quat)
         velocity: wp.array(dtype=vec3)  # pose difference over the substep [m/s]
         spin: wp.array(dtype=vec3)  # angular velocity, world frame [rad/s]
+        axle: wp.array(
+            dtype=wp.float64
+        )  # of a free body: height [m] and its rate [m/s] in place of the above
+        stick: wp.array(dtype=vec3)  # stretch of each particle's tangential spring, world frame [m]
         impulse: wp.array(
             dtype=vec3
         )  # [0] by the soil on the body [N s], [1] its moment about the centre of mass
@@ -42,57 +73,63 @@ def body_struct(real: type) -> type:
 
 
 @cache
-def contact(real: type, atomic: bool) -> SimpleNamespace:
-    """Warp function `push(x, v, mass, dt, s, body)` -> impulse on a particle [N s] in substep s, in precision `real`.
+def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
+    """Warp function `push(p, x, v, mass, dt, s, body)` in precision `real`: impulse on particle p in substep s [N s].
 
     The opposite impulse is added to the body; `atomic` is needed where many threads do so at once (a GPU).
     """
-    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    Body = body_struct(real)
+    vec3 = wp.types.vector(3, real)
+    Body = body_struct(real, law)
+    outward = signed_distance(real, law.shape)
+    bilateral, free = law.bilateral, law.free
 
     @wp.func
-    def outward(q: vec3, half: vec3):
-        # Outward normal of a box at a point in the body frame, and the signed distance as the fourth number.
-        d = vec3(wp.abs(q[0]) - half[0], wp.abs(q[1]) - half[1], wp.abs(q[2]) - half[2])
-        out = vec3(wp.max(d[0], real(0.0)), wp.max(d[1], real(0.0)), wp.max(d[2], real(0.0)))
-        distance = wp.length(out)
-        if distance > real(0.0):
-            n = out / distance
+    def add(body: Body, impulse: vec3, arm: vec3):
+        if wp.static(atomic):
+            wp.atomic_sub(body.impulse, 0, impulse)
+            wp.atomic_sub(body.impulse, 1, wp.cross(arm, impulse))
         else:
-            distance = wp.max(d[0], wp.max(d[1], d[2]))
-            n = vec3(real(1.0), real(0.0), real(0.0))
-            if d[1] > d[0] and d[1] >= d[2]:
-                n = vec3(real(0.0), real(1.0), real(0.0))
-            if d[2] > d[0] and d[2] > d[1]:
-                n = vec3(real(0.0), real(0.0), real(1.0))
-        return vec4(n[0] * wp.sign(q[0]), n[1] * wp.sign(q[1]), n[2] * wp.sign(q[2]), distance)
+            body.impulse[0] = body.impulse[0] - impulse
+            body.impulse[1] = body.impulse[1] - wp.cross(arm, impulse)
 
     @wp.func
-    def push(x: vec3, v: vec3, mass: real, dt: real, s: int, body: Body):
-        arm = x - body.position[s]
+    def push(p: int, x: vec3, v: vec3, mass: real, dt: real, s: int, body: Body):
+        centre = body.position[s]
+        if wp.static(free):
+            centre = vec3(centre[0], centre[1], real(body.axle[0]))
+        arm = x - centre
         impulse = vec3()
         if wp.length_sq(arm) < body.reach * body.reach:
             rotation = body.rotation[s]
-            found = outward(wp.quat_rotate_inv(rotation, arm), body.half_size)
+            found = outward(wp.quat_rotate_inv(rotation, arm), body.shape)
             overlap = body.margin - found[3]
-            if overlap > real(0.0):
+            stretch = vec3()
+            if overlap > -body.layer:
                 normal = wp.quat_rotate(rotation, vec3(found[0], found[1], found[2]))
-                relative = v - body.velocity[s] - wp.cross(body.spin[s], arm)
+                velocity = body.velocity[s]
+                if wp.static(free):
+                    velocity = vec3(velocity[0], velocity[1], real(body.axle[1]))
+                relative = v - velocity - wp.cross(body.spin[s], arm)
                 leaving = wp.dot(relative, normal)
-                if leaving < body.separation_speed:
-                    pressed = dt * (body.stiffness * overlap - body.damping * leaving)
-                    if pressed > real(0.0):
-                        impulse = pressed * normal
-                        sliding = relative - leaving * normal
-                        speed = wp.length(sliding)
-                        if speed > real(0.0):
-                            impulse -= wp.min(body.friction * pressed, mass * speed) / speed * sliding
-                        if wp.static(atomic):
-                            wp.atomic_sub(body.impulse, 0, impulse)
-                            wp.atomic_sub(body.impulse, 1, wp.cross(arm, impulse))
-                        else:
-                            body.impulse[0] = body.impulse[0] - impulse
-                            body.impulse[1] = body.impulse[1] - wp.cross(arm, impulse)
+                hold = wp.min(dt * body.damping, mass)  # dampers may stop the particle, not turn it back
+                pressed = real(0.0)
+                if wp.static(bilateral):
+                    pressed = dt * body.stiffness * wp.max(overlap, real(0.0)) - hold * leaving
+                elif leaving < body.separation_speed:
+                    pressed = wp.max(dt * (body.stiffness * overlap - body.damping * leaving), real(0.0))
+                if pressed != real(0.0):
+                    sliding = relative - leaving * normal
+                    stretch = body.stick[p]
+                    stretch += dt * sliding - wp.dot(stretch, normal) * normal
+                    grip = dt * body.stiffness * stretch + hold * sliding
+                    size = wp.length(grip)
+                    most = body.friction * wp.abs(pressed)
+                    if size > most:
+                        grip = grip * (most / size)
+                        stretch = grip / (dt * body.stiffness)
+                    impulse = pressed * normal - grip
+                    add(body, impulse, arm)
+            body.stick[p] = stretch
         return impulse
 
     return SimpleNamespace(push=push)

@@ -5,21 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar, get_args, get_type_hints
 
 import numpy as np
 
 from .arrangement import ARRANGEMENTS, arrange
-from .bodies import Plate
+from .axle import Axle
+from .bodies import Body
 from .errors import SceneError
 from .material import Material
-from .motion import MOTIONS, curved, ramp, sampled_poses
-from .rotation import about_y, rotate
+from .rotation import rotate
 from .walls import Walls
 
-__all__ = ["Bed", "Excavation", "Scene"]
+__all__ = ["Bed", "Scene"]
 
 INITIAL_STRESSES = ("geostatic", "none")
 
@@ -123,7 +123,15 @@ class Bed:
 
 @dataclass(frozen=True)
 class Scene:
-    """A soil bed, gravity, and for how long; subclasses add the body and its motion."""
+    """A soil bed, gravity, and for how long; subclasses add the body and its motion.
+
+    A subclass with a `kind` of its own is a kind of scene that `from_dict` knows.
+    """
+
+    kinds: ClassVar[dict[str, type[Scene]]] = {}
+    """Kind → class."""
+    bilateral: ClassVar[bool] = False
+    """Whether soil in contact with the body is held, too (contact.py); a kind of scene may make it a key."""
 
     name: str = "bed"
     kind: str = "bed"
@@ -147,6 +155,11 @@ class Scene:
     """Longest way of soil between two remaps [grid spacings]."""
     velocity_memory: float = 0.1
     """Time after which 63 % of the velocities that the grid does not resolve are gone [s]."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "kind" in cls.__dict__:
+            Scene.kinds[cls.kind] = cls
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.gravity) and self.gravity >= 0):
@@ -185,8 +198,13 @@ class Scene:
         return np.zeros_like(self.filled[0])
 
     @property
-    def plate(self) -> Plate | None:
-        """The body that moves through the soil, if any."""
+    def body(self) -> Body | None:
+        """The rigid body that touches the soil, if any."""
+        return None
+
+    @property
+    def axle(self) -> Axle | None:
+        """The body's vertical motion if it is free; None: all of it is prescribed."""
         return None
 
     @property
@@ -199,7 +217,10 @@ class Scene:
         return np.arange(self.frame_count) / self.frame_rate
 
     def poses_at(self, time: np.ndarray) -> np.ndarray:
-        """Pose of the body at any times [s]: centre of mass [m] and quaternion x, y, z, w; shape (T, 7)."""
+        """Pose of the body at any times [s]: centre of mass [m] and quaternion x, y, z, w; shape (T, 7).
+
+        Of a body with a free height the z of the start, which the solver replaces.
+        """
         return np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(np.atleast_1d(time)), 1))
 
     def body_poses(self) -> np.ndarray:
@@ -227,7 +248,17 @@ class Scene:
                 f"material.static_friction {self.material.static_friction:.3f} is so low that the bed at rest "
                 "already yields under its own weight (K0 condition)"
             )
-        return found
+        return found + (self.body.warnings() if self.body is not None else [])
+
+    def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
+        """What came out, in a few words; empty without a body.
+
+        Args:
+            force: by the soil on the body at the frames [N], shape (T, 3).
+            torque: about its centre of mass [N m], shape (T, 3).
+            poses: of the body, shape (T, 7).
+        """
+        return ""
 
     def to_dict(self) -> dict[str, Any]:
         """Everything that defines the scene, as plain nested data."""
@@ -236,154 +267,77 @@ class Scene:
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Scene:
         """The scene described by plain nested data, checked."""
-        kinds = {cls.kind: cls for cls in (Scene, *_subclasses(Scene))}
         kind = data.get("kind", "bed")
-        if kind not in kinds:
-            raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(kinds)}")
-        return _build(kinds[kind], data, "scene")
+        if kind not in Scene.kinds:
+            raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(Scene.kinds)}")
+        return _build(Scene.kinds[kind], data, "scene")
 
+    # --- checks for scenes with a body --------------------------------------------------------------------
 
-@dataclass(frozen=True)
-class Excavation(Scene):
-    """A plate cuts through the bed along x."""
-
-    name: str = "excavation"
-    kind: str = "excavation"
-    blade: Plate = field(default_factory=Plate)
-    depth: float = 0.05
-    """Depth the motion law reaches below the tip's starting height [m]."""
-    speed: float = 0.10
-    """Forward speed of the cut [m/s]."""
-    rake: float = 10.0
-    """Angle of the plate from vertical, tip leading [degrees]."""
-    motion: str = "curved"
-    """curved | ramp | rest | path."""
-    start: float = 0.10
-    """Where the tip starts, as a share of the bin's length."""
-    clearance: float = 0.00665
-    """Height of the tip above the surface at the start [m]; the cut is this much shallower than `depth`."""
-    path: tuple[tuple[float, ...], ...] | None = None
-    """For motion=path: rows t [s], x, y, z [m], qx, qy, qz, qw of the plate's centre of mass."""
-    body_grid: tuple[int, int] = (3, 5)
-    """Rows and columns of body nodes on the front face."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.motion not in MOTIONS:
-            raise SceneError(f"scene.motion is {self.motion!r}; allowed: {', '.join(MOTIONS)}")
-        if self.motion == "path":
-            if self.path is None:
-                raise SceneError(
-                    "scene.motion=path needs scene.path, a CSV file with columns t,x,y,z,qx,qy,qz,qw"
-                )
-            object.__setattr__(self, "path", tuple(tuple(float(v) for v in row) for row in self.path))
-        elif self.path is not None:
-            raise SceneError(
-                f"scene.path is given but scene.motion is {self.motion!r}; use scene.motion=path"
-            )
-        if not (math.isfinite(self.depth) and self.depth >= 0):
-            raise SceneError(f"scene.depth is {self.depth} m; it must be 0 or more")
-        if not (math.isfinite(self.speed) and self.speed > 0):
-            raise SceneError(f"scene.speed is {self.speed} m/s; it must be above 0")
-        if not -60.0 <= self.rake <= 60.0:
-            raise SceneError(f"scene.rake is {self.rake} degrees; allowed: -60 to 60")
-        if not 0.0 <= self.start <= 1.0:
-            raise SceneError(f"scene.start is {self.start}; allowed: 0 to 1, a share of the bin's length")
-        core = self.blade.half_size.min() + self.contact_margin * self.bed.spacing
+    def _check_thickness(self, what: str) -> None:
+        """A body must be thick enough for soil to be inside before it is pushed out."""
+        core = self.body.half_thickness + self.contact_margin * self.bed.spacing
         if core < 0.1 * self.bed.spacing:
             raise SceneError(
-                f"blade.thickness of {self.blade.thickness} m is too thin for a grid of {self.bed.spacing:g} m: "
+                f"{what} of {2.0 * self.body.half_thickness:g} m is too thin for a grid of {self.bed.spacing:g} m: "
                 "soil would pass through; use a smaller bed.spacing (at most half the thickness is good)"
             )
-        object.__setattr__(self, "body_grid", tuple(int(c) for c in self.body_grid))
-        if len(self.body_grid) != 2 or not all(1 <= c <= 100 for c in self.body_grid):
-            raise SceneError(f"scene.body_grid is {self.body_grid}; it needs two counts from 1 to 100")
-        self._check_inside()
 
-    @property
-    def plate(self) -> Plate:
-        return self.blade
-
-    def poses_at(self, time: np.ndarray) -> np.ndarray:
-        time = np.atleast_1d(np.asarray(time, dtype=float))
-        if self.motion == "path":
-            return sampled_poses(np.asarray(self.path), time)
-        rotation = about_y(-math.radians(self.rake))
-        lx, ly, _ = self.bed.size
-        start = np.array([self.start * lx, 0.5 * ly, self.clearance]) - rotate(rotation, self.blade.tip)
-        law = {"curved": curved, "ramp": ramp, "rest": lambda t, *_: np.zeros((len(t), 2))}[self.motion]
-        moved = law(time, self.depth, self.speed)
-        poses = np.empty((len(time), 7))
-        poses[:, :3] = start
-        poses[:, [0, 2]] += moved
-        poses[:, 3:] = rotation
-        return poses
-
-    def body_points(self) -> np.ndarray:
-        return self.blade.points(*self.body_grid)
-
-    def warnings(self) -> list[str]:
-        found = super().warnings()
-        if self.blade.thickness < 2.0 * self.bed.spacing:
-            found.append(
-                f"the plate is {self.blade.thickness / self.bed.spacing:.1f} grid spacings thick; below 2 the soil "
-                "behind it feels the soil in front of it"
-            )
-        return found
-
-    def _check_inside(self) -> None:
-        """The part of the plate that is below the surface must stay within the bin."""
-        time = self.times()
-        poses = self.poses_at(time)
-        points = rotate(poses[:, None, 3:], _edge_samples(self.blade)[None]) + poses[:, None, :3]
+    def _check_inside(self, what: str, remedy: str) -> None:
+        """The part of the body that is below the surface must stay within the bin."""
         lx, ly, lz = self.bed.size
-        below = points[..., 2] < 0.0
-        # Nothing is in the way of a plate at the sides of a channel, whose walls stand for more of the same soil.
+        # Nothing is in the way of a body at the sides of a channel, whose walls stand for more of the same soil.
         side = math.inf if self.bed.walls.kinds[1] in ("slip", "periodic") else 0.0
-        for axis, low, high, name in ((0, 0.0, lx, "x"), (1, -side, ly + side, "y"), (2, -lz, math.inf, "z")):
-            outside = below & ((points[..., axis] < low) | (points[..., axis] > high))
-            if outside.any():
-                frame, point = np.argwhere(outside)[0]
-                limits = f"{low:g} to {high:g} m" if math.isfinite(high) else f"at least {low:g} m"
-                raise SceneError(
-                    f"the plate leaves the bin at {time[frame]:.3f} s: {name} = {points[frame, point, axis]:.4f} m, "
-                    f"allowed {limits} below the surface; change scene.depth, speed, start, duration or the path"
-                )
+        outline = self.body.outline()
+        for time, pose in zip(self.times(), self.body_poses(), strict=True):
+            points = rotate(pose[3:], outline) + pose[:3]
+            below = points[:, 2] < 0.0
+            for axis, low, high, name in ((0, 0.0, lx, "x"), (1, -side, ly + side, "y"), (2, -lz, math.inf, "z")):
+                outside = below & ((points[:, axis] < low) | (points[:, axis] > high))
+                if outside.any():
+                    limits = f"{low:g} to {high:g} m" if math.isfinite(high) else f"at least {low:g} m"
+                    raise SceneError(
+                        f"{what} leaves the bin at {time:.3f} s: {name} = {points[outside, axis][0]:.4f} m, "
+                        f"allowed {limits} below the surface; {remedy}"
+                    )
 
 
-def _edge_samples(plate: Plate, count: int = 9) -> np.ndarray:
-    """Points along the plate's four long edges and corners, body frame [m]: where it can touch a wall."""
-    hx, hy, hz = plate.half_size
-    return np.array(
-        [[sx * hx, sy * hy, z] for sx in (-1, 1) for sy in (-1, 1) for z in np.linspace(-hz, hz, count)]
-    )
-
-
-def _subclasses(cls: type) -> list[type]:
-    return [c for sub in cls.__subclasses__() for c in (sub, *_subclasses(sub))]
+Scene.kinds["bed"] = Scene
 
 
 def _build(cls: type, data: dict[str, Any], where: str) -> Any:
     """A dataclass from nested plain data, refusing keys it does not have."""
     if not isinstance(data, dict):
         raise SceneError(f"{where} is {data!r}; it must be a group of keys")
-    nested = {"bed": Bed, "material": Material, "blade": Plate, "walls": Walls}
+    hints = get_type_hints(cls)
     allowed = {f.name: f for f in fields(cls)}
     unknown = sorted(set(data) - set(allowed))
     if unknown:
         raise SceneError(f"{where} has no key {unknown[0]!r}; allowed: {', '.join(sorted(allowed))}")
     values = {}
     for key, value in data.items():
-        if key in nested:
-            value = _build(nested[key], value, f"{where}.{key}")
-        elif allowed[key].type == "float":
+        if is_dataclass(hints[key]):
+            value = _build(hints[key], value, f"{where}.{key}")
+        elif shapes := {c.shape: c for c in get_args(hints[key]) if is_dataclass(c)}:
+            value = _build(_chosen(shapes, value, f"{where}.{key}"), value, f"{where}.{key}")
+        elif hints[key] is float or (hints[key] == float | None and value is not None):
             value = _number(value, f"{where}.{key}", float)
-        elif allowed[key].type == "int":
+        elif hints[key] is bool and not isinstance(value, bool):
+            raise SceneError(f"{where}.{key} is {value!r}; allowed: true, false")
+        elif hints[key] is int:
             value = _number(value, f"{where}.{key}", int)
         elif isinstance(value, list):
             value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
         values[key] = value
     return cls(**values)
+
+
+def _chosen(shapes: dict[str, type], value: Any, where: str) -> type:
+    """The class of a body given as nested data with the key `shape`."""
+    shape = value.get("shape") if isinstance(value, dict) else None
+    if shape not in shapes:
+        raise SceneError(f"{where}.shape is {shape!r}; allowed: {', '.join(shapes)}")
+    return shapes[shape]
 
 
 def _number(value: Any, where: str, kind: type) -> Any:

@@ -18,7 +18,7 @@ import numpy as np
 
 from sgns.errors import UserError
 
-__all__ = ["PublishedRun", "excavation_case", "read_published"]
+__all__ = ["PublishedRun", "excavation_case", "read_published", "wheel_case"]
 
 _SUBSPACE = 6  # the particle type of a subspace node; all others are nodes of the rigid body
 _MARGIN = 0.1  # the authors' bin starts at this coordinate on each axis [m]
@@ -27,6 +27,17 @@ DEPTHS = (0.02, 0.04, 0.05, 0.08, 0.10)  # [m]
 SPEEDS = (0.01, 0.04, 0.08, 0.10, 0.15)  # [m/s]
 RAKES = (0.0, 3.8, 10.0, 30.8, 45.0)  # [degrees]
 MOTIONS = ("ramp", "curved")
+
+GRAVITIES = (1.62, 3.72, 9.81)  # [m/s^2]
+SLIPS = (
+    0.2,
+    5.0 / 13.0,
+    0.7,
+)  # forward speeds 15.60, 12.00, 5.85 mm/s at a rim speed of 19.5; named 20, 40, 70 %
+LOADS = (100.0, 164.0, 225.0)  # [N]
+DIAMETERS = (0.05, 0.15, 0.30)  # [m]
+WIDTHS = {0.05: 0.25 / 3, 0.15: 0.25 / 3, 0.30: 0.125}  # of each diameter [m]
+ANGLES = (30.0, 37.0, 43.0)  # friction angles [degrees]
 
 
 @dataclass(frozen=True)
@@ -41,6 +52,9 @@ class PublishedRun:
     """Subspace nodes in the authors' basis and axes (the basis itself is not published), shape (T, r, 3)."""
     force: np.ndarray
     """By the soil on the body [N], at the end of the frame, shape (T, 3)."""
+    context: np.ndarray
+    """Of a wheel: gravity [m/s^2], friction angle [degrees] and load [N] in every frame, shape (T, 3); of a blade:
+    shape (T, 0)."""
 
 
 def excavation_case(case: int) -> dict[str, float | str]:
@@ -49,6 +63,18 @@ def excavation_case(case: int) -> dict[str, float | str]:
     if not 1 <= case <= len(grid):
         raise UserError(f"published excavation case {case}: allowed are 1 to {len(grid)}")
     return dict(zip(("depth", "speed", "rake", "motion"), grid[case - 1], strict=True))
+
+
+def wheel_case(case: int) -> dict[str, float]:
+    """Gravity [m/s^2], slip, load [N], diameter [m], friction angle [degrees] and width [m] of a published wheel run,
+    numbered from 1. The 5 cm wheel carries a ninth of the loads."""
+    grid = list(product(GRAVITIES, SLIPS, LOADS, DIAMETERS, ANGLES))
+    if not 1 <= case <= len(grid):
+        raise UserError(f"published wheel case {case}: allowed are 1 to {len(grid)}")
+    found = dict(zip(("gravity", "slip", "load", "diameter", "friction_angle"), grid[case - 1], strict=True))
+    if found["diameter"] == DIAMETERS[0]:
+        found["load"] /= 9.0
+    return found | {"width": WIDTHS[found["diameter"]]}
 
 
 def read_published(
@@ -77,16 +103,19 @@ def read_published(
 
 
 def _run(case: int, record: bytes, bin_size: tuple[float, float, float]) -> PublishedRun:
-    context, frames = _sequence_example(record)
-    types = np.frombuffer(context["particle_type"], dtype="<i8")
+    about, frames = _sequence_example(record)
+    types = np.frombuffer(about["particle_type"], dtype="<i8")
     nodes = np.array([np.frombuffer(f, dtype="<f4") for f in frames["position"]], dtype=float)
     nodes = nodes.reshape(len(nodes), len(types), 3)[1:]
     force = np.array([np.frombuffer(f, dtype="<f4") for f in frames["force"]], dtype=float).reshape(-1, 3)[1:]
+    context = [np.frombuffer(f, dtype="<f4") for f in frames.get("step_context", [b""] * (len(nodes) + 1))]
     soil = types == _SUBSPACE
     lx, _, lz = bin_size
     x, y, z = np.moveaxis(nodes[:, ~soil], -1, 0)
     body = np.stack([_MARGIN + lx - x, z - _MARGIN, y - _MARGIN - lz], axis=-1)
-    return PublishedRun(case, body, nodes[:, soil], force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0])
+    return PublishedRun(
+        case, body, nodes[:, soil], force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0], np.array(context, dtype=float)[1:]
+    )
 
 
 def _records(data: bytes) -> Iterator[bytes]:

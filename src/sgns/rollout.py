@@ -23,7 +23,15 @@ if TYPE_CHECKING:
     from mpm_warp import Scene
     from sgns.simulator import Rollout, Simulator
 
-__all__ = ["RolloutTiming", "main", "require_known_bed", "rollout_scene", "single_thread", "write_rollout"]
+__all__ = [
+    "RolloutTiming",
+    "main",
+    "require_known_bed",
+    "require_prescribed_body",
+    "rollout_scene",
+    "single_thread",
+    "write_rollout",
+]
 
 log = logging.getLogger(__name__)
 
@@ -165,6 +173,15 @@ def require_known_bed(simulator: Simulator, scene: Scene, checkpoint: str | Path
         )
 
 
+def require_prescribed_body(scene: Scene) -> None:
+    """Refuses a scene whose body moves as the soil lets it: a network is told the body's path."""
+    if scene.axle is not None:
+        raise UserError(
+            f"scene.kind is {scene.kind}: its height follows from the soil, and a network can only follow a path that "
+            "is given; roll out a scene with a prescribed body, or simulate this one: sgns simulate"
+        )
+
+
 def bed_differences(known: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     """Names the values of two scenes' beds that differ, the checkpoint's first."""
     named = [
@@ -209,6 +226,7 @@ def main(cfg: DictConfig) -> float:
     from sgns.simulator import Simulator
 
     scene = scene_from_config(cfg)
+    require_prescribed_body(scene)
     simulator = Simulator.load(cfg.checkpoint, device=cfg.device)
     require_known_bed(simulator, scene, cfg.checkpoint)
     ignored = unlearned(simulator.scene, scene.to_dict())

@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -70,12 +69,12 @@ def main(cfg: DictConfig) -> float | None:
             progress=bar.update,
         )
     with Run(output) as run:
-        force = run.force[1:]
         every = scene.bed.store_every
         kept = f" (one of every {every} recorded)" if every > 1 else ""
         count = run.extra["particles_simulated"]
         log.info("%s: %d particles%s, %d frames", output, count, kept, run.frame_count)
-    log.info("mean draft %.1f N, vertical force %.1f N", -np.mean(force[:, 0]), np.mean(force[:, 2]))
+        if words := scene.summary(run.force, run.torque, run.pose):
+            log.info("%s", words)
     log.info(
         "%.1f s for %.2f simulated s: %.2f s per simulated second, %.2f M particle-steps/s on %s",
         timing.wall_time,

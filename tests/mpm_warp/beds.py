@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpm_warp import Bed, Plate, Scene
-from mpm_warp.scene import Excavation
+from mpm_warp import Bed, Excavation, Plate, Scene
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,9 @@ import struct
 import numpy as np
 import pytest
 
+from mpm_warp import Wheel
 from sgns.errors import UserError
-from sgns.published import excavation_case, read_published
+from sgns.published import excavation_case, read_published, wheel_case
 
 BIN = (0.8, 0.6, 0.15)
 
@@ -30,13 +31,16 @@ def feature(raw):
     return field(1, field(1, raw))
 
 
-def record(frames, types, force):
+def record(frames, types, force, contexts=None):
     entry = lambda key, value: field(1, field(1, key.encode()) + field(2, value))  # noqa: E731
     context = entry("particle_type", feature(np.asarray(types, "<i8").tobytes())) + entry(
         "key", field(3, field(1, b""))
     )
     series = lambda rows: b"".join(field(1, feature(np.asarray(r, "<f4").tobytes())) for r in rows)  # noqa: E731
-    return field(1, context) + field(2, entry("position", series(frames)) + entry("force", series(force)))
+    lists = entry("position", series(frames)) + entry("force", series(force))
+    if contexts is not None:
+        lists += entry("step_context", series(contexts))
+    return field(1, context) + field(2, lists)
 
 
 def write(folder, records, cases):
@@ -56,6 +60,7 @@ def test_axes_signs_and_the_doubled_first_frame(tmp_path):
     np.testing.assert_allclose(run.latent[:, 0], [[1, 2, 3], [4, 5, 6]])
     # A force that resists the blade is positive there and negative here.
     np.testing.assert_allclose(run.force, [[-10, 30, 20], [-11, 31, 21]])
+    assert run.context.shape == (2, 0)
 
 
 def test_case_numbers():
@@ -63,6 +68,37 @@ def test_case_numbers():
     assert excavation_case(1) == {"depth": 0.02, "speed": 0.01, "rake": 0.0, "motion": "ramp"}
     with pytest.raises(UserError, match="1 to 250"):
         excavation_case(251)
+
+
+def test_wheel_runs_say_their_gravity_friction_and_load(tmp_path):
+    # A wheel is predicted there (type 0); a force against its motion is positive there, a drawbar pull negative.
+    frames = [[[0.38, 0.31, 0.195], [1.0, 2.0, 3.0]]] * 3
+    context = [[1.62, 37.0, 164.0]] * 3
+    write(tmp_path, [record(frames, [0, 6], [[-14, 41, -0.6]] * 3, context)], [44])
+    (run,) = read_published(tmp_path, (0.40, 0.19, 0.0583))
+    np.testing.assert_allclose(run.body_points[0, 0], [0.12, 0.095, 0.1517], atol=1e-6)
+    np.testing.assert_allclose(run.force[0], [14, -0.6, 41], atol=1e-6)
+    np.testing.assert_allclose(run.context, [[1.62, 37.0, 164.0]] * 2, rtol=1e-6)
+    case = wheel_case(run.case)
+    assert [case[key] for key in ("gravity", "friction_angle", "load")] == [1.62, 37.0, 164.0]
+
+
+def test_wheel_case_numbers():
+    assert wheel_case(1) == pytest.approx(
+        {
+            "gravity": 1.62,
+            "slip": 0.2,
+            "load": 100 / 9,
+            "diameter": 0.05,
+            "friction_angle": 30.0,
+            "width": 0.25 / 3,
+        }
+    )
+    assert wheel_case(203)["diameter"] == 0.15
+    assert 1e3 * Wheel(**wheel_case(203)).speed == pytest.approx(12.0)
+    assert wheel_case(243)["width"] == 0.125
+    with pytest.raises(UserError, match="1 to 243"):
+        wheel_case(0)
 
 
 @pytest.mark.parametrize("damage", ["missing", "short", "foreign", "count"])

@@ -1,0 +1,140 @@
+"""The scene's body on the device: its shape, its motion through a frame, and what the soil gave it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from .axle import axle_step, stable_step
+from .contact import HOLDING_LAYER, ContactLaw, body_struct
+from .errors import SolverStopped
+from .rotation import angular_velocity
+from .shapes import shape_data
+
+if TYPE_CHECKING:
+    from .scene import Scene
+
+__all__ = ["RigidBody", "contact_spring", "longest_step"]
+
+
+def contact_spring(scene: Scene, volume: float) -> tuple[float, float]:
+    """Stiffness [N/m] and damping [N s/m] of the spring between the body and a particle of `volume` [m^3].
+
+    As stiff as a layer of soil one particle thick; the damping is critical.
+    """
+    material = scene.material
+    stiffness = material.wave_speed**2 * material.bulk_density * volume ** (1.0 / 3.0)
+    return stiffness, 2.0 * math.sqrt(stiffness * material.bulk_density * volume)
+
+
+def longest_step(scene: Scene) -> float:
+    """The substep [s] that a free body's mass allows; infinite for a prescribed one.
+
+    Counted as if the whole lower half of the box around the body touched a particle per (particle spacing)^2.
+    """
+    if scene.axle is None:
+        return math.inf
+    volume = scene.bed.filled[1]
+    hx, hy, hz = scene.body.half_size
+    area = 4.0 * hx * hy + 4.0 * hz * (hx + hy)
+    return stable_step(scene.axle.mass, area / volume ** (2.0 / 3.0), *contact_spring(scene, volume))
+
+
+class RigidBody:
+    """Arrays and launches of one body.
+
+    Args:
+        scene: with a body.
+        real: precision.
+        device: where it lives.
+        substeps: per frame.
+        dt: substep [s].
+        particles: how many there are.
+        volume: of a particle [m^3].
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        real: type,
+        device: wp.Device,
+        substeps: int,
+        dt: float,
+        particles: int,
+        volume: float,
+    ) -> None:
+        vec3 = wp.types.vector(3, real)
+        self.scene, self.substeps, self.dt = scene, substeps, dt
+        shape, axle = scene.body, scene.axle
+        self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None)
+        data = body_struct(real, self.law)()
+        h = scene.bed.spacing
+        data.margin = scene.contact_margin * h
+        data.layer = HOLDING_LAYER * h if scene.bilateral else 0.0
+        outermost = max(0.0, scene.contact_margin * h + float(data.layer))
+        data.shape, self._mesh = shape_data(shape, real, outermost, device)
+        data.reach = shape.reach + math.sqrt(3.0) * outermost + h
+        data.friction = shape.friction
+        data.stiffness, data.damping = contact_spring(scene, volume)
+        data.separation_speed = 0.01 * scene.material.wave_speed
+        data.position = wp.zeros(substeps, dtype=vec3, device=device)
+        data.rotation = wp.zeros(substeps, dtype=wp.types.quaternion(real), device=device)
+        data.velocity = wp.zeros(substeps, dtype=vec3, device=device)
+        data.spin = wp.zeros(substeps, dtype=vec3, device=device)
+        data.stick = wp.zeros(particles, dtype=vec3, device=device)
+        data.impulse = wp.zeros(2, dtype=vec3, device=device)
+        self.launches: list[wp.Launch] = []
+        """What has to run in every substep after the soil's push was added up."""
+        self._axle: wp.array | None = None
+        if axle is not None:
+            height = scene.poses_at(np.zeros(1))[0, 2]
+            self._axle = wp.array([height, 0.0, 0.0], dtype=wp.float64, device=device)
+            data.axle = self._axle
+            values = [self._axle, data.impulse, dt, axle.mass, scene.gravity, axle.damping]
+            self.launches.append(wp.launch(axle_step(real), 1, values, device=device, record_cmd=True))
+        self.data = data
+        """The struct that kernels take."""
+
+    def start_frame(self, frame: int) -> None:
+        """Load the prescribed motion of the frame that begins at `frame`, and forget the impulse."""
+        self.data.impulse.zero_()
+        if self._axle is not None:
+            self._axle[2:].zero_()
+        poses = self.scene.poses_at((frame * self.substeps + np.arange(self.substeps + 1)) * self.dt)
+        velocity = np.diff(poses[:, :3], axis=0) / self.dt
+        spin = angular_velocity(poses[:-1, 3:], poses[1:, 3:], self.dt)
+        for array, values in (
+            (self.data.position, poses[:-1, :3]),
+            (self.data.rotation, poses[:-1, 3:]),
+            (self.data.velocity, velocity),
+            (self.data.spin, spin),
+        ):
+            array.assign(values)
+
+    def pose(self, time: float) -> np.ndarray:
+        """Centre of mass [m] and quaternion now, at `time` [s], shape (7,)."""
+        pose = self.scene.poses_at(np.array([time]))[0]
+        if self._axle is not None:
+            pose[2] = self._axle.numpy()[0]
+        return pose
+
+    def check(self, time: float) -> None:
+        """Stop where a free body's motion means nothing any more.
+
+        Raises:
+            SolverStopped: it reached the floor, or its height is not finite.
+        """
+        if self._axle is None:
+            return
+        lowest = self._axle.numpy()[0] - self.scene.body.half_size[2]
+        if not lowest > -self.scene.bed.size[2]:
+            raise SolverStopped(
+                f"the body reached the floor of the bin by {time:.3f} s: make scene.bed.size deeper or the load smaller"
+            )
+
+    def impulse(self) -> np.ndarray:
+        """By the soil on the body since the frame began [N s], and its moment [N m s], shape (2, 3)."""
+        return self.data.impulse.numpy().astype(float)

@@ -1,0 +1,121 @@
+"""Bodies and mesh files: what they are, what they refuse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from meshes import BOX_FACES, box_corners, box_triangles, write_obj, write_stl, write_text_stl
+
+from mpm_warp import Box, Cylinder, MeshBody, Plate, SceneError
+
+SIZE = (0.1, 0.2, 0.3)
+CORNERS = box_corners(SIZE, (5.0, -2.0, 1.0))
+
+
+@pytest.mark.parametrize("form", ["obj", "stl", "text stl"])
+def test_a_mesh_is_about_its_centre_of_mass(tmp_path, form):
+    writers = {
+        "obj": lambda: write_obj(tmp_path / "a.obj", CORNERS, BOX_FACES),
+        "stl": lambda: write_stl(tmp_path / "a.stl", CORNERS, box_triangles()),
+        "text stl": lambda: write_text_stl(tmp_path / "a.STL", CORNERS, box_triangles()),
+    }
+    vertices, triangles, turned = MeshBody(file=str(writers[form]())).mesh
+    assert vertices.shape == (8, 3)
+    assert triangles.shape == (12, 3)
+    assert not turned
+    np.testing.assert_allclose(np.abs(vertices), np.tile(np.array(SIZE) / 2, (8, 1)), atol=1e-6)
+
+
+def test_an_uneven_mesh_has_its_volumes_centre():
+    """A pyramid's centre of mass lies a quarter of its height above its base."""
+    from mpm_warp.mesh_file import closed_mesh
+
+    vertices = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 2]]) + 7.0
+    faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    about, _, turned = closed_mesh(vertices, faces, "pyramid")
+    assert not turned
+    np.testing.assert_allclose(about[4], [0, 0, 1.5], atol=1e-12)
+    # Inside out: turned, and everything else the same.
+    again, outwards, turned = closed_mesh(vertices, faces[:, ::-1], "pyramid")
+    assert turned
+    np.testing.assert_allclose(again, about, atol=1e-12)
+    np.testing.assert_array_equal(outwards, faces)
+
+
+def test_a_mesh_that_was_turned_says_so(tmp_path):
+    file = write_stl(tmp_path / "in.stl", CORNERS, box_triangles()[:, ::-1])
+    assert "faced inwards" in MeshBody(file=str(file)).warnings()[0]
+
+
+@pytest.mark.parametrize(
+    ("faces", "words"),
+    [
+        (BOX_FACES[1:], "not closed: 4 of 17 edges"),
+        ([BOX_FACES[0][::-1], *BOX_FACES[1:]], "do not all face the same way"),
+        ([], "holds no triangles"),
+        ([(0, 1, 9)], "not a good OBJ file: a face names a vertex that is not there"),
+    ],
+)
+def test_bad_meshes(tmp_path, faces, words):
+    file = write_obj(tmp_path / "bad.obj", CORNERS, faces)
+    with pytest.raises(SceneError, match=words):
+        MeshBody(file=str(file))
+
+
+def test_bad_mesh_files(tmp_path):
+    cut_short = write_stl(tmp_path / "short.stl", CORNERS, box_triangles())
+    cut_short.write_bytes(b"\0" * 80 + cut_short.read_bytes()[80:-7])
+    with pytest.raises(SceneError, match="cut short"):
+        MeshBody(file=str(cut_short))
+    with pytest.raises(SceneError, match=r"allowed: \*.stl, \*.obj"):
+        (tmp_path / "a.ply").write_text("ply")
+        MeshBody(file=str(tmp_path / "a.ply"))
+    with pytest.raises(SceneError, match="cannot read"):
+        MeshBody(file=str(tmp_path / "none.stl"))
+    with pytest.raises(SceneError, match=r"tool\.file is missing"):
+        MeshBody()
+    flat = write_obj(tmp_path / "flat.obj", CORNERS * [1, 1, 0], BOX_FACES)
+    with pytest.raises(SceneError, match=r"tool\.file"):
+        MeshBody(file=str(flat))
+
+
+def test_a_scene_knows_whether_its_mesh_is_the_same(tmp_path):
+    file = write_obj(tmp_path / "box.obj", CORNERS, BOX_FACES)
+    body = MeshBody(file=str(file))
+    assert MeshBody(file=str(file), digest=body.digest) == body
+    write_obj(file, CORNERS * 2.0, BOX_FACES)
+    with pytest.raises(SceneError, match="is not the file this scene was made with"):
+        MeshBody(file=str(file), digest=body.digest)
+
+
+def test_nodes_lie_on_the_bodies(tmp_path):
+    wheel = Cylinder(diameter=0.3, width=0.125)
+    points = wheel.points()
+    assert points.shape == (16, 3)
+    np.testing.assert_allclose(np.hypot(points[:, 0], points[:, 2]), 0.15)
+    np.testing.assert_allclose(np.abs(points[:, 1]), 0.0625)
+    np.testing.assert_allclose(points.mean(axis=0), 0.0, atol=1e-12)
+    assert Box().points().shape == (8, 3)
+    file = write_obj(tmp_path / "box.obj", CORNERS, BOX_FACES)
+    assert np.unique(MeshBody(file=str(file)).points().round(9), axis=0).shape == (8, 3)
+
+
+@pytest.mark.parametrize(
+    ("cls", "values", "words"),
+    [
+        (Box, {"size": (0.1, 0.1)}, "three lengths"),
+        (Box, {"friction": -1.0}, "tool.friction"),
+        (Cylinder, {"diameter": 0.0}, "tool.diameter is 0.0; it must be above 0 m"),
+        (Cylinder, {"grousers": 3}, "tool.grouser_height"),
+        (Cylinder, {"grouser_height": 0.01}, "need tool.grousers above 0"),
+        (
+            Cylinder,
+            {"grousers": 30, "grouser_height": 0.01, "grouser_thickness": 0.02},
+            "make them thinner or fewer",
+        ),
+        (Plate, {"width": float("nan")}, "blade.width"),
+    ],
+)
+def test_what_bodies_refuse(cls, values, words):
+    with pytest.raises(SceneError, match=words):
+        cls(**values)
