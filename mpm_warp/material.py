@@ -6,13 +6,19 @@ import math
 from dataclasses import dataclass
 
 from .errors import SceneError
+from .friction import FRICTION_MAPS, static_friction
 
-__all__ = ["Material"]
+__all__ = ["FLUIDITY_AT_WALLS", "RATE_LAWS", "Material"]
+
+RATE_LAWS = ("saturating", "linear")
+FLUIDITY_AT_WALLS = ("zero", "free")
+FRICTION_RANGE = 0.2016
+"""mu_2 - mu_s of the paper's sand: what the limit friction is set above a static friction that reaches it."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """Dry granular soil: Hencky elasticity with rate-dependent friction mu(I).
+    """Dry granular soil: Hencky elasticity with rate-dependent friction mu(I) and its fluidity.
 
     The defaults are the sand of the paper's excavation runs (A. Haeri, K. Skonieczny) except for the
     stiffness: 1 MPa instead of 15 MPa, which makes the explicit step almost four times longer.
@@ -29,14 +35,49 @@ class Material:
     grain_diameter: float = 3.0e-4
     """Grain diameter d [m]."""
     static_friction: float = 0.76
-    """mu_s: ratio of shear stress to pressure below which the soil does not flow [-]."""
+    """mu_s: ratio of shear stress to pressure below which the soil does not flow [-]. Follows from
+    `friction_angle` where that is given."""
     limit_friction: float = 0.9616
     """mu_2: the ratio approached in very fast flow [-]."""
     reference_inertial_number: float = 0.278
-    """I_0 of the saturating law mu(I) = mu_s + (mu_2 - mu_s) / (1 + I_0 / I) [-]."""
+    """I_0 of the rate law [-]."""
+    rate_law: str = "saturating"
+    """saturating: mu(I) = mu_s + (mu_2 - mu_s) / (1 + I_0 / I); linear: mu(I) = mu_s + (mu_2 - mu_s) I / I_0."""
+    friction_angle: float | None = None
+    """Angle of internal friction [degrees]; None: `static_friction` holds."""
+    friction_map: str = "tan"
+    """How the angle becomes mu_s: tan | sin | triaxial (friction.py)."""
+    nonlocal_amplitude: float = 0.48
+    """A: reach of cooperative flow in grain diameters [-]. Used by the effect `nonlocality`."""
+    fluidity_time: float = 2.0e-4
+    """t_0 of the fluidity's own dynamics [s]. Used by the effect `fluidity`."""
+    fluidity_at_walls: str = "zero"
+    """zero: no flow at rough floor and walls; free: no gradient across them. Used by the effect `nonlocality`."""
 
     def __post_init__(self) -> None:
-        positive = ("youngs_modulus", "grain_density", "grain_diameter", "reference_inertial_number")
+        if self.friction_map not in FRICTION_MAPS:
+            static_friction(45.0, self.friction_map)
+        if self.friction_angle is not None:
+            object.__setattr__(
+                self, "static_friction", static_friction(self.friction_angle, self.friction_map)
+            )
+            if self.static_friction >= self.limit_friction:
+                object.__setattr__(self, "_limit_given", self.limit_friction)
+                object.__setattr__(self, "limit_friction", self.static_friction + FRICTION_RANGE)
+        for name, allowed in (("rate_law", RATE_LAWS), ("fluidity_at_walls", FLUIDITY_AT_WALLS)):
+            if getattr(self, name) not in allowed:
+                raise SceneError(f"material.{name} is {getattr(self, name)!r}; allowed: {', '.join(allowed)}")
+        if not (math.isfinite(self.nonlocal_amplitude) and self.nonlocal_amplitude >= 0.0):
+            raise SceneError(
+                f"material.nonlocal_amplitude is {self.nonlocal_amplitude}; it must be 0 or more"
+            )
+        positive = (
+            "youngs_modulus",
+            "grain_density",
+            "grain_diameter",
+            "reference_inertial_number",
+            "fluidity_time",
+        )
         for name in positive:
             value = getattr(self, name)
             if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
@@ -54,6 +95,23 @@ class Material:
                 f"material.limit_friction is {self.limit_friction}; it must be above material.static_friction "
                 f"({self.static_friction})"
             )
+
+    def warnings(self) -> list[str]:
+        """What a user should know about this soil before it is used."""
+        found = []
+        if hasattr(self, "_limit_given"):
+            found.append(
+                f"material.friction_angle {self.friction_angle:g} degrees ({self.friction_map}) gives a static "
+                f"friction of {self.static_friction:.3f}, not below material.limit_friction "
+                f"{self._limit_given:.3f}; the limit is raised to {self.limit_friction:.3f} "
+                f"(the static one + {FRICTION_RANGE})"
+            )
+        if self.rest_stress_yields:
+            found.append(
+                f"material.static_friction {self.static_friction:.3f} is so low that the bed at rest "
+                "already yields under its own weight (K0 condition)"
+            )
+        return found
 
     @property
     def bulk_density(self) -> float:

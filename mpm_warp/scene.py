@@ -155,13 +155,7 @@ class Scene:
 
     def warnings(self) -> list[str]:
         """What a user should know about this scene before it runs."""
-        found = []
-        if self.material.rest_stress_yields:
-            found.append(
-                f"material.static_friction {self.material.static_friction:.3f} is so low that the bed at rest "
-                "already yields under its own weight (K0 condition)"
-            )
-        return found
+        return self.material.warnings()
 
     def to_dict(self) -> dict[str, Any]:
         """Everything that defines the scene, as plain nested data."""
@@ -304,7 +298,7 @@ def _build(cls: type, data: dict[str, Any], where: str) -> Any:
     for key, value in data.items():
         if key in nested:
             value = _build(nested[key], value, f"{where}.{key}")
-        elif allowed[key].type == "float":
+        elif allowed[key].type == "float" or (allowed[key].type == "float | None" and value is not None):
             value = _number(value, f"{where}.{key}", float)
         elif allowed[key].type == "int":
             value = _number(value, f"{where}.{key}", int)

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .constitutive import soil_struct
 from .contact import body_struct
 from .effects import Effects
 from .errors import SceneError, SolverStopped
 from .grid import grid_step, grid_struct
 from .rotation import angular_velocity, rotate
 from .scene import Scene
+from .soil import soil_parameters
 from .start import start_warp
 from .transfer import transfer
 
@@ -142,12 +142,9 @@ class Solver:
         grid.speed_limit = h / self.time_step
         self._grid = grid
 
-        soil = soil_struct(real)()
-        soil.shear_modulus, soil.bulk_modulus = material.shear_modulus, material.bulk_modulus
-        soil.static_friction, soil.limit_friction = material.static_friction, material.limit_friction
-        soil.reference_rate = material.reference_inertial_number / (
-            material.grain_diameter * math.sqrt(material.grain_density)
-        )
+        soil = soil_parameters(real, material, max(bed.size), self.effects.fluidity)
+        if self.effects.fluidity:
+            soil.g = wp.zeros(n, dtype=real, device=self.device)
         self._soil = soil
 
         ln_j = np.zeros(n)

@@ -1,7 +1,8 @@
 """Particle-grid transfers with quadratic B-splines (APIC / MLS), and the material update between them.
 
 Both kernels visit the 27 nodes around a particle. Node (i, j, k) is entry (i ny + j) nz + k of a flat array of
-4-vectors: momentum and mass on the way to the grid, velocity (and an unused number) on the way back.
+4-vectors: momentum and mass on the way to the grid, velocity on the way back, with what the effect `nonlocality`
+adds to the fluidity as the fourth number.
 """
 
 from functools import cache
@@ -9,10 +10,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .constitutive import constitutive, soil_struct
+from .constitutive import constitutive
 from .contact import body_struct, contact
 from .effects import Effects
 from .grid import grid_struct
+from .soil import soil_struct
+from .splines import splines
 
 __all__ = ["transfer"]
 
@@ -27,30 +30,11 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
     vec4 = wp.types.vector(4, real)
     law = constitutive(real, effects)
     vec6, mat33 = law.vec6, law.mat33
-    Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real)
+    Soil, Grid, Body = soil_struct(real, effects.fluidity), grid_struct(real), body_struct(real)
     push = contact(real, atomic).push
     update, kirchhoff = law.update, law.kirchhoff
-
-    @wp.func
-    def base_and_offset(x: vec3, grid: Grid):
-        # Lowest of the three nodes per axis, and the particle's distance from it in cells, in [0.5, 1.5).
-        # The index is bounded: a stray position must not write outside the grid (it would end the process).
-        g = (x - grid.origin) * grid.inverse_spacing
-        i = wp.clamp(int(g[0] - real(0.5)), 0, grid.nx - 3)
-        j = wp.clamp(int(g[1] - real(0.5)), 0, grid.ny - 3)
-        k = wp.clamp(int(g[2] - real(0.5)), 0, grid.nz - 3)
-        return wp.vec3i(i, j, k), g - vec3(real(i), real(j), real(k))
-
-    @wp.func
-    def weights(f: real):
-        a = real(1.5) - f
-        b = f - real(1.0)
-        c = f - real(0.5)
-        return vec3(real(0.5) * a * a, real(0.75) - b * b, real(0.5) * c * c)
-
-    @wp.func
-    def moments(w: vec3, f: real):
-        return vec3(-f * w[0], (real(1.0) - f) * w[1], (real(2.0) - f) * w[2])
+    spline = splines(real)
+    base_and_offset, weights, moments = spline.base_and_offset, spline.weights, spline.moments
 
     @wp.func
     def deposit(nodes: wp.array(dtype=vec4), at: int, amount: vec4):
@@ -165,7 +149,15 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         )  # fmt: skip
         slow = wp.length_sq(speed) < grid.speed_limit * grid.speed_limit  # false for a NaN, too
         if inside and slow:
-            state = update(e[p], ln_j[p], grid.dt * gradient, grid.dt, soil)
+            # What `update` means by its last number; total[3] is what cooperative flow adds.
+            g_now = real(0.0)
+            if wp.static(effects.nonlocality):
+                g_now = total[3]
+            if wp.static(effects.fluidity):
+                g_now = wp.max(soil.g[p] + g_now, real(0.0))
+            state = update(e[p], ln_j[p], grid.dt * gradient, grid.dt, soil, g_now)
+            if wp.static(effects.fluidity):
+                soil.g[p] = state[7]
             x[p] = moved
             v[p] = speed
             c[p] = gradient
