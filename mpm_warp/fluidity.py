@@ -37,7 +37,7 @@ LEAST_PRESSURE = 1e-12
 LEAST_GAP = 1e-4
 """Smallest mu_2 - mu, as a share of mu_2, in the saturating law's rates."""
 MAX_ITERATIONS = 60
-"""Newton steps, or halvings where Newton would leave the bracket; three to six are usual."""
+"""Newton steps, or halvings where Newton would leave the bracket; three to eight are usual."""
 
 
 @cache
@@ -126,6 +126,7 @@ def fluidity(real: type, effects: Effects) -> SimpleNamespace:
         if y0 <= low:
             y = real(0.5) * (low + high)
         mu = mu_trial
+        moved = real(1.0e6)
         for _ in range(wp.static(MAX_ITERATIONS)):
             g_now = wp.exp(y)
             flow = a * g_now
@@ -138,12 +139,15 @@ def fluidity(real: type, effects: Effects) -> SimpleNamespace:
                 slope = m * m
             f = y - y0 - steps * (growth - quadratic * mu * g_now)
             slope = real(1.0) + steps * (slope + quadratic / a) * mu * flow / (real(1.0) + flow)
+            # The slope is 1 or more, so the root is no further from y than f.
             if f > real(0.0):
                 high = y
+                low = wp.max(low, y - f)
             else:
                 low = y
+                high = wp.min(high, y - f)
             new = y - f / slope
-            if new < low or new > high:
+            if new < low or new > high or wp.abs(new - y) > real(0.5) * moved:
                 new = real(0.5) * (low + high)
             moved = wp.abs(new - y)
             y = new

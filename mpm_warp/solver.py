@@ -13,6 +13,7 @@ from .contact import body_struct
 from .effects import Effects
 from .errors import SceneError, SolverStopped
 from .grid import grid_step, grid_struct
+from .nonlocal_fluidity import NonlocalFluidity
 from .rotation import angular_velocity, rotate
 from .scene import Scene
 from .soil import soil_parameters
@@ -193,6 +194,18 @@ class Solver:
                 kernels.to_particles, n, [*particles, self._velocity, self._substep, self._stray], **record
             ),
         ]
+        if self.effects.nonlocality:
+            nonlocal_fluidity = NonlocalFluidity(
+                real,
+                self.effects,
+                self.device,
+                material.fluidity_at_walls == "zero",
+                [self._x, self._e, self._ln_j],
+                grid,
+                soil,
+                self._velocity,
+            )
+            self._launches[2:2] = nonlocal_fluidity.launches
         self._graph: wp.Graph | None = None
 
     # --- stepping -----------------------------------------------------------------------------------------
