@@ -133,6 +133,15 @@ class Material:
         """Speed of confined compression waves, sqrt((K + 4 G / 3) / rho) [m/s]."""
         return math.sqrt((self.bulk_modulus + 4.0 * self.shear_modulus / 3.0) / self.bulk_density)
 
+    def cooperativity_length(self, friction: float) -> float:
+        """xi [m]: how far flow reaches at a ratio `friction` of shear stress to pressure, below mu_2."""
+        slowing = abs(friction - self.static_friction)
+        if self.rate_law == "saturating":
+            slowing *= (self.limit_friction - self.static_friction) / (self.limit_friction - friction)
+        return (
+            math.inf if slowing == 0.0 else self.nonlocal_amplitude * self.grain_diameter / math.sqrt(slowing)
+        )
+
     @property
     def lateral_stress_ratio(self) -> float:
         """K0 = nu / (1 - nu), horizontal over vertical stress of an elastic bed at rest [-]."""
