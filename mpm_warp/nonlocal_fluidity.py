@@ -10,7 +10,8 @@ over the six neighbours j that hold soil: a weak form with a symmetric matrix an
 WALL_CONDUCTANCE at floor and walls where g is to vanish there, otherwise 0.
 
 - `fluidity` on: G is the particles' fluidity and s = t_0 / dt, an implicit step of t_0 dg/dt = A^2 d^2 laplacian(g).
-- `fluidity` off: G is the local fluidity of the rate law and s = (A d / xi)^2, the steady g - xi^2 laplacian(g) = g_loc.
+- `fluidity` off: G is the local fluidity of the rate law and s = (A d / xi)^2, the steady form
+  g - xi^2 laplacian(g) = g_loc.
 
 Particles get g_i - G_i, not g_i. Were they given g_i, the way to the grid and back would smear the fluidity over a
 grid spacing, which is far more than the physics does where A d is small against it.
