@@ -56,6 +56,7 @@ def fluidity(real: type, effects: Effects) -> SimpleNamespace:
     least_fluidity = wp.constant(LEAST_FLUIDITY)
     least_pressure = wp.constant(LEAST_PRESSURE)
     least_gap = wp.constant(LEAST_GAP)
+    negligible = wp.constant(1e-8 if real is wp.float32 else 1e-16)
     tolerance = wp.constant(1e-6 if real is wp.float32 else 1e-13)
 
     @wp.func
@@ -112,6 +113,12 @@ def fluidity(real: type, effects: Effects) -> SimpleNamespace:
         mu_2 = soil.limit_friction
         steps = dt / soil.fluidity_time
         quadratic = (mu_2 - mu_s) / c
+        if mu_trial <= mu_s and a * g < real(negligible):
+            # At rest: g fades without a trace on the stress.
+            fading = mu_trial - mu_s
+            if soil.linear_rate_law == 0:
+                fading = steepening(mu_trial, soil) * fading
+            return vec2(mu_trial, wp.max(g * wp.exp(steps * fading), real(least_fluidity)))
         start = wp.max(g, real(least_fluidity))
         low = real(-1.0e4)
         high = low

@@ -21,10 +21,12 @@ last step's values, so that a few sweeps a step suffice.
 """
 
 import math
+from collections.abc import Sequence
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from .effects import Effects
@@ -33,7 +35,7 @@ from .grid import grid_struct
 from .soil import soil_struct
 from .splines import splines
 
-__all__ = ["NonlocalFluidity", "sweep_count"]
+__all__ = ["NonlocalFluidity", "sweep_count", "wall_sink"]
 
 WALL_CONDUCTANCE = 32.0
 """Of the layer between a wall's node and g = 0, in units of that between two nodes. It puts g = 0 a sixteenth of a
@@ -55,6 +57,16 @@ def sweep_count(ratio: float, relaxation: float | None = None) -> int:
     return 2 * min(8 if relaxation is None else 32, max(1, math.ceil(needed)))
 
 
+def wall_sink(shape: tuple[int, int, int], low: Sequence[int], high: Sequence[int]) -> np.ndarray:
+    """R of each node of a grid where g vanishes at the nodes with an index <= low or >= high, flat."""
+    sink = np.zeros(shape)
+    for axis in range(3):
+        nodes = np.moveaxis(sink, axis, 0)
+        nodes[: max(0, low[axis] + 1)] = WALL_CONDUCTANCE
+        nodes[max(0, high[axis]) :] = WALL_CONDUCTANCE
+    return sink.ravel()
+
+
 @cache
 def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamespace:
     """Kernels in precision `real`; `atomic` is needed where many threads write to the grid at once (a GPU).
@@ -70,7 +82,6 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
     spline, law = splines(real), fluidity(real, effects)
     base_and_offset, weights = spline.base_and_offset, spline.weights
     coefficients, local_fluidity, slowing = law.coefficients, law.local_fluidity, law.slowing
-    wall_conductance = wp.constant(WALL_CONDUCTANCE)
 
     @wp.func
     def source(e: vec6, ln_j: real, p: int, dt: real, soil: Soil):
@@ -137,41 +148,32 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
 
     @wp.kernel(module="unique", enable_backward=False)
     def sweep(
-        grid: Grid,
         ratio: real,  # (A d / dx)^2
-        vanishing: int,  # 1: g = 0 at floor and walls
+        nz: int,
+        plane: int,  # nodes of one x, ny nz
+        sink: wp.array(dtype=real),  # R of each node
         field: wp.array(dtype=vec4),
         swept: wp.array(dtype=vec4),
     ):
         n = wp.tid()
         here = field[n]
-        k = n % grid.nz
-        j = (n // grid.nz) % grid.ny
-        i = n // (grid.nz * grid.ny)
-        low = grid.low
-        high = grid.high
-        inner = (
-            i > 0 and j > 0 and k > 0
-            and i < grid.nx - 1 and j < grid.ny - 1 and k < grid.nz - 1
-        )  # fmt: skip
-        if here[0] > real(0.0) and inner:
+        # No soil lies in the outermost layers of the grid, so only the ends of the array need care.
+        if here[0] > real(0.0) and n >= plane and n < field.shape[0] - plane:
             total = real(0.0)
             flux = real(0.0)
             for side in range(6):
-                stride = grid.ny * grid.nz
+                stride = plane
                 if side // 2 == 1:
-                    stride = grid.nz
+                    stride = nz
                 if side // 2 == 2:
                     stride = 1
                 other = field[n + (2 * (side % 2) - 1) * stride]
                 if other[0] > real(0.0):
-                    joint = wp.max(here[0], other[0]) / here[0]
+                    joint = wp.max(here[0], other[0])
                     total += joint
                     flux += joint * other[3]
-            if vanishing != 0:
-                if i <= low[0] or j <= low[1] or k <= low[2] or i >= high[0] or j >= high[1] or k >= high[2]:
-                    total += real(wall_conductance)
-            here[3] = (here[2] * here[1] + ratio * flux) / (here[2] + ratio * total)
+            scale = ratio / here[0]
+            here[3] = (here[2] * here[1] + scale * flux) / (here[2] + scale * total + ratio * sink[n])
         swept[n] = here
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -192,7 +194,7 @@ class NonlocalFluidity:
         real: precision.
         effects: which physics.
         device: Warp device.
-        vanishing: whether g = 0 at floor and walls.
+        sink: R of each node, see `wall_sink`.
         particles: arrays x, e and ln J.
         grid, soil: the solver's structs.
         velocity: nodal velocities, whose fourth number takes the answer.
@@ -203,7 +205,7 @@ class NonlocalFluidity:
         real: type,
         effects: Effects,
         device: wp.Device,
-        vanishing: bool,
+        sink: np.ndarray,
         particles: list[wp.array],
         grid: Any,
         soil: Any,
@@ -213,7 +215,8 @@ class NonlocalFluidity:
         vec4 = wp.types.vector(4, real)
         count = len(velocity)
         sums, field, other = (wp.zeros(count, dtype=vec4, device=device) for _ in range(3))
-        self._arrays = (sums, other)  # a recorded launch does not promise to keep its arrays
+        walls = wp.array(sink, dtype=real, device=device)
+        self._arrays = (sums, other, walls)  # a recorded launch does not promise to keep its arrays
         self.field = field
         """Filled volume in particles, mean g or g_loc [1/s], s [-] and nodal fluidity g [1/s], shape (nodes, 4)."""
         ratio = (soil.cooperative_length / grid.spacing) ** 2
@@ -221,7 +224,8 @@ class NonlocalFluidity:
         record = {"device": device, "record_cmd": True}
 
         def sweep(start: wp.array, end: wp.array) -> wp.Launch:
-            return wp.launch(kernels.sweep, count, [grid, ratio, int(vanishing), start, end], **record)
+            inputs = [ratio, grid.nz, grid.ny * grid.nz, walls, start, end]
+            return wp.launch(kernels.sweep, count, inputs, **record)
 
         project = wp.launch(kernels.project, len(particles[0]), [*particles, grid, soil, sums], **record)
         self.launches = [

@@ -13,7 +13,7 @@ from .contact import body_struct
 from .effects import Effects
 from .errors import SceneError, SolverStopped
 from .grid import grid_step, grid_struct
-from .nonlocal_fluidity import NonlocalFluidity
+from .nonlocal_fluidity import NonlocalFluidity, wall_sink
 from .rotation import angular_velocity, rotate
 from .scene import Scene
 from .soil import soil_parameters
@@ -195,11 +195,14 @@ class Solver:
             ),
         ]
         if self.effects.nonlocality:
+            sink = np.zeros(node_count)
+            if material.fluidity_at_walls == "zero":
+                sink = wall_sink((grid.nx, grid.ny, grid.nz), grid.low, grid.high)
             nonlocal_fluidity = NonlocalFluidity(
                 real,
                 self.effects,
                 self.device,
-                material.fluidity_at_walls == "zero",
+                sink,
                 [self._x, self._e, self._ln_j],
                 grid,
                 soil,

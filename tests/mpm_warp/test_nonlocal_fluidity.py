@@ -11,7 +11,7 @@ from beds import cut
 from scipy.optimize import brentq
 
 from mpm_warp import Bed, Effects, Material, Scene, Solver
-from mpm_warp.nonlocal_fluidity import NonlocalFluidity
+from mpm_warp.nonlocal_fluidity import NonlocalFluidity, wall_sink
 
 STEADY = Effects(nonlocality=True)
 DYNAMIC = Effects(fluidity=True, nonlocality=True)
@@ -28,12 +28,12 @@ class Column:
             Scene(bed=bed, material=material, gravity=0.0, duration=0.1), effects, precision=real
         )
         grid = solver._grid
-        grid.low, grid.high = wp.vec3i(-1, -1, grid.low[2]), wp.vec3i(2**30, 2**30, 2**30)
+        floor = wall_sink((grid.nx, grid.ny, grid.nz), (-1, -1, grid.low[2]), (2**30,) * 3)
         self.term = NonlocalFluidity(
             solver._real,
             effects,
             solver.device,
-            material.fluidity_at_walls == "zero",
+            floor * (material.fluidity_at_walls == "zero"),
             [solver._x, solver._e, solver._ln_j],
             grid,
             solver._soil,
