@@ -55,15 +55,7 @@ class Material:
     """zero: no flow at rough floor and walls; free: no gradient across them. Used by the effect `nonlocality`."""
 
     def __post_init__(self) -> None:
-        if self.friction_map not in FRICTION_MAPS:
-            static_friction(45.0, self.friction_map)
-        if self.friction_angle is not None:
-            object.__setattr__(
-                self, "static_friction", static_friction(self.friction_angle, self.friction_map)
-            )
-            if self.static_friction >= self.limit_friction:
-                object.__setattr__(self, "_limit_given", self.limit_friction)
-                object.__setattr__(self, "limit_friction", self.static_friction + FRICTION_RANGE)
+        object.__setattr__(self, "_notes", tuple(self._apply_friction_angle()))
         for name, allowed in (("rate_law", RATE_LAWS), ("fluidity_at_walls", FLUIDITY_AT_WALLS)):
             if getattr(self, name) not in allowed:
                 raise SceneError(f"material.{name} is {getattr(self, name)!r}; allowed: {', '.join(allowed)}")
@@ -96,16 +88,33 @@ class Material:
                 f"({self.static_friction})"
             )
 
+    def _apply_friction_angle(self) -> list[str]:
+        """Set mu_s, and mu_2 where it must follow, from the angle if there is one; what to tell the user."""
+        if self.friction_map not in FRICTION_MAPS:
+            static_friction(45.0, self.friction_map)  # says what is allowed
+        if self.friction_angle is None:
+            return []
+        found = static_friction(self.friction_angle, self.friction_map)
+        source = f"material.friction_angle {self.friction_angle:g} degrees ({self.friction_map})"
+        notes = []
+        if self.static_friction not in (type(self).static_friction, found):
+            notes.append(
+                f"material.static_friction {self.static_friction:g} is not used, because {source} gives {found:.4f}; "
+                "set material.friction_angle=null to use it"
+            )
+        object.__setattr__(self, "static_friction", found)
+        if found >= self.limit_friction:
+            raised = found + FRICTION_RANGE
+            notes.append(
+                f"{source} gives a static friction of {found:.4f}, not below material.limit_friction "
+                f"{self.limit_friction:g}; the limit is raised to {raised:.4f}"
+            )
+            object.__setattr__(self, "limit_friction", raised)
+        return notes
+
     def warnings(self) -> list[str]:
         """What a user should know about this soil before it is used."""
-        found = []
-        if hasattr(self, "_limit_given"):
-            found.append(
-                f"material.friction_angle {self.friction_angle:g} degrees ({self.friction_map}) gives a static "
-                f"friction of {self.static_friction:.3f}, not below material.limit_friction "
-                f"{self._limit_given:.3f}; the limit is raised to {self.limit_friction:.3f} "
-                f"(the static one + {FRICTION_RANGE})"
-            )
+        found = list(self._notes)
         if self.rest_stress_yields:
             found.append(
                 f"material.static_friction {self.static_friction:.3f} is so low that the bed at rest "
