@@ -47,7 +47,6 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
     """
     vec3 = wp.types.vector(3, real)
     vec6 = wp.types.vector(6, real)
-    vec7 = wp.types.vector(7, real)
     mat33 = wp.types.matrix((3, 3), real)
     Soil = soil_struct(real, effects.fluidity)
     State = wp.types.vector(8 if effects.fluidity else 7, real)
@@ -266,6 +265,5 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
         update=update,
         kirchhoff=kirchhoff,
         vec6=vec6,
-        vec7=vec7,
         mat33=mat33,
     )

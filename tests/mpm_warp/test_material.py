@@ -67,7 +67,7 @@ def test_a_scene_with_an_angle_survives_plain_data():
 
 def test_an_angle_in_plain_data_is_checked():
     assert Scene.from_dict({"material": {"friction_angle": 30}}).material.friction_angle == 30.0
-    with pytest.raises(SceneError, match="scene.material.friction_angle is 'steep'; it must be a finite number"):
+    with pytest.raises(SceneError, match="friction_angle is 'steep'; it must be a finite number"):
         Scene.from_dict({"material": {"friction_angle": "steep"}})
 
 
@@ -90,7 +90,9 @@ def test_what_a_material_refuses(values, words):
 
 def test_cooperativity_length():
     """A d over the root of m |mu - mu_s|: the stopping heights of glass beads are (pi / 2) xi(tan theta)."""
-    beads = Material(static_friction=0.3819, limit_friction=0.6435, reference_inertial_number=0.278, grain_diameter=1.0)
+    beads = Material(
+        static_friction=0.3819, limit_friction=0.6435, reference_inertial_number=0.278, grain_diameter=1.0
+    )
     heights = {22.78: (3.863, 3.570), 24.23: (2.889, 2.485), 26.57: (2.194, 1.625), 28.81: (1.839, 1.099)}
     for degrees, (linear, saturating) in heights.items():
         mu = math.tan(math.radians(degrees))
