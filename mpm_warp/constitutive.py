@@ -20,28 +20,15 @@ from types import SimpleNamespace
 import warp as wp
 
 from .effects import Effects
+from .fluidity import fluidity
+from .soil import soil_struct
 
-__all__ = ["constitutive", "soil_struct"]
+__all__ = ["constitutive"]
 
 SECOND_ORDER_LIMIT = 0.01
 """Size of strain and step up to which the second-order expansion is used: it misses at most 1e-4 of the step."""
 SERIES_LIMIT = 0.05
 """Frobenius norm of b - I up to which the four-term log series is used: its relative error is then below 2e-6."""
-
-
-@cache
-def soil_struct(real: type) -> type:
-    """Struct of the soil constants in precision `real` (pressures in Pa, lengths in m)."""
-
-    @wp.struct
-    class Soil:
-        shear_modulus: real
-        bulk_modulus: real
-        static_friction: real
-        limit_friction: real
-        reference_rate: real  # I_0 sqrt(1 / rho_s) / d: G dt reference_rate sqrt(p) is the paper's alpha
-
-    return Soil
 
 
 @cache
@@ -53,14 +40,19 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
     - `strain_trial(e, A)` -> deviatoric trial strain (6),
     - `volume_step(A)` -> ln det(I + A),
     - `yield_stress(tau_trial, p, dt, soil)` -> equivalent shear stress after the plastic return,
-    - `update(e, ln_j, A, dt, soil)` -> new e (6) and new ln J as a 7-vector,
+    - `update(e, ln_j, A, dt, soil, g)` -> new e (6) and new ln J as a 7-vector. `g` is a number of the effects that
+      have one, otherwise unused: with `nonlocality` alone the excess of the fluidity over its local value; with
+      `fluidity` the particle's fluidity [1/s], whose new value is then the eighth number of the answer,
     - `kirchhoff(e, ln_j, soil)` -> Kirchhoff stress (3 x 3) [Pa].
     """
     vec3 = wp.types.vector(3, real)
     vec6 = wp.types.vector(6, real)
-    vec7 = wp.types.vector(7, real)
     mat33 = wp.types.matrix((3, 3), real)
-    Soil = soil_struct(real)
+    Soil = soil_struct(real, effects.fluidity)
+    State = wp.types.vector(8 if effects.fluidity else 7, real)
+    fluid = fluidity(real, effects)
+    coefficients, fluidity_step = fluid.coefficients, fluid.fluidity_step
+    friction_with_excess = fluid.friction_with_excess
     second_order_limit = wp.constant(SECOND_ORDER_LIMIT**2)
     series_limit = wp.constant(SERIES_LIMIT**2)
 
@@ -201,27 +193,63 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
             # Closed-form implicit mu(I): Dunatunga and Kamrin, J. Fluid Mech. 779 (2015).
             s2 = soil.limit_friction * p
             alpha = soil.shear_modulus * dt * soil.reference_rate * wp.sqrt(p)
+            if soil.linear_rate_law != 0:
+                k = alpha / ((soil.limit_friction - soil.static_friction) * p)
+                return (tau + k * s0) / (real(1.0) + k)
             b = s2 + tau + alpha
             h = s2 * tau + s0 * alpha
             return real(2.0) * h / (b + wp.sqrt(wp.max(b * b - real(4.0) * h, real(0.0))))
         return s0
 
     @wp.func
-    def update(e: vec6, ln_j: real, a: mat33, dt: real, soil: Soil):
+    def state_of(e: vec6, ln_j: real, g: real):
+        if wp.static(effects.fluidity):
+            return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j, g)
+        else:
+            return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j)
+
+    @wp.func
+    def separated_fluidity(a: mat33, dt: real, soil: Soil):
+        # Soil that comes back into contact flows as it did apart.
+        d = vec6(
+            a[0, 0], a[1, 1], a[2, 2],
+            real(0.5) * (a[0, 1] + a[1, 0]), real(0.5) * (a[0, 2] + a[2, 0]), real(0.5) * (a[1, 2] + a[2, 1]),
+        )  # fmt: skip
+        return wp.sqrt(real(2.0) * norm_squared(deviator(d))) / (dt * soil.static_friction)
+
+    @wp.func
+    def update(e: vec6, ln_j: real, a: mat33, dt: real, soil: Soil, g: real):
         new_ln_j = ln_j + volume_step(a)
         if wp.static(effects.separation):
             if new_ln_j >= real(0.0):
-                return vec7(real(0.0), real(0.0), real(0.0), real(0.0), real(0.0), real(0.0), new_ln_j)
+                if wp.static(effects.fluidity):
+                    return state_of(vec6(), new_ln_j, separated_fluidity(a, dt, soil))
+                else:
+                    return state_of(vec6(), new_ln_j, g)
         t = strain_trial(e, a)
+        new_g = g
         if wp.static(effects.yielding):
             p = -soil.bulk_modulus * new_ln_j
             if p <= real(0.0):
                 t = vec6()
             else:
                 tau = soil.shear_modulus * wp.sqrt(real(2.0) * norm_squared(t))
-                if tau > soil.static_friction * p:
-                    t = t * (yield_stress(tau, p, dt, soil) / tau)
-        return vec7(t[0], t[1], t[2], t[3], t[4], t[5], new_ln_j)
+                if wp.static(effects.fluidity):
+                    ac = coefficients(p, dt, soil)
+                    mu = tau * ac[0] / (soil.shear_modulus * dt)
+                    found = fluidity_step(mu, ac[0], ac[1], g, dt, soil)
+                    if mu > real(0.0):
+                        t = t * (found[0] / mu)
+                    new_g = found[1]
+                elif wp.static(effects.nonlocality):
+                    if tau > real(0.0):
+                        ac = coefficients(p, dt, soil)
+                        mu = tau * ac[0] / (soil.shear_modulus * dt)
+                        t = t * (friction_with_excess(mu, ac[0], ac[1], g, soil) / mu)
+                else:
+                    if tau > soil.static_friction * p:
+                        t = t * (yield_stress(tau, p, dt, soil) / tau)
+        return state_of(t, new_ln_j, new_g)
 
     @wp.func
     def kirchhoff(e: vec6, ln_j: real, soil: Soil):
@@ -237,6 +265,5 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
         update=update,
         kirchhoff=kirchhoff,
         vec6=vec6,
-        vec7=vec7,
         mat33=mat33,
     )

@@ -14,6 +14,14 @@ _REASONS = {
         "friction rises with the inertial number, mu(I)",
         "friction is the constant mu_s (Drucker-Prager)",
     ),
+    "fluidity": (
+        "the fluidity follows its own dynamics with the time t_0",
+        "the fluidity takes its steady value at once",
+    ),
+    "nonlocality": (
+        "flow spreads over a few grain diameters",
+        "flow depends on the stress at the same place only",
+    ),
     "separation": ("soil below its critical density carries no stress", "soil may carry tension"),
     "symmetry": ("half the bed is computed and mirrored", "the whole bed is computed"),
 }
@@ -27,6 +35,10 @@ class Effects:
     """Frictional yield; off: elastic soil."""
     rate_dependence: bool = True
     """mu(I) instead of a constant mu_s. Needs `yielding`."""
+    fluidity: bool = False
+    """The fluidity as a field with its own dynamics. Needs `rate_dependence`."""
+    nonlocality: bool = False
+    """Cooperative flow, the Laplacian of the fluidity. Needs `rate_dependence`."""
     separation: bool = True
     """A stress-free state below the critical density; off: the soil can carry tension."""
     symmetry: bool = False
@@ -39,6 +51,13 @@ class Effects:
                 "effects.rate_dependence needs effects.yielding: soil that does not yield has no friction that could "
                 "depend on the rate; set effects.rate_dependence=false"
             )
+
+        for name in ("fluidity", "nonlocality"):
+            if getattr(self, name) and not self.rate_dependence:
+                raise SceneError(
+                    f"effects.{name} needs effects.rate_dependence: the fluidity is what the rate law mu(I) leads to; "
+                    f"set effects.rate_dependence=true or effects.{name}=false"
+                )
 
     def described(self) -> dict[str, dict[str, bool | str]]:
         """Each effect with its state and the reason, as stored in a run file."""

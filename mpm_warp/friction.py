@@ -1,32 +1,35 @@
-"""From a friction angle to the friction coefficients of the material."""
+"""From an angle of internal friction to the cone's static friction mu_s."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 from .errors import SceneError
-from .material import Material
 
-__all__ = ["static_friction", "with_friction_angle"]
+__all__ = ["FRICTION_MAPS", "static_friction"]
+
+FRICTION_MAPS = {
+    "tan": lambda phi: math.tan(phi),
+    "sin": lambda phi: math.sin(phi),
+    "triaxial": lambda phi: 2.0 * math.sqrt(3.0) * math.sin(phi) / (3.0 - math.sin(phi)),
+}
+"""mu_s of an angle [rad] such that the cone and the Mohr-Coulomb criterion agree in one kind of loading: `tan` in
+simple shear, `sin` in plane strain, `triaxial` in triaxial compression. In other kinds they differ."""
 
 
-def static_friction(angle: float) -> float:
-    """mu_s of a friction angle [degrees]: its tangent."""
-    if not 0.0 < angle < 60.0:
-        raise SceneError(f"friction_angle is {angle} degrees; allowed: above 0, below 60")
-    return math.tan(math.radians(angle))
+def static_friction(angle: float, friction_map: str = "tan") -> float:
+    """mu_s [-] of soil with friction angle `angle` [degrees].
 
-
-def with_friction_angle(material: Material, angle: float) -> tuple[Material, bool]:
-    """The material with the mu_s of `angle` [degrees], and whether mu_2 had to be raised for it.
-
-    mu_2 stays as it is while it is above mu_s. Otherwise it is raised to keep its distance from mu_s, so that friction
-    goes on to rise with the rate as much as it did in the material given.
+    Raises:
+        SceneError: when the map is not known or the angle not between 0 and 90 degrees.
     """
-    friction = static_friction(angle)
-    raised = friction >= material.limit_friction
-    limit = material.limit_friction
-    if raised:
-        limit = friction + material.limit_friction - material.static_friction
-    return replace(material, static_friction=friction, limit_friction=limit), raised
+    if friction_map not in FRICTION_MAPS:
+        raise SceneError(
+            f"material.friction_map is {friction_map!r}; allowed: {', '.join(sorted(FRICTION_MAPS))}"
+        )
+    if isinstance(angle, bool) or not isinstance(angle, (int, float)) or not 0.0 < angle < 90.0:
+        raise SceneError(
+            f"material.friction_angle is {angle!r}; allowed: above 0 and below 90 degrees, or null for "
+            "material.static_friction"
+        )
+    return FRICTION_MAPS[friction_map](math.radians(angle))

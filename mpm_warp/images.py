@@ -7,11 +7,12 @@ A node on a mirror plane is its own image.
 
 from functools import cache
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-__all__ = ["images", "mirror_pairs", "seam_pairs"]
+__all__ = ["Images", "images", "mirror_pairs", "seam_pairs"]
 
 _REACH = 2  # layers of ghost nodes: one more than the splines of a particle on the plane reach
 
@@ -79,3 +80,38 @@ def images(real: type) -> SimpleNamespace:
             x[p] = at
 
     return SimpleNamespace(fold=fold, unfold=unfold, wrap=wrap)
+
+
+class Images:
+    """Launches that keep ghost nodes and their images in agreement.
+
+    Args:
+        real: precision.
+        device: Warp device.
+        grid: the solver's struct.
+        ghosts: axis → ghost layers and their images, shape (m, 2).
+        mirrored: whether the layers along y are mirror images; all others are one period apart.
+    """
+
+    def __init__(
+        self, real: type, device: wp.Device, grid: Any, ghosts: dict[int, np.ndarray], mirrored: bool
+    ) -> None:
+        vec4 = wp.types.vector(4, real)
+        self._kernels, self._device, self._axes = images(real), device, []
+        for axis, pairs in ghosts.items():
+            extent, stride = ((grid.nx, grid.ny * grid.nz), (grid.ny, grid.nz))[axis]
+            sign = vec4(1.0, -1.0 if mirrored and axis == 1 else 1.0, 1.0, 1.0)
+            layers = wp.array(pairs, dtype=wp.vec2i, device=device)
+            rows = grid.nx * grid.ny * grid.nz // extent
+            self._axes.append((rows, [layers, sign, stride, extent]))
+
+    def fold(self, nodes: wp.array) -> list[wp.Launch]:
+        """Add ghost layers to their images."""
+        return [self._record(self._kernels.fold, nodes, *axis) for axis in self._axes]
+
+    def unfold(self, nodes: wp.array) -> list[wp.Launch]:
+        """Give ghost layers the values of their images."""
+        return [self._record(self._kernels.unfold, nodes, *axis) for axis in reversed(self._axes)]
+
+    def _record(self, kernel: wp.Kernel, nodes: wp.array, rows: int, rest: list) -> wp.Launch:
+        return wp.launch(kernel, rows, [nodes, *rest], device=self._device, record_cmd=True)

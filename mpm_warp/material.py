@@ -6,13 +6,19 @@ import math
 from dataclasses import dataclass
 
 from .errors import SceneError
+from .friction import FRICTION_MAPS, static_friction
 
-__all__ = ["Material"]
+__all__ = ["FLUIDITY_AT_WALLS", "RATE_LAWS", "Material"]
+
+RATE_LAWS = ("saturating", "linear")
+FLUIDITY_AT_WALLS = ("zero", "free")
+FRICTION_RANGE = 0.2016
+"""mu_2 - mu_s of the paper's sand: what the limit friction is set above a static friction that reaches it."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """Dry granular soil: Hencky elasticity with rate-dependent friction mu(I).
+    """Dry granular soil: Hencky elasticity with rate-dependent friction mu(I) and its fluidity.
 
     The defaults are the sand of the paper's excavation runs (A. Haeri, K. Skonieczny) except for the
     stiffness: 1 MPa instead of 15 MPa, which makes the explicit step almost four times longer.
@@ -29,14 +35,41 @@ class Material:
     grain_diameter: float = 3.0e-4
     """Grain diameter d [m]."""
     static_friction: float = 0.76
-    """mu_s: ratio of shear stress to pressure below which the soil does not flow [-]."""
+    """mu_s: ratio of shear stress to pressure below which the soil does not flow [-]. Follows from
+    `friction_angle` where that is given."""
     limit_friction: float = 0.9616
     """mu_2: the ratio approached in very fast flow [-]."""
     reference_inertial_number: float = 0.278
-    """I_0 of the saturating law mu(I) = mu_s + (mu_2 - mu_s) / (1 + I_0 / I) [-]."""
+    """I_0 of the rate law [-]."""
+    rate_law: str = "saturating"
+    """saturating: mu(I) = mu_s + (mu_2 - mu_s) / (1 + I_0 / I); linear: mu(I) = mu_s + (mu_2 - mu_s) I / I_0."""
+    friction_angle: float | None = None
+    """Angle of internal friction [degrees]; None: `static_friction` holds."""
+    friction_map: str = "tan"
+    """How the angle becomes mu_s: tan | sin | triaxial (friction.py)."""
+    nonlocal_amplitude: float = 0.48
+    """A: reach of cooperative flow in grain diameters [-]. Used by the effect `nonlocality`."""
+    fluidity_time: float = 2.0e-4
+    """t_0 of the fluidity's own dynamics [s]. Used by the effect `fluidity`."""
+    fluidity_at_walls: str = "zero"
+    """zero: no flow at rough floor and walls; free: no gradient across them. Used by the effect `nonlocality`."""
 
     def __post_init__(self) -> None:
-        positive = ("youngs_modulus", "grain_density", "grain_diameter", "reference_inertial_number")
+        object.__setattr__(self, "_notes", tuple(self._apply_friction_angle()))
+        for name, allowed in (("rate_law", RATE_LAWS), ("fluidity_at_walls", FLUIDITY_AT_WALLS)):
+            if getattr(self, name) not in allowed:
+                raise SceneError(f"material.{name} is {getattr(self, name)!r}; allowed: {', '.join(allowed)}")
+        if not (math.isfinite(self.nonlocal_amplitude) and self.nonlocal_amplitude >= 0.0):
+            raise SceneError(
+                f"material.nonlocal_amplitude is {self.nonlocal_amplitude}; it must be 0 or more"
+            )
+        positive = (
+            "youngs_modulus",
+            "grain_density",
+            "grain_diameter",
+            "reference_inertial_number",
+            "fluidity_time",
+        )
         for name in positive:
             value = getattr(self, name)
             if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
@@ -54,6 +87,40 @@ class Material:
                 f"material.limit_friction is {self.limit_friction}; it must be above material.static_friction "
                 f"({self.static_friction})"
             )
+
+    def _apply_friction_angle(self) -> list[str]:
+        """Set mu_s, and mu_2 where it must follow, from the angle if there is one; what to tell the user."""
+        if self.friction_map not in FRICTION_MAPS:
+            static_friction(45.0, self.friction_map)  # says what is allowed
+        if self.friction_angle is None:
+            return []
+        found = static_friction(self.friction_angle, self.friction_map)
+        source = f"material.friction_angle {self.friction_angle:g} degrees ({self.friction_map})"
+        notes = []
+        if self.static_friction not in (type(self).static_friction, found):
+            notes.append(
+                f"material.static_friction {self.static_friction:g} is not used, because {source} gives {found:.4f}; "
+                "set material.friction_angle=null to use it"
+            )
+        object.__setattr__(self, "static_friction", found)
+        if found >= self.limit_friction:
+            raised = found + FRICTION_RANGE
+            notes.append(
+                f"{source} gives a static friction of {found:.4f}, not below material.limit_friction "
+                f"{self.limit_friction:g}; the limit is raised to {raised:.4f}"
+            )
+            object.__setattr__(self, "limit_friction", raised)
+        return notes
+
+    def warnings(self) -> list[str]:
+        """What a user should know about this soil before it is used."""
+        found = list(self._notes)
+        if self.rest_stress_yields:
+            found.append(
+                f"material.static_friction {self.static_friction:.3f} is so low that the bed at rest "
+                "already yields under its own weight (K0 condition)"
+            )
+        return found
 
     @property
     def bulk_density(self) -> float:
@@ -74,6 +141,15 @@ class Material:
     def wave_speed(self) -> float:
         """Speed of confined compression waves, sqrt((K + 4 G / 3) / rho) [m/s]."""
         return math.sqrt((self.bulk_modulus + 4.0 * self.shear_modulus / 3.0) / self.bulk_density)
+
+    def cooperativity_length(self, friction: float) -> float:
+        """xi [m]: how far flow reaches at a ratio `friction` of shear stress to pressure, below mu_2."""
+        slowing = abs(friction - self.static_friction)
+        if self.rate_law == "saturating":
+            slowing *= (self.limit_friction - self.static_friction) / (self.limit_friction - friction)
+        return (
+            math.inf if slowing == 0.0 else self.nonlocal_amplitude * self.grain_diameter / math.sqrt(slowing)
+        )
 
     @property
     def lateral_stress_ratio(self) -> float:

@@ -54,6 +54,7 @@ class RigidBody:
         dt: substep [s].
         particles: how many there are.
         volume: of a particle [m^3].
+        share: of the soil's impulse that is computed: 1/2 with mirror symmetry.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class RigidBody:
         dt: float,
         particles: int,
         volume: float,
+        share: float = 1.0,
     ) -> None:
         vec3 = wp.types.vector(3, real)
         self.scene, self.substeps, self.dt = scene, substeps, dt
@@ -93,7 +95,7 @@ class RigidBody:
             height = scene.poses_at(np.zeros(1))[0, 2]
             self._axle = wp.array([height, 0.0, 0.0], dtype=wp.float64, device=device)
             data.axle = self._axle
-            values = [self._axle, data.impulse, dt, axle.mass, scene.gravity, axle.damping]
+            values = [self._axle, data.impulse, dt, share * axle.mass, scene.gravity, axle.damping]
             self.launches.append(wp.launch(axle_step(real), 1, values, device=device, record_cmd=True))
         self.data = data
         """The struct that kernels take."""

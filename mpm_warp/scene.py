@@ -242,13 +242,7 @@ class Scene:
 
     def warnings(self) -> list[str]:
         """What a user should know about this scene before it runs."""
-        found = []
-        if self.material.rest_stress_yields:
-            found.append(
-                f"material.static_friction {self.material.static_friction:.3f} is so low that the bed at rest "
-                "already yields under its own weight (K0 condition)"
-            )
-        return found + (self.body.warnings() if self.body is not None else [])
+        return self.material.warnings() + (self.body.warnings() if self.body is not None else [])
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         """What came out, in a few words; empty without a body.
@@ -292,7 +286,11 @@ class Scene:
         for time, pose in zip(self.times(), self.body_poses(), strict=True):
             points = rotate(pose[3:], outline) + pose[:3]
             below = points[:, 2] < 0.0
-            for axis, low, high, name in ((0, 0.0, lx, "x"), (1, -side, ly + side, "y"), (2, -lz, math.inf, "z")):
+            for axis, low, high, name in (
+                (0, 0.0, lx, "x"),
+                (1, -side, ly + side, "y"),
+                (2, -lz, math.inf, "z"),
+            ):
                 outside = below & ((points[:, axis] < low) | (points[:, axis] > high))
                 if outside.any():
                     limits = f"{low:g} to {high:g} m" if math.isfinite(high) else f"at least {low:g} m"

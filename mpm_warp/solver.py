@@ -10,21 +10,26 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .constitutive import soil_struct
-from .contact import body_struct
+from .contact import ContactLaw, body_struct
 from .effects import Effects
 from .errors import SceneError, SolverStopped
-from .grid import grid_step, grid_struct
-from .rotation import angular_velocity, rotate
+from .grid import grid_step
+from .grid_layout import lay_grid
+from .images import Images, images
+from .initial_stress import initial_stress
+from .nonlocal_fluidity import NonlocalFluidity, wall_sink
+from .rigid_body import RigidBody
+from .rotation import rotate
 from .scene import Scene
+from .soil import soil_parameters
 from .start import start_warp
+from .symmetry import asymmetry, half
 from .time_step import steps_to_remap, substeps_per_frame, top_body_speed
 from .transfer import transfer
 
 __all__ = ["PRECISIONS", "Frame", "Solver"]
 
 PRECISIONS = {"float32": wp.float32, "float64": wp.float64}
-_PADDING = 3  # cells outside the bin, so that the nodes around a particle at a wall exist
 
 
 @dataclass(frozen=True)
@@ -35,9 +40,9 @@ class Frame:
     time: float
     """[s]"""
     position: np.ndarray
-    """Soil [m], shape (n, 3), float32."""
+    """Soil [m], shape (n, 3), float32; along a periodic axis it goes on counting beyond the bin."""
     velocity: np.ndarray
-    """Soil [m/s], shape (n, 3), float32."""
+    """Soil, of the grid where the particle is [m/s], shape (n, 3), float32."""
     body_pose: np.ndarray
     """Centre of mass [m] and quaternion x, y, z, w, shape (7,)."""
     body_points: np.ndarray
@@ -82,8 +87,14 @@ class Solver:
         self.device = wp.get_device(device)
         self.precision = precision
         self._real = PRECISIONS[precision]
+        if self.effects.symmetry and (reason := asymmetry(scene)):
+            raise SceneError(
+                f"effects.symmetry needs a scene that is mirror symmetric about mid-width: {reason}; or set "
+                "effects.symmetry=false"
+            )
+        self._half = half(scene) if self.effects.symmetry else None
 
-        self._top_body = top_body_speed(scene)
+        self._top_body_speed = top_body_speed(scene)
         self.substeps_per_frame = substeps_per_frame(scene)
         self.time_step = 1.0 / scene.frame_rate / self.substeps_per_frame
         """Substep [s]."""
@@ -91,143 +102,188 @@ class Solver:
 
     @property
     def particle_count(self) -> int:
-        """n."""
+        """n, of the whole bed."""
+        return len(self.scene.initial_positions())
+
+    @property
+    def computed_count(self) -> int:
+        """Particles that are computed: about half of them with mirror symmetry."""
         return len(self._x)
 
     def frames(self) -> Iterator[Frame]:
         """All frames in order, the initial state first.
 
         Raises:
-            SolverStopped: at the end of the first frame in which a particle went wrong.
+            SolverStopped: at the end of the first frame in which a particle or the body went wrong.
         """
         for index in range(self.scene.frame_count):
             if index > 0:
-                self._load_motion(index - 1)
+                self._substep.zero_()
+                if self._body is not None:
+                    self._body.start_frame(index - 1)
                 self._advance(index)
+                if self._body is not None:
+                    self._body.check(index / self.scene.frame_rate)
             yield self._frame(index)
 
     # --- set-up -------------------------------------------------------------------------------------------
 
     def _allocate(self) -> None:
-        scene, bed, material, real = self.scene, self.scene.bed, self.scene.material, self._real
+        scene, real, device = self.scene, self._real, self.device
         vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-        positions, volume = bed.filled
+        positions, volume = scene.filled
+        velocities, (ln_j, strain) = scene.initial_velocities(), initial_stress(scene)
+        if self._half is not None:
+            kept = self._half.kept
+            positions, velocities, ln_j, strain = positions[kept], velocities[kept], ln_j[kept], strain[kept]
         n = len(positions)
+        self._grid, ghosts = lay_grid(scene, real, self.time_step, volume, self._half is not None)
+        self._soil = soil_parameters(real, scene.material, max(scene.bed.size), self.effects.fluidity)
+        if self.effects.fluidity:
+            self._soil.g = wp.zeros(n, dtype=real, device=device)
 
-        grid = grid_struct(real)()
-        h = bed.spacing
-        # Walls fall on nodes where the bin is a whole number of cells; otherwise the grid is centred in x and y,
-        # which keeps the scene's mirror symmetry, and the nodes just outside the bin are the walls.
-        cells = [math.ceil(s / h - 1e-6) for s in bed.size[:2]]
-        origin = [0.5 * (s - c * h) - _PADDING * h for s, c in zip(bed.size[:2], cells, strict=True)]
-        origin.append(-bed.size[2] - _PADDING * h)
-        top = math.ceil((bed.size[2] + bed.headroom) / h) + _PADDING
-        grid.origin = vec3(*origin)
-        grid.spacing, grid.inverse_spacing = h, 1.0 / h
-        grid.nx, grid.ny, grid.nz = (
-            cells[0] + 2 * _PADDING + 1,
-            cells[1] + 2 * _PADDING + 1,
-            top + _PADDING + 1,
-        )
-        grid.dt, grid.gravity = self.time_step, scene.gravity
-        grid.low = wp.vec3i(_PADDING, _PADDING, _PADDING)
-        grid.high = wp.vec3i(_PADDING + cells[0], _PADDING + cells[1], 2**30)
-        grid.speed_limit = h / self.time_step
-        grid.particle_volume, grid.particle_mass = volume, volume * material.bulk_density
-        self._grid = grid
-
-        soil = soil_struct(real)()
-        soil.shear_modulus, soil.bulk_modulus = material.shear_modulus, material.bulk_modulus
-        soil.static_friction, soil.limit_friction = material.static_friction, material.limit_friction
-        soil.reference_rate = material.reference_inertial_number / (
-            material.grain_diameter * math.sqrt(material.grain_density)
-        )
-        self._soil = soil
-
-        ln_j = np.zeros(n)
-        if bed.initial_stress == "geostatic":
-            # Isotropic: the vertical stress of rest at once, so nothing settles.
-            density = material.bulk_density * n * volume / np.prod(bed.size)
-            ln_j = -density * scene.gravity * np.maximum(-positions[:, 2], 0.0) / material.bulk_modulus
-
-        new = {"device": self.device}
-        self._x = wp.array(positions, dtype=vec3, **new)
-        self._v = wp.zeros(n, dtype=vec3, **new)
-        self._c = wp.zeros(n, dtype=wp.types.matrix((3, 3), real), **new)
-        self._e = wp.zeros(n, dtype=wp.types.vector(6, real), **new)
-        self._ln_j = wp.array(ln_j, dtype=real, **new)
-        self._u = wp.zeros(n, dtype=vec3, **new)  # velocity of the grid where the particle is
-        self._home = wp.zeros(n, dtype=vec3, **new)
-        node_count = grid.nx * grid.ny * grid.nz
+        self._x = wp.array(positions, dtype=vec3, device=device)
+        self._home = wp.zeros(n, dtype=vec3, device=device)
+        self._v = wp.array(velocities, dtype=vec3, device=device)
+        self._felt = wp.array(np.pad(velocities, ((0, 0), (0, 1))), dtype=vec4, device=device)
+        self._c = wp.zeros(n, dtype=wp.types.matrix((3, 3), real), device=device)
+        self._e = wp.array(strain, dtype=wp.types.vector(6, real), device=device)
+        self._ln_j = wp.array(ln_j, dtype=real, device=device)
+        nodes = self._grid.nx * self._grid.ny * self._grid.nz
         self._momentum, self._velocity, self._before, self._impulse = (
-            wp.zeros(node_count + 1, dtype=vec4, **new) for _ in range(4)  # + 1: see rows.py
+            wp.zeros(nodes + 1, dtype=vec4, device=device)
+            for _ in range(4)  # + 1: see rows.py
         )
-        self._substep = wp.zeros(1, dtype=int, **new)
-        self._top_speed = wp.zeros(1, dtype=real, **new)
-        self._stray = wp.zeros(4, dtype=int, **new)
+        self._inverse_mass = wp.zeros(nodes, dtype=real, device=device)
+        self._substep = wp.zeros(1, dtype=int, device=device)
+        self._top_speed = wp.zeros(1, dtype=real, device=device)
+        self._stray = wp.zeros(4, dtype=int, device=device)
 
-        body, plate, m = body_struct(real)(), scene.plate, self.substeps_per_frame
-        if plate is not None:
-            body.half_size, body.friction = vec3(*plate.half_size), plate.friction
-            body.margin = scene.contact_margin * h
-            body.reach = float(np.linalg.norm(plate.half_size + max(0.0, body.margin)))
-            # The spring is as stiff as a layer of soil one particle thick; damping is critical.
-            stiffness = material.wave_speed**2 * material.bulk_density * volume ** (1.0 / 3.0)
-            body.stiffness, body.damping = stiffness, 2.0 * math.sqrt(stiffness * grid.particle_mass)
-            body.separation_speed = 0.01 * material.wave_speed
-        body.position = wp.zeros(m, dtype=vec3, **new)
-        body.rotation = wp.zeros(m, dtype=wp.types.quaternion(real), **new)
-        body.velocity = wp.zeros(m, dtype=vec3, **new)
-        body.spin = wp.zeros(m, dtype=vec3, **new)
-        body.impulse = wp.zeros(2, dtype=vec3, **new)
-        self._body = body
+        self._body: RigidBody | None = None
+        if scene.body is not None:
+            share = 1.0 if self._half is None else 0.5
+            self._body = RigidBody(
+                scene, real, device, self.substeps_per_frame, self.time_step, n, volume, share
+            )
+        self._record_launches(n, nodes, ghosts)
 
-        kernels = transfer(real, self.effects, with_body=plate is not None, atomic=self.device.is_cuda)
-        nodes = grid_step(real)
+    def _record(self, kernel: wp.Kernel, count: int, *arguments: Any) -> wp.Launch:
+        return wp.launch(kernel, count, arguments, device=self.device, record_cmd=True)
 
-        def record(kernel: wp.Kernel, count: int, *arguments: Any) -> wp.Launch:
-            return wp.launch(kernel, count, arguments, device=self.device, record_cmd=True)
-
-        x, u, v, c, home, e, ln_j = self._x, self._u, self._v, self._c, self._home, self._e, self._ln_j
+    def _record_launches(self, n: int, nodes: int, ghosts: dict[int, np.ndarray]) -> None:
+        """What runs at a remap and in every step, in order."""
+        real, grid, soil, body = self._real, self._grid, self._soil, self._body
+        kernels = transfer(real, self.effects, body.law if body else None, atomic=self.device.is_cuda)
+        node = grid_step(real, self.scene.bed.walls.kinds)
+        ghost = Images(real, self.device, grid, ghosts, mirrored=self._half is not None)
+        x, home, v, felt, c, e, ln_j = (
+            self._x, self._home, self._v, self._felt, self._c, self._e, self._ln_j
+        )  # fmt: skip
         watch = (self._substep, self._stray)
-        self._to_grid = record(
-            kernels.to_grid, n, x, v, c, home, grid, self._momentum, self._top_speed, *watch
-        )
-        self._begin = record(
-            nodes.begin, node_count, grid, self._momentum, self._velocity, self._before, self._impulse
-        )
-        self._step = [
-            record(kernels.scatter, n, x, home, u, e, ln_j, grid, soil, body, self._impulse, self._substep),
-            record(nodes.step, node_count, grid, self._velocity, self._impulse, self._substep),
-            record(kernels.gather, n, x, home, u, c, grid, self._velocity, *watch),
-            record(kernels.material, n, c, e, ln_j, grid, soil),
+
+        self._to_grid = self._record_wraps(n)
+        scatter = []
+        for part, its_grid, its_body in self._parts(n):
+            particles = [a[part] for a in (x, v, c, home)]
+            self._to_grid.append(
+                self._record(
+                    kernels.to_grid,
+                    len(particles[0]),
+                    *particles,
+                    its_grid,
+                    self._momentum,
+                    self._top_speed,
+                    *watch,
+                )
+            )
+            particles = [a[part] for a in (x, home, felt, e, ln_j)]
+            rest = (its_grid, soil, its_body, self._impulse, self._substep)
+            scatter.append(self._record(kernels.scatter, len(particles[0]), *particles, *rest))
+        fields = (self._momentum, self._velocity, self._before, self._inverse_mass, self._impulse)
+        self._begin = [
+            *ghost.fold(self._momentum),
+            self._record(node.begin, nodes, grid, *fields),
+            *ghost.unfold(self._before),
         ]
-        self._from_grid = record(kernels.from_grid, n, home, u, v, grid, self._before, 0.0)
+        self._step = [
+            *scatter,
+            *(body.launches if body else ()),
+            *ghost.fold(self._impulse),
+            self._record(
+                node.step, nodes, grid, self._velocity, self._inverse_mass, self._impulse, self._substep
+            ),
+            *self._record_nonlocal(ghost),
+            *ghost.unfold(self._velocity),
+            self._record(kernels.gather, n, x, home, felt, c, grid, self._velocity, *watch),
+            self._record(kernels.material, n, felt, c, e, ln_j, grid, soil),
+        ]
+        self._from_grid = self._record(kernels.from_grid, n, home, felt, v, grid, self._before, 0.0)
         self._graphs: dict[int, wp.Graph] = {}
+
+    def _parts(self, n: int) -> Iterator[tuple[slice, Any, Any]]:
+        """Particles with the grid and the body that they see. Those on the plane of symmetry count half."""
+        grid = self._grid
+        body = self._body.data if self._body else body_struct(self._real, ContactLaw())()
+        on_plane = self._half.on_plane if self._half is not None else 0
+        if not on_plane:
+            yield slice(0, n), grid, body
+            return
+        for part, share in ((slice(0, on_plane), 0.5), (slice(on_plane, n), 1.0)):
+            its_grid, its_body = type(grid)(), type(body)()
+            its_grid.assign(grid)
+            its_body.assign(body)
+            its_grid.particle_mass, its_grid.particle_volume = (
+                share * grid.particle_mass,
+                share * grid.particle_volume,
+            )
+            its_body.stiffness, its_body.damping = share * body.stiffness, share * body.damping
+            if self._body is not None:
+                its_body.stick = body.stick[part]
+            yield part, its_grid, its_body
+
+    def _record_nonlocal(self, ghost: Images) -> list[wp.Launch]:
+        if not self.effects.nonlocality:
+            return []
+        grid = self._grid
+        sink = np.zeros(grid.nx * grid.ny * grid.nz)
+        if self.scene.material.fluidity_at_walls == "zero":
+            sink = wall_sink((grid.nx, grid.ny, grid.nz), grid.low, grid.high)
+        particles = [self._home, self._e, self._ln_j]
+        return NonlocalFluidity(
+            self._real, self.effects, self.device, sink, particles, grid, self._soil, ghost, self._velocity
+        ).launches
+
+    def _record_wraps(self, n: int) -> list[wp.Launch]:
+        """Bring particles that left a periodic bin back in."""
+        self._turns: dict[int, wp.array] = {}
+        launches = []
+        for axis, kind in enumerate(self.scene.bed.walls.kinds):
+            if kind == "periodic":
+                self._turns[axis] = turns = wp.zeros(n, dtype=int, device=self.device)
+                wrap = images(self._real).wrap
+                launches.append(self._record(wrap, n, self._x, turns, axis, self.scene.bed.size[axis]))
+        return launches
 
     # --- stepping -----------------------------------------------------------------------------------------
 
-    def _load_motion(self, frame: int) -> None:
-        """The body's pose and velocity in every substep of the frame that begins at `frame`."""
-        self._substep.zero_()
-        self._body.impulse.zero_()
-        if self.scene.plate is None:
-            return
-        m, dt = self.substeps_per_frame, self.time_step
-        poses = self.scene.poses_at((frame * m + np.arange(m + 1)) * dt)
-        velocity = np.diff(poses[:, :3], axis=0) / dt
-        spin = angular_velocity(poses[:-1, 3:], poses[1:, 3:], dt)
-        for array, values in (
-            (self._body.position, poses[:-1, :3]),
-            (self._body.rotation, poses[:-1, 3:]),
-            (self._body.velocity, velocity),
-            (self._body.spin, spin),
-        ):
-            array.assign(values)
+    def _advance(self, index: int) -> None:
+        left = self.substeps_per_frame
+        while left:
+            self._top_speed.zero_()
+            for launch in self._to_grid:
+                launch.launch()
+            speed = max(self._top_body_speed, float(self._top_speed.numpy()[0]))
+            steps = min(left, steps_to_remap(self.scene, self.time_step, speed))
+            left -= steps
+            if self.device.is_cuda:
+                wp.capture_launch(self._captured(steps))
+            else:
+                self._until_remap(steps)
+        self._check_particles(index)
 
-    def _interval(self, steps: int) -> None:
-        """The substeps from one remap to the next."""
-        self._begin.launch()
+    def _until_remap(self, steps: int) -> None:
+        for launch in self._begin:
+            launch.launch()
         for _ in range(steps):
             for launch in self._step:
                 launch.launch()
@@ -235,48 +291,54 @@ class Solver:
         self._from_grid.set_param_by_name("keep", keep)
         self._from_grid.launch()
 
-    def _advance(self, index: int) -> None:
-        left = self.substeps_per_frame
-        while left:
-            self._top_speed.zero_()
-            self._to_grid.launch()
-            speed = max(self._top_body, float(self._top_speed.numpy()[0]))
-            steps = min(left, steps_to_remap(self.scene, self.time_step, speed))
-            left -= steps
-            if not self.device.is_cuda:
-                self._interval(steps)
-                continue
-            if steps not in self._graphs:
-                for launch in (self._begin, *self._step, self._from_grid):
-                    wp.load_module(launch.kernel.module, device=self.device)
-                with wp.ScopedCapture(device=self.device) as capture:
-                    self._interval(steps)
-                self._graphs[steps] = capture.graph
-            wp.capture_launch(self._graphs[steps])
-        count, particle, substep, slow = (int(i) for i in self._stray.numpy())
-        if count:
-            time = (index - 1) / self.scene.frame_rate + substep * self.time_step
-            at = ", ".join(f"{c:.4f}" for c in self._x.numpy()[particle])
-            cause = (
-                "it left the grid: soil was thrown or pushed beyond it, raise scene.bed.headroom"
-                if slow
-                else "its speed is not finite or carried it further than a cell between two remaps: "
-                "lower scene.courant or the body's speed"
-            )
-            raise SolverStopped(
-                f"particle {particle} at ({at}) m went wrong at {time:.5f} s, substep {substep} of frame {index}: "
-                f"{cause} ({count} faults in this frame; the frames before it are good)"
-            )
+    def _captured(self, steps: int) -> wp.Graph:
+        if steps not in self._graphs:
+            for launch in (*self._begin, *self._step, self._from_grid):
+                wp.load_module(launch.kernel.module, device=self.device)
+            with wp.ScopedCapture(device=self.device) as capture:
+                self._until_remap(steps)
+            self._graphs[steps] = capture.graph
+        return self._graphs[steps]
+
+    def _check_particles(self, index: int) -> None:
+        count, particle, substep, near = (int(i) for i in self._stray.numpy())
+        if not count:
+            return
+        time = (index - 1) / self.scene.frame_rate + substep * self.time_step
+        at = ", ".join(f"{c:.4f}" for c in self._x.numpy()[particle])
+        if self._half is not None:
+            particle = int(self._half.kept[particle])
+        cause = (
+            "it left the grid: soil was thrown or pushed beyond it, raise scene.bed.headroom"
+            if near
+            else "its speed is not finite or carried it further than a cell between two remaps: lower scene.courant or "
+            "the body's speed"
+        )
+        raise SolverStopped(
+            f"particle {particle} at ({at}) m went wrong at {time:.5f} s, substep {substep} of frame {index}: "
+            f"{cause} ({count} faults in this frame; the frames before it are good)"
+        )
 
     def _frame(self, index: int) -> Frame:
         scene = self.scene
-        pose = scene.poses_at(np.array([index / scene.frame_rate]))[0]
-        impulse = self._body.impulse.numpy().astype(float) * (scene.frame_rate if index else 0.0)
+        time = index / scene.frame_rate
+        pose = scene.poses_at(np.array([time]))[0]
+        impulse = np.zeros((2, 3))
+        if self._body is not None:
+            pose, impulse = self._body.pose(time), self._body.impulse() * (scene.frame_rate if index else 0.0)
+        position, velocity = self._x.numpy(), self._felt.numpy()[:, :3]
+        for axis, turns in self._turns.items():
+            position = position.copy()  # on the CPU it is the solver's own memory
+            position[:, axis] += turns.numpy() * scene.bed.size[axis]
+        if self._half is not None:
+            position, velocity = self._half.whole(position, velocity)
+            # The other half doubles force along and moment within the plane of symmetry, and cancels the rest.
+            impulse *= [[2.0, 0.0, 2.0], [0.0, 2.0, 0.0]]
         return Frame(
             index=index,
-            time=index / scene.frame_rate,
-            position=self._x.numpy().astype(np.float32),
-            velocity=self._u.numpy().astype(np.float32),
+            time=time,
+            position=position.astype(np.float32),
+            velocity=velocity.astype(np.float32),
             body_pose=pose,
             body_points=rotate(pose[3:], scene.body_points()) + pose[:3],
             force=impulse[0],

@@ -45,7 +45,7 @@ def asymmetry(scene: Scene) -> str | None:
     """Why a scene is not mirror symmetric about y = Ly / 2; None if it is."""
     if scene.bed.walls.y == "periodic":
         return "the bed is periodic in y (bed.walls.y)"
-    if scene.plate is not None:
+    if scene.body is not None:
         # A path may turn off the plane between two frames.
         path = getattr(scene, "path", None)
         times = np.concatenate([scene.times(), [row[0] for row in path or ()]])

@@ -6,20 +6,22 @@ import math
 
 import numpy as np
 
+from .rigid_body import longest_step
 from .scene import Scene
 
 __all__ = ["steps_to_remap", "substeps_per_frame", "top_body_speed"]
 
 
 def substeps_per_frame(scene: Scene) -> int:
-    """Equal steps in a frame: as many as elastic waves and the body's motion ask for."""
+    """Equal steps in a frame: as many as elastic waves, the body's motion and a free body's mass ask for."""
     limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + top_body_speed(scene))
+    limit = min(limit, longest_step(scene))
     return max(1, math.ceil(1.0 / scene.frame_rate / limit - 1e-9))
 
 
 def top_body_speed(scene: Scene) -> float:
     """Fastest motion of the body between frames [m/s]."""
-    if scene.plate is None:
+    if scene.body is None:
         return 0.0
     step = np.diff(scene.body_poses()[:, :3], axis=0)
     return float(np.max(np.linalg.norm(step, axis=1), initial=0.0) * scene.frame_rate)

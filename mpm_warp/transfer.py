@@ -6,7 +6,8 @@ of the place they had at the remap, their `home`. A remap smooths velocities ove
 that smoothing acts as a viscosity that grows with 1 / dt.
 
 The transfers visit the 27 nodes around a particle, as 9 rows along z. Node (i, j, k) is entry (i ny + j) nz + k of a
-flat array of 4-vectors: momentum and mass, velocity and 1 / mass, or impulse.
+flat array of 4-vectors: momentum and mass, impulse, or velocity with what the effect `nonlocality` adds to the
+fluidity as the fourth number.
 """
 
 from functools import cache
@@ -14,21 +15,24 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .constitutive import constitutive, soil_struct
-from .contact import body_struct, contact
+from .constitutive import constitutive
+from .contact import ContactLaw, body_struct, contact
 from .effects import Effects
 from .grid import grid_struct
 from .rows import rows
+from .soil import soil_struct
+from .splines import splines
 
 __all__ = ["transfer"]
 
 
 @cache
-def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> SimpleNamespace:
+def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: bool) -> SimpleNamespace:
     """Kernels in precision `real` with only the physics in `effects`: `to_grid` and `from_grid` at a remap;
     `scatter`, `gather` and `material` in every step.
 
-    `atomic` is needed where many threads write to the grid at once (a GPU).
+    `touch` is the contact with a body, None without one; `atomic` is needed where many threads write to the grid at
+    once (a GPU).
     """
     # Warp writes a product and the sum it goes into as two statements: without the flag they stay two instructions.
     fused = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast"}
@@ -36,34 +40,17 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
     vec4 = wp.types.vector(4, real)
     law = constitutive(real, effects)
     vec6, mat33 = law.vec6, law.mat33
-    Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real)
-    push = contact(real, atomic).push
+    Soil, Grid = soil_struct(real, effects.fluidity), grid_struct(real)
+    Body = body_struct(real, touch or ContactLaw())
+    with_body = touch is not None
+    push = contact(real, touch or ContactLaw(), atomic).push
     update, kirchhoff = law.update, law.kirchhoff
+    spline = splines(real)
+    base_and_offset, weights, moments = spline.base_and_offset, spline.weights, spline.moments
     lanes = rows(real, gpu=atomic)
     row, plus, gather_row, scatter_row, spread, fold = (
         lanes.row, lanes.plus, lanes.gather, lanes.scatter, lanes.spread, lanes.fold
     )  # fmt: skip
-
-    @wp.func
-    def base_and_offset(x: vec3, grid: Grid):
-        # Lowest of the three nodes per axis, and the particle's distance from it in cells, in [0.5, 1.5).
-        # The index is bounded: a stray position must not write outside the grid (it would end the process).
-        g = (x - grid.origin) * grid.inverse_spacing
-        i = wp.clamp(int(g[0] - real(0.5)), 0, grid.nx - 3)
-        j = wp.clamp(int(g[1] - real(0.5)), 0, grid.ny - 3)
-        k = wp.clamp(int(g[2] - real(0.5)), 0, grid.nz - 3)
-        return wp.vec3i(i, j, k), g - vec3(real(i), real(j), real(k))
-
-    @wp.func
-    def weights(f: real):
-        a = real(1.5) - f
-        b = f - real(1.0)
-        c = f - real(0.5)
-        return vec3(real(0.5) * a * a, real(0.75) - b * b, real(0.5) * c * c)
-
-    @wp.func
-    def moments(w: vec3, f: real):
-        return vec3(-f * w[0], (real(1.0) - f) * w[1], (real(2.0) - f) * w[2])
 
     @wp.func
     def node_index(base: wp.vec3i, i: int, j: int, grid: Grid):
@@ -123,7 +110,7 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
     def scatter(
         x: wp.array(dtype=vec3),
         home: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        felt: wp.array(dtype=vec4),
         e: wp.array(dtype=vec6),
         ln_j: wp.array(dtype=real),
         grid: Grid,
@@ -140,14 +127,15 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         )
         start = -(q * f)
         if wp.static(with_body):
-            start += push(x[p], u[p], grid.particle_mass, grid.dt, substep[0], body)
+            u = vec3(felt[p][0], felt[p][1], felt[p][2])
+            start += push(p, x[p], u, grid.particle_mass, grid.dt, substep[0], body)
         deposit(base, f, vec4(start[0], start[1], start[2], real(0.0)), q, grid, impulse)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=fused)
     def gather(
         x: wp.array(dtype=vec3),
         home: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        felt: wp.array(dtype=vec4),
         c: wp.array(dtype=mat33),
         grid: Grid,
         velocity: wp.array(dtype=vec4),
@@ -181,8 +169,7 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         gy = fold(wz, all_y)
         gz = fold(az, all_v)
         scale = real(4.0) * grid.inverse_spacing
-        felt = vec3(total[0], total[1], total[2])
-        moved = x[p] + grid.dt * felt
+        moved = x[p] + grid.dt * vec3(total[0], total[1], total[2])
         g = (moved - grid.origin) * grid.inverse_spacing
         inside = (
             g[0] >= real(0.5) and g[1] >= real(0.5) and g[2] >= real(0.5)
@@ -193,7 +180,7 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         near = wp.length_sq(moved - home[p]) < grid.spacing * grid.spacing  # false for a NaN, too
         if inside and near:
             x[p] = moved
-            u[p] = felt
+            felt[p] = total
             c[p] = mat33(
                 gx[0] * scale, gy[0] * scale, gz[0] * scale,
                 gx[1] * scale, gy[1] * scale, gz[1] * scale,
@@ -206,6 +193,7 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
     # A kernel of its own: in one with the transfer the C++ compiler makes both slower.
     @wp.kernel(module="unique", enable_backward=False, module_options=fused)
     def material(
+        felt: wp.array(dtype=vec4),
         c: wp.array(dtype=mat33),
         e: wp.array(dtype=vec6),
         ln_j: wp.array(dtype=real),
@@ -213,14 +201,22 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         soil: Soil,
     ):
         p = wp.tid()
-        state = update(e[p], ln_j[p], grid.dt * c[p], grid.dt, soil)
+        # What `update` means by its last number; felt[p][3] is what cooperative flow adds.
+        g = real(0.0)
+        if wp.static(effects.nonlocality):
+            g = felt[p][3]
+        if wp.static(effects.fluidity):
+            g = wp.max(soil.g[p] + g, real(0.0))
+        state = update(e[p], ln_j[p], grid.dt * c[p], grid.dt, soil, g)
         e[p] = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
         ln_j[p] = state[6]
+        if wp.static(effects.fluidity):
+            soil.g[p] = state[7]
 
     @wp.kernel(module="unique", enable_backward=False, module_options=fused)
     def from_grid(
         home: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        felt: wp.array(dtype=vec4),
         v: wp.array(dtype=vec3),
         grid: Grid,
         before: wp.array(dtype=vec4),
@@ -237,7 +233,8 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
             for j in range(3):
                 total = plus(total, wx[i] * wy[j], gather_row(before, node_index(base, i, j, grid)))
         smooth = fold(weights(f[2]), total)
-        v[p] = u[p] + keep * (v[p] - vec3(smooth[0], smooth[1], smooth[2]))
+        u = vec3(felt[p][0], felt[p][1], felt[p][2])
+        v[p] = u + keep * (v[p] - vec3(smooth[0], smooth[1], smooth[2]))
 
     return SimpleNamespace(
         to_grid=to_grid, scatter=scatter, gather=gather, material=material, from_grid=from_grid

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,6 @@ import numpy as np
 from .axle import Axle
 from .bodies import Cylinder
 from .errors import SceneError
-from .friction import with_friction_angle
 from .rotation import about_y
 from .scene import Scene
 
@@ -50,7 +49,7 @@ class Wheel(Scene):
     rim_speed: float = 0.0195
     """Angular speed times half the diameter [m/s]."""
     friction_angle: float | None = None
-    """Sets material.static_friction to its tangent [degrees]; None: the material's own."""
+    """In place of material.friction_angle [degrees]; None: the material's own."""
     settle: float = 1.0
     """Time at rest under the load before driving [s]; recorded like the rest."""
     damping: float = 0.0
@@ -84,11 +83,9 @@ class Wheel(Scene):
             _ = self.body
         except SceneError as error:
             raise SceneError(str(error).replace("tool.", "scene.")) from None
-        raised = False
         if self.friction_angle is not None:
-            material, raised = with_friction_angle(self.material, self.friction_angle)
+            material = replace(self.material, friction_angle=self.friction_angle)
             object.__setattr__(self, "material", material)
-        object.__setattr__(self, "_raised", raised)
         self._check_thickness("a wheel's width")
         self._check_fits()
 
@@ -136,12 +133,6 @@ class Wheel(Scene):
 
     def warnings(self) -> list[str]:
         found = super().warnings()
-        if self._raised:
-            found.append(
-                f"a friction angle of {self.friction_angle:g} degrees is a static friction of "
-                f"{self.material.static_friction:.4f}, not below material.limit_friction, which was raised to "
-                f"{self.material.limit_friction:.4f}"
-            )
         if self.grousers and self.grouser_thickness < self.bed.spacing:
             found.append(
                 f"the grousers are {self.grouser_thickness / self.bed.spacing:.2f} grid spacings thick; below 1 the "

@@ -88,5 +88,5 @@ def simulate_scene(
         writer.finish(wall_time)
     frames = scene.frame_count - 1
     return Timing(
-        wall_time, frames / scene.frame_rate, frames * solver.substeps_per_frame * solver.particle_count
+        wall_time, frames / scene.frame_rate, frames * solver.substeps_per_frame * solver.computed_count
     )

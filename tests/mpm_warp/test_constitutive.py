@@ -9,7 +9,8 @@ from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 
 from mpm_warp import Effects, Material
-from mpm_warp.constitutive import constitutive, soil_struct
+from mpm_warp.constitutive import constitutive
+from mpm_warp.soil import soil_parameters, soil_struct
 
 SAND = Material(youngs_modulus=15e6)
 ALL = Effects()
@@ -20,7 +21,7 @@ class Point:
     """Runs the Warp functions on many single points."""
 
     def __init__(self, real=wp.float64, effects=ALL, material=SAND):
-        law, Soil = constitutive(real, effects), soil_struct(real)
+        law, Soil = constitutive(real, effects), soil_struct(real, effects.fluidity)
         vec6, mat33 = law.vec6, law.mat33
         update, trial, volume = law.update, law.strain_trial, law.volume_step
 
@@ -35,7 +36,7 @@ class Point:
         ):
             p = wp.tid()
             for _ in range(n):
-                state = update(e[p], j[p], a[p], dt, soil)
+                state = update(e[p], j[p], a[p], dt, soil, real(0.0))
                 e[p] = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
                 j[p] = state[6]
 
@@ -46,15 +47,7 @@ class Point:
             j[p] = volume(a[p])
 
         self._steps, self._trials, self.types = steps, trials, (vec6, real, mat33)
-        self.soil = Soil()
-        self.soil.shear_modulus, self.soil.bulk_modulus = material.shear_modulus, material.bulk_modulus
-        self.soil.static_friction, self.soil.limit_friction = (
-            material.static_friction,
-            material.limit_friction,
-        )
-        self.soil.reference_rate = material.reference_inertial_number / (
-            material.grain_diameter * math.sqrt(material.grain_density)
-        )
+        self.soil = soil_parameters(real, material, 1.0, effects.fluidity)
 
     def _arrays(self, strain, ln_j, a):
         six = np.array([[s[i, k] for i, k in PAIRS] for s in strain])

@@ -1,0 +1,59 @@
+"""Where the grid lies: its nodes, walls and ghost layers for a scene."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .grid import grid_struct
+from .images import mirror_pairs, seam_pairs
+from .scene import Scene
+
+__all__ = ["lay_grid"]
+
+_PADDING = 3  # cells outside the bin, so that the nodes around a particle at a wall exist
+
+
+def lay_grid(
+    scene: Scene, real: type, time_step: float, particle_volume: float, symmetric: bool
+) -> tuple[Any, dict[int, np.ndarray]]:
+    """The grid's struct, and for each axis that has ghost layers these and their images (images.py).
+
+    Walls fall on nodes where the bin is a whole number of cells; otherwise the grid is centred in x and y, which
+    keeps the scene's mirror symmetry, and the nodes just outside the bin are the walls. With `symmetric` the grid ends two layers
+    beyond the plane y = Ly / 2.
+    """
+    bed, vec3 = scene.bed, wp.types.vector(3, real)
+    h = bed.spacing
+    cells = [math.ceil(s / h - 1e-6) for s in bed.size[:2]]
+    origin = [0.5 * (s - c * h) - _PADDING * h for s, c in zip(bed.size[:2], cells, strict=True)]
+    origin.append(-bed.size[2] - _PADDING * h)
+    count = [c + 2 * _PADDING + 1 for c in cells]
+    count.append(math.ceil((bed.size[2] + bed.headroom) / h) + 2 * _PADDING + 1)
+    low = [_PADDING, _PADDING, _PADDING]
+    high = [_PADDING + cells[0], _PADDING + cells[1], 2**30]
+    ghosts = {
+        axis: seam_pairs(_PADDING, cells[axis]) for axis in (0, 1) if bed.walls.kinds[axis] == "periodic"
+    }
+    if symmetric:
+        ghosts[1] = mirror_pairs(2 * _PADDING + cells[1])
+        left_out = ghosts[1].min()
+        ghosts[1] -= left_out
+        origin[1] += left_out * h
+        count[1] -= left_out
+        low[1], high[1] = -1, high[1] - left_out
+
+    grid = grid_struct(real)()
+    grid.origin = vec3(*origin)
+    grid.spacing, grid.inverse_spacing = h, 1.0 / h
+    grid.nx, grid.ny, grid.nz = (int(c) for c in count)
+    grid.dt, grid.gravity = time_step, vec3(*scene.gravity_vector)
+    grid.low, grid.high = wp.vec3i(*low), wp.vec3i(*(int(i) for i in high))
+    grid.wall_friction = vec3(*bed.walls.friction)
+    grid.particle_volume = particle_volume
+    grid.particle_mass = particle_volume * scene.material.bulk_density
+    grid.speed_limit = h / time_step
+    return grid, ghosts
