@@ -21,7 +21,7 @@ from .walls import Walls
 
 __all__ = ["Bed", "Scene"]
 
-INITIAL_STRESSES = ("geostatic", "none")
+INITIAL_STRESSES = ("geostatic", "k0", "none")
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ class Bed:
     mirrored: bool = False
     """A random arrangement is its own mirror image about y = Ly / 2, which mirror symmetry needs."""
     initial_stress: str = "geostatic"
-    """geostatic: isotropic pressure rho g depth; none: stress-free, settles in the first frames."""
+    """geostatic: isotropic pressure rho g depth; k0: the horizontal stress is nu / (1 - nu) times the vertical one;
+    none: stress-free, settles in the first frames."""
     headroom: float = 0.25
     """Height above the surface up to which soil may be thrown or piled [m]."""
     store_every: int = 1

@@ -21,7 +21,7 @@ class RetainingWall(Scene):
     """[m/s]"""
 
     @property
-    def plate(self) -> Plate:
+    def body(self) -> Plate:
         return Plate(length=0.4, width=1.0, thickness=2.0 * BEHIND, friction=0.0)
 
     @property
@@ -37,8 +37,8 @@ class RetainingWall(Scene):
         poses = super().poses_at(time)
         # Soil touches the wall where contact begins: `contact_margin` spacings off its face.
         face = BEHIND - self.contact_margin * self.bed.spacing + self.speed * np.atleast_1d(time)
-        poses[:, 0] = face - 0.5 * self.plate.thickness
-        poses[:, 2] = 0.5 * self.plate.length - DEPTH
+        poses[:, 0] = face - 0.5 * self.body.thickness
+        poses[:, 2] = 0.5 * self.body.length - DEPTH
         return poses
 
 

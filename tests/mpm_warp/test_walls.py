@@ -134,11 +134,11 @@ def test_walls_survive_plain_data():
 
 
 def test_plain_walls_cost_nothing():
-    """Without ghost nodes a substep is three launches, and nothing counts turns."""
+    """Without ghost nodes a step is scatter, grid, gather and material, and nothing counts turns."""
     plain, periodic = (
         Solver(cut(bed=Bed(size=(0.48, 0.4, 0.16), spacing=0.02, walls=Walls(y=y))))
         for y in ("no_slip", "periodic")
     )
-    assert len(plain._launches) == 3
+    assert len(plain._step) == 4
     assert plain._turns == {}
-    assert len(periodic._launches) == 6
+    assert len(periodic._step) == 6
