@@ -22,6 +22,7 @@ def grid_struct(real: type) -> type:
         ny: int
         nz: int
         dt: real  # [s]
+        damping: real  # viscous time of the elastic strain / dt
         gravity: vec3  # [m/s^2]
         # Nodes with index <= low or >= high belong to the floor and the walls.
         low: wp.vec3i

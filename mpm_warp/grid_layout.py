@@ -35,9 +35,11 @@ def lay_grid(
     count.append(math.ceil((bed.size[2] + bed.headroom) / h) + 2 * _PADDING + 1)
     low = [_PADDING, _PADDING, _PADDING]
     high = [_PADDING + cells[0], _PADDING + cells[1], 2**30]
-    ghosts = {
-        axis: seam_pairs(_PADDING, cells[axis]) for axis in (0, 1) if bed.walls.kinds[axis] == "periodic"
-    }
+    ghosts = {}
+    for axis in (0, 1):
+        if bed.walls.kinds[axis] == "periodic":
+            ghosts[axis] = seam_pairs(_PADDING, cells[axis])
+            low[axis], high[axis] = -1, 2**30  # no walls
     if symmetric:
         ghosts[1] = mirror_pairs(2 * _PADDING + cells[1])
         left_out = ghosts[1].min()
@@ -51,6 +53,7 @@ def lay_grid(
     grid.spacing, grid.inverse_spacing = h, 1.0 / h
     grid.nx, grid.ny, grid.nz = (int(c) for c in count)
     grid.dt, grid.gravity = time_step, vec3(*scene.gravity_vector)
+    grid.damping = scene.elastic_damping * h / scene.material.wave_speed / time_step
     grid.low, grid.high = wp.vec3i(*low), wp.vec3i(*(int(i) for i in high))
     grid.wall_friction = vec3(*bed.walls.friction)
     grid.particle_volume = particle_volume

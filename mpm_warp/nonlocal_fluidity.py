@@ -113,6 +113,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         ln_j: wp.array(dtype=real),
         grid: Grid,
         soil: Soil,
+        on_plane: int,  # so many particles, the first ones, lie on a mirror plane and count half
         sums: wp.array(dtype=vec4),
     ):
         p = wp.tid()
@@ -123,6 +124,8 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
             wy = weights(f[1])
             wz = weights(f[2])
             amount = vec4(found[0], found[1], found[2], real(0.0))
+            if p < on_plane:
+                amount = real(0.5) * amount
             for i in range(3):
                 for j in range(3):
                     row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
@@ -198,9 +201,9 @@ class NonlocalFluidity:
         sink: R of each node, see `wall_sink`.
         particles: arrays home, e and ln J.
         grid, soil: the solver's structs.
-        images: ghost nodes; the fluidity beyond a seam or a mirror plane counts where particles reach across,
-            but nothing diffuses through.
+        images: ghost nodes, with plain signs: what is carried here has no direction, so a mirror does not turn it.
         velocity: nodal velocities, whose fourth number takes the answer.
+        on_plane: number of particles, the first ones, that lie on a mirror plane.
     """
 
     def __init__(
@@ -214,6 +217,7 @@ class NonlocalFluidity:
         soil: Any,
         images: Images,
         velocity: wp.array,
+        on_plane: int = 0,
     ) -> None:
         kernels = nonlocal_kernels(real, effects, atomic=device.is_cuda)
         vec4 = wp.types.vector(4, real)
@@ -227,16 +231,17 @@ class NonlocalFluidity:
         relaxation = soil.fluidity_time / grid.dt if effects.fluidity else None
         record = {"device": device, "record_cmd": True}
 
-        def sweep(start: wp.array, end: wp.array) -> wp.Launch:
+        def sweep(start: wp.array, end: wp.array) -> list[wp.Launch]:
             inputs = [ratio, grid.nz, grid.ny * grid.nz, walls, start, end]
-            return wp.launch(kernels.sweep, count, inputs, **record)
+            return [*images.unfold(start), wp.launch(kernels.sweep, count, inputs, **record)]
 
-        project = wp.launch(kernels.project, len(particles[0]), [*particles, grid, soil, sums], **record)
+        inputs = [*particles, grid, soil, on_plane, sums]
+        project = wp.launch(kernels.project, len(particles[0]), inputs, **record)
         self.launches = [
             project,
             *images.fold(sums),
             wp.launch(kernels.prepare, count, [sums, field], **record),
-            *[sweep(field, other), sweep(other, field)] * (sweep_count(ratio, relaxation) // 2),
+            *[*sweep(field, other), *sweep(other, field)] * (sweep_count(ratio, relaxation) // 2),
             wp.launch(kernels.place, count, [field, velocity], **record),
         ]
         """In order, after the grid step and before the particles read the grid."""

@@ -150,6 +150,8 @@ class Scene:
     """Distance from the body's surface at which it begins to act on particles [grid spacings]; see contact.py."""
     courant: float = 0.6
     """Time step as a share of spacing / wave speed."""
+    elastic_damping: float = 0.1
+    """Damping ratio of elastic waves as short as the grid can carry; longer ones are damped less [-]."""
     remap_time: float = 4.0e-3
     """Longest time between two remaps of the velocities [s]; see solver.py."""
     remap_distance: float = 0.1

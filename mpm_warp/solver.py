@@ -149,6 +149,9 @@ class Solver:
         self._c = wp.zeros(n, dtype=wp.types.matrix((3, 3), real), device=device)
         self._e = wp.array(strain, dtype=wp.types.vector(6, real), device=device)
         self._ln_j = wp.array(ln_j, dtype=real, device=device)
+        shear, bulk = 2.0 * scene.material.shear_modulus, scene.material.bulk_modulus
+        stress = shear * strain + bulk * ln_j[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+        self._stress = wp.array(stress, dtype=wp.types.vector(6, real), device=device)
         nodes = self._grid.nx * self._grid.ny * self._grid.nz
         self._momentum, self._velocity, self._before, self._impulse = (
             wp.zeros(nodes + 1, dtype=vec4, device=device)
@@ -196,8 +199,8 @@ class Solver:
                     *watch,
                 )
             )
-            particles = [a[part] for a in (x, home, felt, e, ln_j)]
-            rest = (its_grid, soil, its_body, self._impulse, self._substep)
+            particles = [a[part] for a in (x, home, felt, self._stress)]
+            rest = (its_grid, its_body, self._impulse, self._substep)
             scatter.append(self._record(kernels.scatter, len(particles[0]), *particles, *rest))
         fields = (self._momentum, self._velocity, self._before, self._inverse_mass, self._impulse)
         self._begin = [
@@ -212,10 +215,10 @@ class Solver:
             self._record(
                 node.step, nodes, grid, self._velocity, self._inverse_mass, self._impulse, self._substep
             ),
-            *self._record_nonlocal(ghost),
+            *self._record_nonlocal(ghosts),
             *ghost.unfold(self._velocity),
             self._record(kernels.gather, n, x, home, felt, c, grid, self._velocity, *watch),
-            self._record(kernels.material, n, felt, c, e, ln_j, grid, soil),
+            self._record(kernels.material, n, felt, c, e, ln_j, self._stress, grid, soil),
         ]
         self._from_grid = self._record(kernels.from_grid, n, home, felt, v, grid, self._before, 0.0)
         self._graphs: dict[int, wp.Graph] = {}
@@ -241,16 +244,18 @@ class Solver:
                 its_body.stick = body.stick[part]
             yield part, its_grid, its_body
 
-    def _record_nonlocal(self, ghost: Images) -> list[wp.Launch]:
+    def _record_nonlocal(self, ghosts: dict[int, np.ndarray]) -> list[wp.Launch]:
         if not self.effects.nonlocality:
             return []
-        grid = self._grid
+        real, grid = self._real, self._grid
         sink = np.zeros(grid.nx * grid.ny * grid.nz)
         if self.scene.material.fluidity_at_walls == "zero":
             sink = wall_sink((grid.nx, grid.ny, grid.nz), grid.low, grid.high)
         particles = [self._home, self._e, self._ln_j]
+        ghost = Images(real, self.device, grid, ghosts, mirrored=False)  # fluidity has no direction
+        on_plane = self._half.on_plane if self._half is not None else 0
         return NonlocalFluidity(
-            self._real, self.effects, self.device, sink, particles, grid, self._soil, ghost, self._velocity
+            real, self.effects, self.device, sink, particles, grid, self._soil, ghost, self._velocity, on_plane
         ).launches
 
     def _record_wraps(self, n: int) -> list[wp.Launch]:

@@ -15,6 +15,8 @@ __all__ = ["steps_to_remap", "substeps_per_frame", "top_body_speed"]
 def substeps_per_frame(scene: Scene) -> int:
     """Equal steps in a frame: as many as elastic waves, the body's motion and a free body's mass ask for."""
     limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + top_body_speed(scene))
+    # A damped oscillator asks for a shorter step than a free one.
+    limit *= math.sqrt(1.0 + scene.elastic_damping**2) - scene.elastic_damping
     limit = min(limit, longest_step(scene))
     return max(1, math.ceil(1.0 / scene.frame_rate / limit - 1e-9))
 

@@ -111,10 +111,8 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         x: wp.array(dtype=vec3),
         home: wp.array(dtype=vec3),
         felt: wp.array(dtype=vec4),
-        e: wp.array(dtype=vec6),
-        ln_j: wp.array(dtype=real),
+        stress: wp.array(dtype=vec6),
         grid: Grid,
-        soil: Soil,
         body: Body,
         impulse: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
@@ -122,7 +120,8 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         p = wp.tid()
         base, f = base_and_offset(home[p], grid)
         # Of the stress: -dt V D^-1 tau (x_i - x_p), D = dx^2 / 4; q is per cell.
-        q = kirchhoff(e[p], ln_j[p], soil) * (
+        t = stress[p]
+        q = mat33(t[0], t[3], t[4], t[3], t[1], t[5], t[4], t[5], t[2]) * (
             real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing
         )
         start = -(q * f)
@@ -197,6 +196,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         c: wp.array(dtype=mat33),
         e: wp.array(dtype=vec6),
         ln_j: wp.array(dtype=real),
+        stress: wp.array(dtype=vec6),
         grid: Grid,
         soil: Soil,
     ):
@@ -207,11 +207,20 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
             g = felt[p][3]
         if wp.static(effects.fluidity):
             g = wp.max(soil.g[p] + g, real(0.0))
-        state = update(e[p], ln_j[p], grid.dt * c[p], grid.dt, soil, g)
-        e[p] = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
+        before = e[p]
+        volume_before = ln_j[p]
+        state = update(before, volume_before, grid.dt * c[p], grid.dt, soil, g)
+        after = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
+        e[p] = after
         ln_j[p] = state[6]
         if wp.static(effects.fluidity):
             soil.g[p] = state[7]
+        # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone.
+        volume = state[6] + grid.damping * (state[6] - volume_before)
+        if wp.static(effects.separation):
+            volume = wp.where(state[6] < real(0.0), wp.min(volume, real(0.0)), state[6])
+        t = kirchhoff(after + grid.damping * (after - before), volume, soil)
+        stress[p] = vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])
 
     @wp.kernel(module="unique", enable_backward=False, module_options=fused)
     def from_grid(
