@@ -129,7 +129,9 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         if wp.static(with_body):
             u = vec3(felt[p][0], felt[p][1], felt[p][2])
             start += push(p, x[p], u, grid.particle_mass, grid.dt, substep[0], body)
-        deposit(base, f, vec4(start[0], start[1], start[2], grid.particle_mass * swelling[p]), q, grid, impulse)
+        deposit(
+            base, f, vec4(start[0], start[1], start[2], grid.particle_mass * swelling[p]), q, grid, impulse
+        )
 
     @wp.kernel(module="unique", enable_backward=False, module_options=fused)
     def gather(
@@ -230,10 +232,11 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         swelling[p] = state[6] - volume_before
         if wp.static(effects.fluidity):
             soil.g[p] = state[7]
-        # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone.
+        # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone. It
+        # takes away at most half of the pressure, since soil can bear no tension.
         volume = state[6] + grid.damping * (state[6] - volume_before)
         if wp.static(effects.separation):
-            volume = wp.where(state[6] < real(0.0), wp.min(volume, real(0.0)), state[6])
+            volume = wp.where(state[6] < real(0.0), wp.min(volume, real(0.5) * state[6]), state[6])
         t = kirchhoff(after + grid.damping * (after - before), volume, soil)
         stress[p] = vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])
 

@@ -51,10 +51,10 @@ def settings(kind: str) -> dict[str, list[str]]:
     changes = {
         "jittered, seed 0": ["scene.bed.arrangement=jittered", "++scene.bed.mirrored=true"],
         "jittered, seed 1": ["scene.bed.arrangement=jittered", "++scene.bed.mirrored=true", "seed=1"],
+        "margin -1": ["scene.contact_margin=-1"],
         "margin -0.5": ["scene.contact_margin=-0.5"],
         "margin -0.25": ["scene.contact_margin=-0.25"],
         "margin 0": ["scene.contact_margin=0"],
-        "margin 0.25": ["scene.contact_margin=0.25"],
         "courant 0.3": ["scene.courant=0.3"],
         "damping 0": ["scene.elastic_damping=0"],
         "damping 0.2": ["scene.elastic_damping=0.2"],
@@ -78,8 +78,10 @@ def settings(kind: str) -> dict[str, list[str]]:
         found["dx 10, 8 per cell"] = at("10", 8)
         found["dx 6.7, 1 per cell"] = at("6.7", 1)
         for dx, ppc in (("20", 4), ("10", 4)):
-            for margin in ("-0.5", "0"):
-                found[f"dx {dx}, {ppc} per cell, margin {margin}"] = at(dx, ppc, f"scene.contact_margin={margin}")
+            for margin in ("-1", "-0.5"):
+                found[f"dx {dx}, {ppc} per cell, margin {margin}"] = at(
+                    dx, ppc, f"scene.contact_margin={margin}"
+                )
         found["dx 6.7, 4 per cell"] = at("6.7", 4)
     return found
 
@@ -125,7 +127,9 @@ def measure(kind: str, name: str, overrides: list[str]) -> dict[str, float | str
         }
     DATA.mkdir(parents=True, exist_ok=True)
     surface, moved = on_common_points(scene, last.position)
-    np.savez_compressed(DATA / f"{kind}_{name.replace(' ', '_')}.npz", force=force, surface=surface, moved=moved)
+    np.savez_compressed(
+        DATA / f"{kind}_{name.replace(' ', '_')}.npz", force=force, surface=surface, moved=moved
+    )
     return {k: round(float(v), 3) if isinstance(v, np.floating) else v for k, v in row.items()}
 
 
