@@ -16,6 +16,11 @@ WALL_CONDUCTANCE at floor and walls where g is to vanish there, otherwise 0.
 Particles get g_i - G_i, not g_i. Were they given g_i, the way to the grid and back would smear the fluidity over a
 grid spacing, which is far more than the physics does where A d is small against it.
 
+With `fluidity` the particles of a cell must also be kept together: where the Laplacian drains a cell, those with
+more g would grow and the others die out, unseen by the grid. Of the difference between a particle's g and the grid's
+(sharpened, so that smooth fields lose nothing) only the share `fading` of fluidity.py outlasts a step, as it does for
+the shortest wave the grid knows. It is 1 where A d is small against the spacing.
+
 The equations are relaxed by Jacobi sweeps, which keep g between 0 and the largest G. The steady form goes on from the
 last step's values, so that a few sweeps a step suffice.
 """
@@ -74,7 +79,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
     - `project`: volume, fluidity and s from the particles to `sums`,
     - `prepare`: `sums` to means in `field` (filled volume, G, s, g), clearing the sums,
     - `sweep`: one Jacobi sweep from one field to another,
-    - `place`: g - G to the fourth number of the nodes' `velocity`.
+    - `place`: what particles get to the fourth number of the nodes' `velocity`.
     """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     vec6 = wp.types.vector(6, real)
@@ -82,6 +87,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
     spline, law = splines(real), fluidity(real, effects)
     base_and_offset, weights = spline.base_and_offset, spline.weights
     coefficients, local_fluidity, slowing = law.coefficients, law.local_fluidity, law.slowing
+    fading = law.fading
 
     @wp.func
     def source(e: vec6, ln_j: real, p: int, dt: real, soil: Soil):
@@ -176,13 +182,42 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
             here[3] = (here[2] * here[1] + scale * flux) / (here[2] + scale * total + ratio * sink[n])
         swept[n] = here
 
+    @wp.func
+    def sharpened(n: int, here: vec4, nz: int, plane: int, field: wp.array(dtype=vec4)):
+        # G less the quarter of dx^2 laplacian(G) by which the way to the grid and back smooths it, along every axis
+        # on which both neighbours hold soil.
+        sharp = here[1]
+        for axis in range(3):
+            stride = plane
+            if axis == 1:
+                stride = nz
+            if axis == 2:
+                stride = 1
+            before = field[n - stride]
+            after = field[n + stride]
+            if wp.min(before[0], after[0]) > real(0.25) * here[0]:
+                sharp -= real(0.25) * (before[1] - real(2.0) * here[1] + after[1])
+        return sharp
+
     @wp.kernel(module="unique", enable_backward=False)
-    def place(field: wp.array(dtype=vec4), velocity: wp.array(dtype=vec4)):
+    def place(
+        grid: Grid,
+        soil: Soil,
+        nz: int,
+        plane: int,
+        field: wp.array(dtype=vec4),
+        velocity: wp.array(dtype=vec4),
+    ):
         n = wp.tid()
         found = field[n]
         if found[0] > real(0.0):
             v = velocity[n]
-            velocity[n] = vec4(v[0], v[1], v[2], found[3] - found[1])
+            amount = found[3] - found[1]
+            if wp.static(effects.fluidity):
+                if n >= plane and n < field.shape[0] - plane:
+                    lost = real(1.0) - fading(grid.inverse_spacing, grid.dt, soil)
+                    amount += lost * sharpened(n, found, nz, plane, field)
+            velocity[n] = vec4(v[0], v[1], v[2], amount)
 
     return SimpleNamespace(project=project, prepare=prepare, sweep=sweep, place=place)
 
@@ -232,6 +267,8 @@ class NonlocalFluidity:
             project,
             wp.launch(kernels.prepare, count, [sums, field], **record),
             *[sweep(field, other), sweep(other, field)] * (sweep_count(ratio, relaxation) // 2),
-            wp.launch(kernels.place, count, [field, velocity], **record),
+            wp.launch(
+                kernels.place, count, [grid, soil, grid.nz, grid.ny * grid.nz, field, velocity], **record
+            ),
         ]
         """In order, after the grid step and before the particles read the grid."""

@@ -13,6 +13,7 @@ import warp as wp
 from .constitutive import constitutive
 from .contact import body_struct, contact
 from .effects import Effects
+from .fluidity import fluidity
 from .grid import grid_struct
 from .soil import soil_struct
 from .splines import splines
@@ -33,6 +34,7 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
     Soil, Grid, Body = soil_struct(real, effects.fluidity), grid_struct(real), body_struct(real)
     push = contact(real, atomic).push
     update, kirchhoff = law.update, law.kirchhoff
+    fading = fluidity(real, effects).fading
     spline = splines(real)
     base_and_offset, weights, moments = spline.base_and_offset, spline.weights, spline.moments
 
@@ -149,12 +151,15 @@ def transfer(real: type, effects: Effects, with_body: bool, atomic: bool) -> Sim
         )  # fmt: skip
         slow = wp.length_sq(speed) < grid.speed_limit * grid.speed_limit  # false for a NaN, too
         if inside and slow:
-            # What `update` means by its last number; total[3] is what cooperative flow adds.
+            # What `update` means by its last number; total[3] is what cooperative flow adds (nonlocal_fluidity.py).
             g_now = real(0.0)
             if wp.static(effects.nonlocality):
                 g_now = total[3]
             if wp.static(effects.fluidity):
-                g_now = wp.max(soil.g[p] + g_now, real(0.0))
+                kept = real(1.0)
+                if wp.static(effects.nonlocality):
+                    kept = fading(grid.inverse_spacing, grid.dt, soil)
+                g_now = wp.max(kept * soil.g[p] + g_now, real(0.0))
             state = update(e[p], ln_j[p], grid.dt * gradient, grid.dt, soil, g_now)
             if wp.static(effects.fluidity):
                 soil.g[p] = state[7]
