@@ -127,7 +127,9 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
             wx = weights(f[0])
             wy = weights(f[1])
             wz = weights(f[2])
-            amount = vec4(found[0], found[1], found[2], real(0.0))
+            size = grid.inverse_spacing * grid.inverse_spacing * grid.inverse_spacing
+            size = size * grid.particle_volume
+            amount = size * vec4(found[0], found[1], found[2], real(0.0))
             for i in range(3):
                 for j in range(3):
                     row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
@@ -253,7 +255,7 @@ class NonlocalFluidity:
         walls = wp.array(sink, dtype=real, device=device)
         self._arrays = (sums, other, walls)  # a recorded launch does not promise to keep its arrays
         self.field = field
-        """Filled volume in particles, mean g or g_loc [1/s], s [-] and nodal fluidity g [1/s], shape (nodes, 4)."""
+        """Filled volume in cells, mean g or g_loc [1/s], s [-] and nodal fluidity g [1/s], shape (nodes, 4)."""
         ratio = (soil.cooperative_length / grid.spacing) ** 2
         relaxation = soil.fluidity_time / grid.dt if effects.fluidity else None
         record = {"device": device, "record_cmd": True}
