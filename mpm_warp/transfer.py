@@ -18,6 +18,7 @@ import warp as wp
 from .constitutive import constitutive
 from .contact import ContactLaw, body_struct, contact
 from .effects import Effects
+from .fluidity import fluidity
 from .grid import grid_struct
 from .rows import rows
 from .soil import soil_struct
@@ -45,6 +46,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
     with_body = touch is not None
     push = contact(real, touch or ContactLaw(), atomic).push
     update, kirchhoff = law.update, law.kirchhoff
+    fading = fluidity(real, effects).fading
     spline = splines(real)
     base_and_offset, weights, moments = spline.base_and_offset, spline.weights, spline.moments
     lanes = rows(real, gpu=atomic)
@@ -215,12 +217,15 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         soil: Soil,
     ):
         p = wp.tid()
-        # What `update` means by its last number.
+        # What `update` means by its last number; `excess` is what cooperative flow adds (nonlocal_fluidity.py).
         g = real(0.0)
         if wp.static(effects.nonlocality):
             g = excess[p]
         if wp.static(effects.fluidity):
-            g = wp.max(soil.g[p] + g, real(0.0))
+            kept = real(1.0)
+            if wp.static(effects.nonlocality):
+                kept = fading(grid.inverse_spacing, grid.dt, soil)
+            g = wp.max(kept * soil.g[p] + g, real(0.0))
         before = e[p]
         # Volume changes as the mean over the nodes around does: what a particle's own gradient says besides is noise, and
         # is taken back a step later.
