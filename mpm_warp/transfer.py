@@ -227,8 +227,8 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
                 kept = fading(grid.inverse_spacing, grid.dt, soil)
             g = wp.max(kept * soil.g[p] + g, real(0.0))
         before = e[p]
-        # Volume changes as the mean over the nodes around does: what a particle's own gradient says besides is noise, and
-        # is taken back a step later.
+        # Volume changes as the mean over the nodes around does: what a particle's own gradient says besides is noise,
+        # and is taken back a step later.
         volume_before = ln_j[p] + grid.volume_averaging * (felt[p][3] - swelling[p])
         state = update(before, volume_before, grid.dt * c[p], grid.dt, soil, g)
         after = vec6(state[0], state[1], state[2], state[3], state[4], state[5])

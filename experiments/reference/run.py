@@ -25,7 +25,6 @@ from mpm_warp import Effects, Solver
 from sgns.scenes import scene_from_config
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
 DATA = Path("data/reference")
