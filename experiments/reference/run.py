@@ -11,8 +11,8 @@ from __future__ import annotations
 import argparse
 import csv
 import logging
-import re
 import multiprocessing
+import re
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
