@@ -38,7 +38,7 @@ from mpm_warp.start import start_warp
 start_warp()
 print("ready", flush=True)
 input()
-wp.load_module(grid_step(wp.float32).module, device="cpu")
+wp.load_module(grid_step(wp.float32, ("no_slip",) * 3).begin.module, device="cpu")
 print("done")
 """
 
