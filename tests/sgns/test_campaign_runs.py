@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -80,6 +81,24 @@ def test_campaign_is_resumed(tmp_path, caplog):
     assert check_run(files[2]) == []
     np.testing.assert_array_equal(Run(files[1]).force, force)
     assert sorted(f.name for f in files[0].parent.iterdir()) == sorted(f.name for f in files)
+
+
+def test_runs_that_take_turns_are_the_runs_made_one_by_one(tmp_path, caplog):
+    one, two = campaign(tmp_path / "one", runs=5), campaign(tmp_path / "two", runs=5)
+    simulate_campaign(one, device="cpu", workers=1)
+    start = time.perf_counter()
+    with caplog.at_level(logging.INFO):
+        simulate_campaign(two, device="cpu", workers=1, batch=3)
+    elapsed = time.perf_counter() - start
+    assert "with 3 at once" in caplog.text
+    spent = 0.0
+    for name in two.scenes:
+        assert check_run(two.file(name)) == []
+        with Run(one.file(name)) as alone, Run(two.file(name)) as together:
+            np.testing.assert_array_equal(alone.positions(), together.positions())
+            np.testing.assert_array_equal(alone.force, together.force)
+            spent += together.wall_time_s
+    assert 0.0 < spent < elapsed  # each run has its own turns only
 
 
 def test_the_longest_runs_come_first(tmp_path, order):
@@ -163,21 +182,23 @@ def test_time_left_follows_from_the_work_left_and_the_speed_seen(tmp_path):
         production._pool.shutdown()
 
 
-def test_a_run_that_fails_does_not_stop_the_others(tmp_path, monkeypatch):
+@pytest.mark.parametrize("batch", [1, 2])
+def test_a_run_that_fails_does_not_stop_the_others(tmp_path, batch):
     c = campaign(tmp_path, draw={"depth": [0.02, 0.04, 0.05], "path": [None]}, runs=None)
     name = next(iter(c.scenes))
     c.file(name).mkdir(parents=True)  # nothing can be written there
     with pytest.raises(UserError, match=f"1 of 3 runs could not be made .* first is {name}: .* is a folder"):
-        simulate_campaign(c, device="cpu", workers=1)
+        simulate_campaign(c, device="cpu", workers=1, batch=batch)
     assert [check_run(c.file(n)) for n in list(c.scenes)[1:]] == [[], []]
 
 
-def test_a_run_that_another_process_makes_is_left_to_it(tmp_path, caplog):
+@pytest.mark.parametrize("batch", [1, 2])
+def test_a_run_that_another_process_makes_is_left_to_it(tmp_path, caplog, batch):
     c = campaign(tmp_path, runs=3)
     first, *others = c.scenes
     with claimed(c.file(first)) as ours, caplog.at_level(logging.INFO):
         assert ours
-        simulate_campaign(c, device="cpu", workers=1)
+        simulate_campaign(c, device="cpu", workers=1, batch=batch)
     assert "runs left to another process that is making them or has made them: 1" in caplog.text
     assert not c.file(first).exists()
     assert all(c.file(name).exists() for name in others)

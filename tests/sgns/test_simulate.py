@@ -62,6 +62,7 @@ def test_command_writes_fewer_particles(tmp_path):
         ("device=tpu", "device is 'tpu'"),
         ("scene.bed.store_every=0", "bed.store_every is 0"),
         ("shards=4", "give dataset=..."),
+        ("solver.batch=0", "solver.batch is 0"),
         ("scene.depth=deep", "scene.depth is 'deep'"),
         ("scene.path=nowhere.csv", "scene.path"),
     ],
