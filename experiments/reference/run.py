@@ -49,8 +49,8 @@ def settings(kind: str) -> dict[str, list[str]]:
         found |= {f"dx 10, {ppc} per cell": at("10", ppc) for ppc in (1, 4)}
         base, name = at("13.3", 4), "dx 13.3, 4 per cell"
     changes = {
-        "jittered, seed 0": ["scene.bed.arrangement=jittered", "+scene.bed.mirrored=true"],
-        "jittered, seed 1": ["scene.bed.arrangement=jittered", "+scene.bed.mirrored=true", "seed=1"],
+        "jittered, seed 0": ["scene.bed.arrangement=jittered", "++scene.bed.mirrored=true"],
+        "jittered, seed 1": ["scene.bed.arrangement=jittered", "++scene.bed.mirrored=true", "seed=1"],
         "margin -0.5": ["scene.contact_margin=-0.5"],
         "margin -0.25": ["scene.contact_margin=-0.25"],
         "margin 0": ["scene.contact_margin=0"],
