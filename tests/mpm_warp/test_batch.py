@@ -117,7 +117,9 @@ def test_unknown_device():
 @needs_cuda
 def test_many_scenes_on_cuda_agree_with_the_cpu():
     scenes = [cut(duration=0.15, depth=depth) for depth in np.linspace(0.02, 0.06, 9)]
-    for scene, frames in zip(scenes, by_scene(frames_together(scenes, device="cuda", at_once=8)), strict=True):
+    for scene, frames in zip(
+        scenes, by_scene(frames_together(scenes, device="cuda", at_once=8)), strict=True
+    ):
         one, two = frames[-1], list(Solver(scene).frames())[-1]
         np.testing.assert_allclose(one.force, two.force, atol=0.01 * np.linalg.norm(two.force))
         assert np.abs(one.position - two.position).max() < 1e-4
@@ -125,7 +127,7 @@ def test_many_scenes_on_cuda_agree_with_the_cpu():
 
 @wp.kernel
 def busy(end: wp.array(dtype=float)):
-    number = float(0.0)
+    number = end[0]
     for _ in range(30_000_000):
         number = wp.sin(number + 1.0)
     end[0] = number

