@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterable, Iterator
+from itertools import repeat
 
 from .effects import Effects
 from .errors import SceneError, SolverStopped
@@ -15,7 +16,7 @@ __all__ = ["frames_together"]
 
 def frames_together(
     scenes: Iterable[Scene],
-    effects: Effects | None = None,
+    effects: Effects | Iterable[Effects] | None = None,
     device: str = "cpu",
     precision: str = "float32",
     at_once: int = 32,
@@ -31,7 +32,7 @@ def frames_together(
 
     Args:
         scenes: what to compute.
-        effects: which physics, for all of them.
+        effects: which physics, for all of them or one for each.
         device: `cpu` or `cuda`, `cuda:0`, ...
         precision: `float32` or `float64`.
         at_once: scenes that are under way at the same time; the next begins when one ends.
@@ -41,10 +42,13 @@ def frames_together(
         In place of a frame that cannot be computed the error comes, as that scene's last; the others go on.
     """
 
-    def frames(scene: Scene) -> Generator[Frame | SceneError | SolverStopped | None, None, None]:
+    def frames(
+        scene: Scene, effects: Effects | None
+    ) -> Generator[Frame | SceneError | SolverStopped | None, None, None]:
         try:
             yield from Solver(scene, effects, device, precision).stages()
         except (SceneError, SolverStopped) as error:
             yield error
 
-    return in_turns(map(frames, scenes), at_once, device)
+    each = repeat(effects) if effects is None or isinstance(effects, Effects) else effects
+    return in_turns(map(frames, scenes, each), at_once, device)

@@ -62,6 +62,17 @@ def test_scenes_together_are_the_scenes_alone(at_once):
         assert np.linalg.norm(frames[-1].force) > 0.1
 
 
+def test_scenes_may_have_effects_of_their_own():
+    scene, effects = (
+        cut(duration=0.15),
+        [Effects(), Effects(rate_dependence=False), Effects(separation=False)],
+    )
+    found = [frames[-1].force for frames in by_scene(frames_together([scene] * 3, effects))]
+    for force, own in zip(found, effects, strict=True):
+        np.testing.assert_array_equal(force, list(Solver(scene, own).frames())[-1].force)
+    assert len({tuple(force) for force in found}) == 3
+
+
 def test_scenes_that_fail_leave_the_others():
     sound = cut(duration=0.05)
     uneven = Scene(bed=Bed(size=(0.2, 0.2, 0.1), spacing=0.05, arrangement="jittered"), duration=0.05)
