@@ -4,6 +4,7 @@ from .arrangement import arrange
 from .bodies import Box, Cylinder, MeshBody, Plate
 from .column import Column
 from .effects import Effects
+from .effects_for import Decision, Tolerances, effects_for
 from .errors import SceneError, SolverStopped
 from .excavation import Excavation
 from .incline import Incline
@@ -21,6 +22,7 @@ __all__ = [
     "Box",
     "Column",
     "Cylinder",
+    "Decision",
     "Effects",
     "Excavation",
     "Frame",
@@ -33,9 +35,11 @@ __all__ = [
     "SceneError",
     "Solver",
     "SolverStopped",
+    "Tolerances",
     "Walls",
     "Wheel",
     "arrange",
     "asymmetry",
+    "effects_for",
     "substeps_per_frame",
 ]

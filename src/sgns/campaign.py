@@ -36,7 +36,8 @@ class Campaign:
     """Run name → scene."""
     split: dict[str, str]
     """Run name → train, validation or test."""
-    effects: dict[str, bool]
+    effects: dict[str, Any]
+    """What was asked for; scenes decide about what is `auto`, each for itself."""
     precision: str
     seed: int
 
@@ -73,14 +74,14 @@ class Campaign:
 
 
 def plan(
-    settings: Mapping[str, Any], base: Mapping[str, Any], effects: dict[str, bool], precision: str, seed: int
+    settings: Mapping[str, Any], base: Mapping[str, Any], effects: dict[str, Any], precision: str, seed: int
 ) -> Campaign:
     """The runs of a campaign.
 
     Args:
         settings: the `dataset` group: name, path, draw, runs, split.
         base: a scene as nested data; `draw` replaces values in it.
-        effects: which physics.
+        effects: which physics is asked for: effect → true, false or auto, and the group `tolerance`.
         precision: float32 or float64.
         seed: of the drawn combinations and the split.
     """

@@ -17,12 +17,13 @@ from typing import Any
 
 from tqdm import tqdm
 
-from mpm_warp import Effects, Scene, SceneError, Solver, SolverStopped
+from mpm_warp import Decision, Effects, Scene, SceneError, Solver, SolverStopped
 from sgns.campaign import Campaign
 from sgns.claim import claimed
 from sgns.cost import RunCost, duration_words, finishing_time, require_space, run_cost, size_words
 from sgns.errors import UserError
 from sgns.runs import Run
+from sgns.scene_effects import decided, decision_summary, recorded
 from sgns.scene_run import simulate_scene
 from sgns.settings import flattened
 
@@ -59,6 +60,7 @@ def simulate_campaign(
         raise UserError(
             f"shard is {shard!r}; with shards={shards} it must be a whole number from 0 to {shards - 1}"
         )
+    physics = {name: decided(scene, campaign.effects) for name, scene in campaign.scenes.items()}
     campaign.record()
     costs = {name: run_cost(scene) for name, scene in campaign.scenes.items()}
     by_length = sorted(costs, key=lambda name: costs[name].work, reverse=True)
@@ -69,11 +71,19 @@ def simulate_campaign(
     log.info("dataset %s in %s: %s, %d to do", campaign.name, campaign.path, total, len(missing))
     if not missing:
         return
+    for line in decision_summary(physics[name][1] for name in missing):
+        log.info("%s", line)
     size = sum(costs[name].size for name in missing)
     require_space(campaign.path, size)
-    _compile(campaign, missing, device)
+    _compile(campaign, {name: physics[name][0] for name in missing}, device)
     workers = min(workers or (1 if device != "cpu" else len(os.sched_getaffinity(0))), len(missing))
-    production = _Production(campaign, {name: costs[name] for name in missing}, device, workers)
+    production = _Production(
+        campaign,
+        {name: costs[name] for name in missing},
+        {name: physics[name] for name in missing},
+        device,
+        workers,
+    )
     failed = production.make_all(f"about {size_words(size)} of disk")
     if failed:
         name, message = next(iter(failed.items()))
@@ -82,13 +92,13 @@ def simulate_campaign(
         )
 
 
-def _compile(campaign: Campaign, names: list[str], device: str) -> None:
+def _compile(campaign: Campaign, effects: dict[str, Effects], device: str) -> None:
     """Compile the kernels of every kind of scene, once; the processes find them in Warp's cache.
 
-    Kernels can differ only where scenes differ in something else than the size of a number.
+    Kernels can differ only where scenes differ in their effects or in something else than the size of a number.
     """
     kinds = {}
-    for name in names:
+    for name, physics in effects.items():
         scene = campaign.scenes[name]
         chosen = {
             key: value
@@ -99,17 +109,24 @@ def _compile(campaign: Campaign, names: list[str], device: str) -> None:
             for key, value in flattened(scene.to_dict()).items()
             if key != "name"
         }
-        kinds.setdefault(frozenset(chosen.items()), scene)
-    for scene in kinds.values():
-        Solver(scene, Effects(**campaign.effects), device, campaign.precision)
+        kinds.setdefault((frozenset(chosen.items()), physics), scene)
+    for (_, physics), scene in kinds.items():
+        Solver(scene, physics, device, campaign.precision)
 
 
 class _Production:
     """Worker processes, what they have done, and how long the rest will take."""
 
-    def __init__(self, campaign: Campaign, costs: dict[str, RunCost], device: str, workers: int) -> None:
-        self.campaign, self.costs, self.workers = campaign, costs, workers
-        self._settings = (campaign.effects, campaign.seed, device, campaign.precision)
+    def __init__(
+        self,
+        campaign: Campaign,
+        costs: dict[str, RunCost],
+        physics: dict[str, tuple[Effects, dict[str, Decision]]],
+        device: str,
+        workers: int,
+    ) -> None:
+        self.campaign, self.costs, self.physics, self.workers = campaign, costs, physics, workers
+        self._settings = (campaign.seed, device, campaign.precision)
         context = multiprocessing.get_context("spawn")
         # Frames done of every run; each entry has one writer, so there is no lock.
         self._frames_done = context.RawArray("q", len(costs))
@@ -126,10 +143,10 @@ class _Production:
             try:
                 self._measure()
                 log.info("about %s with %d at once, %s", self._left(), self.workers, disk)
-                effects, seed, device, precision = self._settings
                 for index, name in enumerate(self.costs):
                     scene, file = self.campaign.scenes[name].to_dict(), self.campaign.file(name)
-                    job = (index, scene, file, effects, seed, device, precision)
+                    effects, decisions = self.physics[name]
+                    job = (index, scene, file, effects, recorded(decisions), *self._settings)
                     self._jobs[name] = self._pool.submit(_make, *job)
                 self._follow()
                 outcomes = {name: job.result() for name, job in self._jobs.items()}
@@ -152,9 +169,11 @@ class _Production:
         """Let all workers step runs from all over the list for a moment, at the same time."""
         names = list(self.costs)
         sample = [names[i * len(names) // self.workers] for i in range(self.workers)]
-        effects, _, device, precision = self._settings
+        _, device, precision = self._settings
         trials = [
-            self._pool.submit(_try, self.campaign.scenes[name].to_dict(), effects, device, precision)
+            self._pool.submit(
+                _try, self.campaign.scenes[name].to_dict(), self.physics[name][0], device, precision
+            )
             for name in sample
         ]
         for name, trial in zip(sample, trials, strict=True):
@@ -233,9 +252,9 @@ def _start_worker(frames_done: Any, barrier: Any) -> None:
     threading.Thread(target=leave_with_parent, daemon=True).start()
 
 
-def _try(scene: dict[str, Any], effects: dict[str, bool], device: str, precision: str) -> tuple[int, float]:
+def _try(scene: dict[str, Any], effects: Effects, device: str, precision: str) -> tuple[int, float]:
     """Frames made and the seconds they took, while the other workers do the same."""
-    frames = Solver(Scene.from_dict(scene), Effects(**effects), device, precision).frames()
+    frames = Solver(Scene.from_dict(scene), effects, device, precision).frames()
     next(frames)
     with suppress(threading.BrokenBarrierError):
         _barrier.wait(timeout=120.0)
@@ -252,7 +271,8 @@ def _make(
     index: int,
     scene: dict[str, Any],
     output: Path,
-    effects: dict[str, bool],
+    effects: Effects,
+    reasons: dict[str, dict[str, Any]],
     seed: int,
     device: str,
     precision: str,
@@ -269,7 +289,8 @@ def _make(
             simulate_scene(
                 Scene.from_dict(scene),
                 output,
-                effects=Effects(**effects),
+                effects=effects,
+                reasons=reasons,
                 seed=seed,
                 device=device,
                 precision=precision,

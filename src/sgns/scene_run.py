@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ def simulate_scene(
     output: Path,
     *,
     effects: Effects,
+    reasons: Mapping[str, Mapping[str, Any]] | None = None,
     seed: int = 0,
     device: str = "cpu",
     precision: str = "float32",
@@ -47,6 +49,7 @@ def simulate_scene(
     """Compute a scene and write its run file, with the particles that `scene.bed.store_every` leaves in it.
 
     Args:
+        reasons: effect → on, reason, number, for the run file; by default what `effects` says of itself.
         progress: called once after every frame.
     """
     solver = Solver(scene, effects, device, precision)
@@ -54,7 +57,7 @@ def simulate_scene(
     with RunWriter(
         output,
         scene=scene.to_dict(),
-        effects=effects.described(),
+        effects=reasons or effects.described(),
         arrangement_hash=scene.arrangement_hash,
         particle_count=len(stored),
         body_points=len(scene.body_points()),
