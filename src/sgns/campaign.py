@@ -10,6 +10,7 @@ import itertools
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ import numpy as np
 import yaml
 from omegaconf import OmegaConf
 
-from mpm_warp import Scene
+from mpm_warp import Decision, Effects, Scene
 from sgns.errors import UserError
+from sgns.scene_effects import decided
 from sgns.wholefile import write_whole
 
 __all__ = ["SPLITS", "Campaign", "Dataset", "plan"]
@@ -40,6 +42,11 @@ class Campaign:
     """What was asked for; scenes decide about what is `auto`, each for itself."""
     precision: str
     seed: int
+
+    @cached_property
+    def physics(self) -> dict[str, tuple[Effects, dict[str, Decision]]]:
+        """Run name → its effects and the decision about each."""
+        return {name: decided(scene, self.effects) for name, scene in self.scenes.items()}
 
     def describe(self) -> dict[str, Any]:
         """The contents of dataset.yaml."""

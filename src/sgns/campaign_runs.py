@@ -17,13 +17,13 @@ from typing import Any
 
 from tqdm import tqdm
 
-from mpm_warp import Decision, Effects, Scene, SceneError, Solver, SolverStopped
+from mpm_warp import Effects, Scene, SceneError, Solver, SolverStopped
 from sgns.campaign import Campaign
 from sgns.claim import claimed
 from sgns.cost import RunCost, duration_words, finishing_time, require_space, run_cost, size_words
 from sgns.errors import UserError
 from sgns.runs import Run
-from sgns.scene_effects import decided, decision_summary, recorded
+from sgns.scene_effects import decision_summary, recorded
 from sgns.scene_run import simulate_scene
 from sgns.settings import flattened
 
@@ -60,7 +60,7 @@ def simulate_campaign(
         raise UserError(
             f"shard is {shard!r}; with shards={shards} it must be a whole number from 0 to {shards - 1}"
         )
-    physics = {name: decided(scene, campaign.effects) for name, scene in campaign.scenes.items()}
+    physics = campaign.physics  # before anything is written: what was asked for may be impossible
     campaign.record()
     costs = {name: run_cost(scene) for name, scene in campaign.scenes.items()}
     by_length = sorted(costs, key=lambda name: costs[name].work, reverse=True)
@@ -75,15 +75,9 @@ def simulate_campaign(
         log.info("%s", line)
     size = sum(costs[name].size for name in missing)
     require_space(campaign.path, size)
-    _compile(campaign, {name: physics[name][0] for name in missing}, device)
+    _compile(campaign, missing, device)
     workers = min(workers or (1 if device != "cpu" else len(os.sched_getaffinity(0))), len(missing))
-    production = _Production(
-        campaign,
-        {name: costs[name] for name in missing},
-        {name: physics[name] for name in missing},
-        device,
-        workers,
-    )
+    production = _Production(campaign, {name: costs[name] for name in missing}, device, workers)
     failed = production.make_all(f"about {size_words(size)} of disk")
     if failed:
         name, message = next(iter(failed.items()))
@@ -92,13 +86,13 @@ def simulate_campaign(
         )
 
 
-def _compile(campaign: Campaign, effects: dict[str, Effects], device: str) -> None:
+def _compile(campaign: Campaign, names: list[str], device: str) -> None:
     """Compile the kernels of every kind of scene, once; the processes find them in Warp's cache.
 
     Kernels can differ only where scenes differ in their effects or in something else than the size of a number.
     """
     kinds = {}
-    for name, physics in effects.items():
+    for name in names:
         scene = campaign.scenes[name]
         chosen = {
             key: value
@@ -109,7 +103,7 @@ def _compile(campaign: Campaign, effects: dict[str, Effects], device: str) -> No
             for key, value in flattened(scene.to_dict()).items()
             if key != "name"
         }
-        kinds.setdefault((frozenset(chosen.items()), physics), scene)
+        kinds.setdefault((frozenset(chosen.items()), campaign.physics[name][0]), scene)
     for (_, physics), scene in kinds.items():
         Solver(scene, physics, device, campaign.precision)
 
@@ -117,15 +111,8 @@ def _compile(campaign: Campaign, effects: dict[str, Effects], device: str) -> No
 class _Production:
     """Worker processes, what they have done, and how long the rest will take."""
 
-    def __init__(
-        self,
-        campaign: Campaign,
-        costs: dict[str, RunCost],
-        physics: dict[str, tuple[Effects, dict[str, Decision]]],
-        device: str,
-        workers: int,
-    ) -> None:
-        self.campaign, self.costs, self.physics, self.workers = campaign, costs, physics, workers
+    def __init__(self, campaign: Campaign, costs: dict[str, RunCost], device: str, workers: int) -> None:
+        self.campaign, self.costs, self.workers = campaign, costs, workers
         self._settings = (campaign.seed, device, campaign.precision)
         context = multiprocessing.get_context("spawn")
         # Frames done of every run; each entry has one writer, so there is no lock.
@@ -145,7 +132,7 @@ class _Production:
                 log.info("about %s with %d at once, %s", self._left(), self.workers, disk)
                 for index, name in enumerate(self.costs):
                     scene, file = self.campaign.scenes[name].to_dict(), self.campaign.file(name)
-                    effects, decisions = self.physics[name]
+                    effects, decisions = self.campaign.physics[name]
                     job = (index, scene, file, effects, recorded(decisions), *self._settings)
                     self._jobs[name] = self._pool.submit(_make, *job)
                 self._follow()
@@ -172,7 +159,7 @@ class _Production:
         _, device, precision = self._settings
         trials = [
             self._pool.submit(
-                _try, self.campaign.scenes[name].to_dict(), self.physics[name][0], device, precision
+                _try, self.campaign.scenes[name].to_dict(), self.campaign.physics[name][0], device, precision
             )
             for name in sample
         ]

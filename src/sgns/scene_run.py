@@ -53,7 +53,7 @@ def simulate_scene(
         progress: called once after every frame.
     """
     solver = Solver(scene, effects, device, precision)
-    stored = scene.bed.stored
+    stored = scene.stored
     with RunWriter(
         output,
         scene=scene.to_dict(),

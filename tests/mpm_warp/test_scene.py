@@ -104,7 +104,7 @@ def test_what_a_scene_refuses(change, words):
         (Bed, {"arrangement": "heap"}, "allowed: lattice, jittered, poisson"),
         (Bed, {"store_every": 0}, "bed.store_every is 0; it must be a whole number"),
         (Bed, {"store_every": 2.5}, "bed.store_every is 2.5; it must be a whole number"),
-        (Bed, {"initial_stress": "some"}, "allowed: geostatic, none"),
+        (Bed, {"initial_stress": "some"}, "allowed: geostatic, k0, none"),
         (Plate, {"thickness": 0.0}, "blade.thickness"),
         (Plate, {"friction": -1.0}, "blade.friction"),
         (Material, {"poissons_ratio": 0.5}, "poissons_ratio"),
