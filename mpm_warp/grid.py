@@ -22,6 +22,7 @@ def grid_struct(real: type) -> type:
         ny: int
         nz: int
         dt: real  # [s]
+        volume_averaging: real  # share of a particle's own volume change that the mean replaces
         damping: real  # viscous time of the elastic strain / dt
         gravity: vec3  # [m/s^2]
         # Nodes with index <= low or >= high belong to the floor and the walls.
@@ -110,7 +111,8 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
             substep[0] = substep[0] + 1
         inverse = inverse_mass[n]
         if inverse > real(0.0):
-            now = velocity[n] + inverse * impulse[n]
+            change = impulse[n]
+            now = velocity[n] + inverse * change
             impulse[n] = vec4()
             v = vec3(now[0], now[1], now[2]) + grid.dt * grid.gravity
             # `/` of whole numbers is one instruction; `//` and `%` follow Python's rule for negative numbers.
@@ -133,6 +135,6 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
                     v = at_y(v, vec3(real(0.0), real(-1.0), real(0.0)), rough[1])
             if k <= low[2]:
                 v = at_floor(v, vec3(real(0.0), real(0.0), real(1.0)), rough[2])
-            velocity[n] = vec4(v[0], v[1], v[2], real(0.0))
+            velocity[n] = vec4(v[0], v[1], v[2], inverse * change[3])
 
     return SimpleNamespace(begin=begin, step=step)

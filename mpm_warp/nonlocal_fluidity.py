@@ -75,7 +75,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
     - `project`: volume, fluidity and s from the particles to `sums`,
     - `prepare`: `sums` to means in `field` (filled volume, G, s, g), clearing the sums,
     - `sweep`: one Jacobi sweep from one field to another,
-    - `place`: g - G to the fourth number of the nodes' `velocity`.
+    - `place`: g - G to the nodes' `cooperation`.
     """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     vec6 = wp.types.vector(6, real)
@@ -181,12 +181,11 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         swept[n] = here
 
     @wp.kernel(module="unique", enable_backward=False)
-    def place(field: wp.array(dtype=vec4), velocity: wp.array(dtype=vec4)):
+    def place(field: wp.array(dtype=vec4), cooperation: wp.array(dtype=vec4)):
         n = wp.tid()
         found = field[n]
-        if found[0] > real(0.0):
-            v = velocity[n]
-            velocity[n] = vec4(v[0], v[1], v[2], found[3] - found[1])
+        excess = wp.where(found[0] > real(0.0), found[3] - found[1], real(0.0))
+        cooperation[n] = vec4(excess, real(0.0), real(0.0), real(0.0))
 
     return SimpleNamespace(project=project, prepare=prepare, sweep=sweep, place=place)
 
@@ -202,7 +201,7 @@ class NonlocalFluidity:
         particles: arrays home, e and ln J.
         grid, soil: the solver's structs.
         images: ghost nodes, with plain signs: what is carried here has no direction, so a mirror does not turn it.
-        velocity: nodal velocities, whose fourth number takes the answer.
+        cooperation: of the nodes; its first number takes the answer.
         on_plane: number of particles, the first ones, that lie on a mirror plane.
     """
 
@@ -216,12 +215,12 @@ class NonlocalFluidity:
         grid: Any,
         soil: Any,
         images: Images,
-        velocity: wp.array,
+        cooperation: wp.array,
         on_plane: int = 0,
     ) -> None:
         kernels = nonlocal_kernels(real, effects, atomic=device.is_cuda)
         vec4 = wp.types.vector(4, real)
-        count = len(velocity)
+        count = len(cooperation)
         sums, field, other = (wp.zeros(count, dtype=vec4, device=device) for _ in range(3))
         walls = wp.array(sink, dtype=real, device=device)
         self._arrays = (sums, other, walls)  # a recorded launch does not promise to keep its arrays
@@ -242,6 +241,6 @@ class NonlocalFluidity:
             *images.fold(sums),
             wp.launch(kernels.prepare, count, [sums, field], **record),
             *[*sweep(field, other), *sweep(other, field)] * (sweep_count(ratio, relaxation) // 2),
-            wp.launch(kernels.place, count, [field, velocity], **record),
+            wp.launch(kernels.place, count, [field, cooperation], **record),
         ]
         """In order, after the grid step and before the particles read the grid."""

@@ -157,6 +157,8 @@ class Scene:
     """Time step as a share of spacing / wave speed."""
     elastic_damping: float = 0.1
     """Damping ratio of elastic waves as short as the grid can carry; longer ones are damped less [-]."""
+    volume_averaging: float = 1.0
+    """Share of a particle's own volume change that the mean around it replaces [-]."""
     remap_time: float = 4.0e-3
     """Longest time between two remaps of the velocities [s]; see solver.py."""
     remap_distance: float = 0.1

@@ -148,12 +148,16 @@ class Solver:
         self._ln_j = wp.array(ln_j, dtype=real, device=device)
         shear, bulk = 2.0 * scene.material.shear_modulus, scene.material.bulk_modulus
         stress = shear * strain + bulk * ln_j[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+        self._swelling = wp.zeros(n, dtype=real, device=device)
         self._stress = wp.array(stress, dtype=wp.types.vector(6, real), device=device)
         nodes = self._grid.nx * self._grid.ny * self._grid.nz
         self._momentum, self._velocity, self._before, self._impulse = (
             wp.zeros(nodes + 1, dtype=vec4, device=device)
             for _ in range(4)  # + 1: see rows.py
         )
+        cooperative = self.effects.nonlocality
+        self._cooperation = wp.zeros(nodes + 1 if cooperative else 0, dtype=vec4, device=device)
+        self._excess = wp.zeros(n if cooperative else 0, dtype=real, device=device)
         self._inverse_mass = wp.zeros(nodes, dtype=real, device=device)
         self._substep = wp.zeros(1, dtype=int, device=device)
         self._top_speed = wp.zeros(1, dtype=real, device=device)
@@ -204,7 +208,7 @@ class Solver:
                     *watch,
                 )
             )
-            particles = [a[part] for a in (x, home, felt, self._stress)]
+            particles = [a[part] for a in (x, home, felt, self._stress, self._swelling)]
             rest = (its_grid, its_body, self._impulse, self._substep)
             scatter.append(self._record(kernels.scatter, len(particles[0]), *particles, *rest))
         fields = (self._momentum, self._velocity, self._before, self._inverse_mass, self._impulse)
@@ -222,8 +226,12 @@ class Solver:
             ),
             *self._record_nonlocal(ghosts),
             *ghost.unfold(self._velocity),
-            self._record(kernels.gather, n, x, home, felt, c, grid, self._velocity, *watch),
-            self._record(kernels.material, n, felt, c, e, ln_j, self._stress, grid, soil),
+            self._record(
+                kernels.gather, n, x, home, felt, c, grid, self._velocity, self._cooperation, self._excess, *watch
+            ),
+            self._record(
+                kernels.material, n, felt, c, e, ln_j, self._stress, self._swelling, self._excess, grid, soil
+            ),
         ]
         self._from_grid = self._record(kernels.from_grid, n, home, felt, v, grid, self._before, 0.0)
         self._graphs: dict[int, wp.Graph] = {}
@@ -259,18 +267,10 @@ class Solver:
         particles = [self._home, self._e, self._ln_j]
         ghost = Images(real, self.device, grid, ghosts, mirrored=False)  # fluidity has no direction
         on_plane = self._half.on_plane if self._half is not None else 0
-        return NonlocalFluidity(
-            real,
-            self.effects,
-            self.device,
-            sink,
-            particles,
-            grid,
-            self._soil,
-            ghost,
-            self._velocity,
-            on_plane,
-        ).launches
+        term = NonlocalFluidity(
+            real, self.effects, self.device, sink, particles, grid, self._soil, ghost, self._cooperation, on_plane
+        )
+        return [*term.launches, *ghost.unfold(self._cooperation)]
 
     def _record_wraps(self, n: int) -> list[wp.Launch]:
         """Bring particles that left a periodic bin back in."""

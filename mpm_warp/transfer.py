@@ -6,8 +6,8 @@ of the place they had at the remap, their `home`. A remap smooths velocities ove
 that smoothing acts as a viscosity that grows with 1 / dt.
 
 The transfers visit the 27 nodes around a particle, as 9 rows along z. Node (i, j, k) is entry (i ny + j) nz + k of a
-flat array of 4-vectors: momentum and mass, impulse, or velocity with what the effect `nonlocality` adds to the
-fluidity as the fourth number.
+flat array of 4-vectors: momentum and mass, or impulse and mass times the particles' last volume change, or velocity and
+its mean.
 """
 
 from functools import cache
@@ -112,6 +112,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         home: wp.array(dtype=vec3),
         felt: wp.array(dtype=vec4),
         stress: wp.array(dtype=vec6),
+        swelling: wp.array(dtype=real),
         grid: Grid,
         body: Body,
         impulse: wp.array(dtype=vec4),
@@ -128,7 +129,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         if wp.static(with_body):
             u = vec3(felt[p][0], felt[p][1], felt[p][2])
             start += push(p, x[p], u, grid.particle_mass, grid.dt, substep[0], body)
-        deposit(base, f, vec4(start[0], start[1], start[2], real(0.0)), q, grid, impulse)
+        deposit(base, f, vec4(start[0], start[1], start[2], grid.particle_mass * swelling[p]), q, grid, impulse)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=fused)
     def gather(
@@ -138,6 +139,8 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         c: wp.array(dtype=mat33),
         grid: Grid,
         velocity: wp.array(dtype=vec4),
+        cooperation: wp.array(dtype=vec4),
+        excess: wp.array(dtype=real),
         substep: wp.array(dtype=int),
         stray: wp.array(dtype=int),
     ):
@@ -164,6 +167,13 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
             all_x = plus(all_x, ax[i], plane)
             all_y = plus(all_y, wx[i], plane_y)
         total = fold(wz, all_v)
+        if wp.static(effects.nonlocality):
+            around = row()
+            for i in range(3):
+                for j in range(3):
+                    nodes = gather_row(cooperation, node_index(base, i, j, grid))
+                    around = plus(around, wx[i] * wy[j], nodes)
+            excess[p] = fold(wz, around)[0]
         gx = fold(wz, all_x)
         gy = fold(wz, all_y)
         gz = fold(az, all_v)
@@ -197,22 +207,27 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         e: wp.array(dtype=vec6),
         ln_j: wp.array(dtype=real),
         stress: wp.array(dtype=vec6),
+        swelling: wp.array(dtype=real),
+        excess: wp.array(dtype=real),
         grid: Grid,
         soil: Soil,
     ):
         p = wp.tid()
-        # What `update` means by its last number; felt[p][3] is what cooperative flow adds.
+        # What `update` means by its last number.
         g = real(0.0)
         if wp.static(effects.nonlocality):
-            g = felt[p][3]
+            g = excess[p]
         if wp.static(effects.fluidity):
             g = wp.max(soil.g[p] + g, real(0.0))
         before = e[p]
-        volume_before = ln_j[p]
+        # Volume changes as the mean over the nodes around does: what a particle's own gradient says besides is noise, and
+        # is taken back a step later.
+        volume_before = ln_j[p] + grid.volume_averaging * (felt[p][3] - swelling[p])
         state = update(before, volume_before, grid.dt * c[p], grid.dt, soil, g)
         after = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
         e[p] = after
         ln_j[p] = state[6]
+        swelling[p] = state[6] - volume_before
         if wp.static(effects.fluidity):
             soil.g[p] = state[7]
         # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone.

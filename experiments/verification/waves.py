@@ -34,7 +34,13 @@ def error_after_a_period(kind: str, cells: int, particles_per_cell: float, coura
         walls=Walls("periodic", "periodic", "slip"),
     )
     scene = Scene(
-        bed=bed, material=soil, gravity=0.0, duration=period, frame_rate=1.0 / period, courant=courant
+        bed=bed,
+        material=soil,
+        gravity=0.0,
+        duration=period,
+        frame_rate=1.0 / period,
+        courant=courant,
+        elastic_damping=0.0,
     )
     solver = Solver(scene, ELASTIC, precision="float64")
     start = np.zeros((solver.particle_count, 3))

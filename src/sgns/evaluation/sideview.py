@@ -34,8 +34,12 @@ SHORTEST_ARROW = 0.02
 def body_outline(run: Any, frame: int) -> np.ndarray:
     """Outline of the body seen from the side [m], shape (k, 2) in x and z.
 
-    The box of the scene's blade if it has one, else the hull of the body's points.
+    The box of the scene's blade, the circle of its wheel, else the hull of the body's points.
     """
+    if "diameter" in run.scene:
+        angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+        radius = 0.5 * float(run.scene["diameter"])
+        return run.pose[frame, [0, 2]] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     blade = run.scene.get("blade")
     if isinstance(blade, Mapping):
         half = 0.5 * np.array([blade["thickness"], blade["width"], blade["length"]], dtype=np.float64)

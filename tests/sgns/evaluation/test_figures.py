@@ -1,4 +1,5 @@
 import io
+from types import SimpleNamespace
 
 import matplotlib
 import numpy as np
@@ -53,6 +54,12 @@ def test_view_times_lie_after_the_history_and_within_the_run(run):
     frames = view_times(run, 3)
     assert len(frames) == 3 and frames == sorted(frames)
     assert 3 < frames[0] and frames[-1] < run.frame_count
+
+
+def test_outline_of_a_wheel_is_a_circle_about_its_axle():
+    wheel = SimpleNamespace(scene={"diameter": 0.15}, pose=np.array([[0.1, 0.0, 0.07, 0, 0, 0, 1.0]]))
+    outline = body_outline(wheel, 0)
+    assert np.linalg.norm(outline - [0.1, 0.07], axis=1) == pytest.approx(0.075)
 
 
 def test_outline_is_the_box_of_the_blade(run):

@@ -1,0 +1,117 @@
+"""The published wheel runs, simulated at the published settings and compared with the published forces and sinkage.
+
+    python experiments/published_forces/wheel.py <folder of the authors' wheel files>
+
+Makes one run file per case (about 80 MB each, in data/published_wheel; finished ones are kept), then wheel.csv and
+wheel.png beside this script.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import logging
+from pathlib import Path
+
+import numpy as np
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from run import FIRST, HERE, WINDOW, compared, plt, smoothed
+
+from mpm_warp import Wheel
+from sgns.campaign import Campaign
+from sgns.published import read_published, wheel_case
+from sgns.runs import Run
+from sgns.scenes import scene_from_config
+from sgns.simulate import simulate_campaign
+
+SERIES = (("pull", "drawbar pull", "C0"), ("vertical", "vertical force", "C1"), ("sinkage", "sinkage", "C2"))
+
+
+def ours(file: Path, scene: Wheel, count: int) -> dict[str, np.ndarray]:
+    """Drawbar pull and vertical force [N] and sinkage [mm] in the `count` frames after settling."""
+    first = round(scene.settle * scene.frame_rate) + 1
+    with Run(file) as run:
+        force, pose = (values[first : first + count] for values in (run.force, run.pose))
+    return {"pull": force[:, 0], "vertical": force[:, 2], "sinkage": 1e3 * scene.sinkage(pose)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("published", help="folder with valid.tfrecord and metadata.json")
+    parser.add_argument("--runs", default="data/published_wheel", help="folder for the run files")
+    parser.add_argument("--results", default=HERE, type=Path, help="folder for wheel.csv and wheel.png")
+    parser.add_argument("--workers", type=int, default=None, help="runs at once (default: one per core)")
+    parser.add_argument("--cases", type=int, nargs="*", help="only these case numbers")
+    parser.add_argument("overrides", nargs="*", help="changes of the scene, for example scene.friction=0.5")
+    options = parser.parse_intermixed_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        config = compose("simulate", ["scene=published_wheel", *options.overrides])
+    published = read_published(options.published, scene_from_config(config).bed.size)
+    published = [r for r in published if not options.cases or r.case in options.cases]
+    published.sort(key=lambda run: run.case)
+    scenes = {}
+    for run in published:
+        for key, value in wheel_case(run.case).items():
+            OmegaConf.update(config, f"scene.{key}", value)
+        scenes[f"case_{run.case:03d}"] = scene_from_config(config)
+    campaign = Campaign(
+        "published_wheel",
+        Path(options.runs),
+        scenes,
+        dict.fromkeys(scenes, "test"),
+        OmegaConf.to_object(config.effects),
+        config.solver.precision,
+        seed=0,
+    )
+    simulate_campaign(campaign, device="cpu", workers=options.workers)
+
+    rows = []
+    figure = plt.figure(figsize=(14, 2.4 * len(published) + 1), layout="constrained")
+    axes = figure.subplots(len(published), 3, sharex=True, squeeze=False)
+    for line, theirs in zip(axes, published, strict=True):
+        name = f"case_{theirs.case:03d}"
+        scene = scenes[name]
+        height = theirs.body_points[..., 2].mean(axis=1)
+        there = {
+            "pull": theirs.force[:, 0],
+            "vertical": theirs.force[:, 2],
+            "sinkage": 1e3 * (0.5 * scene.diameter - height),
+        }
+        here = ours(campaign.file(name), scene, len(height))
+        row = {"case": theirs.case, **wheel_case(theirs.case)}
+        for axis, (key, label, colour) in zip(line, SERIES, strict=True):
+            # Shorter runs (scene.duration) compare what there is.
+            a, b = here[key], there[key][: len(here[key])]
+            row |= {f"{key}_{what}": round(float(value), 3) for what, value in compared(a, b).items()}
+            time = (FIRST + WINDOW // 2 + 1 + np.arange(len(smoothed(b)))) / 60.0
+            axis.plot(time, smoothed(b), color=colour, lw=1, ls="--", label="published")
+            axis.plot(time, smoothed(a), color=colour, lw=1.4, label="sgns")
+            axis.set_title(f"{theirs.case}: {label}", fontsize=9)
+            axis.set_ylabel("mm" if key == "sinkage" else "N")
+            axis.grid(alpha=0.3)
+        line[0].set_title(
+            f"{theirs.case}: drawbar pull ({scene.gravity:g} m/s², {scene.load:.0f} N, "
+            f"{100 * scene.diameter:g} cm, {scene.friction_angle:g}°, slip {scene.slip:.2f})",
+            fontsize=9,
+        )
+        rows.append(row)
+    axes[0, 0].legend(fontsize=8)
+    figure.supxlabel("time since the wheel began to drive [s]")
+    options.results.mkdir(parents=True, exist_ok=True)
+    figure.savefig(options.results / "wheel.png", dpi=80)
+    with (options.results / "wheel.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    for key, label, _ in SERIES:
+        errors = [row[f"{key}_nrmse"] for row in rows]
+        logging.info(
+            "%s: median NRMSE %.3f, %.3f to %.3f", label, np.median(errors), min(errors), max(errors)
+        )
+
+
+if __name__ == "__main__":
+    main()

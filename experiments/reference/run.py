@@ -1,0 +1,195 @@
+"""What is true: one cut and one wheel at many settings of the solver, as convergence tables and figures.
+
+    python experiments/reference/run.py [--only cut|wheel] [--workers 2]
+
+Every finished run is kept as a line of cut.csv or wheel.csv and is not made again; positions go to data/reference. The
+figures are drawn from the tables (`--draw` does nothing else).
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import logging
+import multiprocessing
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from hydra import compose, initialize_config_module
+from scipy.spatial import cKDTree
+
+from mpm_warp import Effects, Solver
+from sgns.scenes import scene_from_config
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+HERE = Path(__file__).parent
+DATA = Path("data/reference")
+DX = {"20": 0.02, "13.3": 0.8 / 60, "10": 0.01, "6.7": 0.8 / 120}
+
+CUT = ["scene=excavation", "scene.depth=0.08", "scene.duration=2.0"]
+WHEEL = ["scene=wheel", "scene.duration=3.0"]
+
+
+def settings(kind: str) -> dict[str, list[str]]:
+    """Name → overrides of every run, the cheapest questions first."""
+
+    def at(dx: str, ppc: int, *more: str) -> list[str]:
+        return [f"scene.bed.spacing={DX[dx]:.10f}", f"scene.bed.particles_per_cell={ppc}", *more]
+
+    if kind == "wheel":
+        found = {f"dx {dx}, {ppc} per cell": at(dx, ppc) for dx in ("13.3", "10", "6.7") for ppc in (1, 4, 8)}
+        base, name = at("10", 4), "dx 10, 4 per cell"
+    else:
+        found = {f"dx {dx}, {ppc} per cell": at(dx, ppc) for dx in ("20", "13.3") for ppc in (1, 4, 8)}
+        found |= {f"dx 10, {ppc} per cell": at("10", ppc) for ppc in (1, 4)}
+        base, name = at("13.3", 4), "dx 13.3, 4 per cell"
+    changes = {
+        "jittered, seed 0": ["scene.bed.arrangement=jittered", "++scene.bed.mirrored=true"],
+        "jittered, seed 1": ["scene.bed.arrangement=jittered", "++scene.bed.mirrored=true", "seed=1"],
+        "margin -0.5": ["scene.contact_margin=-0.5"],
+        "margin -0.25": ["scene.contact_margin=-0.25"],
+        "margin 0": ["scene.contact_margin=0"],
+        "margin 0.25": ["scene.contact_margin=0.25"],
+        "courant 0.3": ["scene.courant=0.3"],
+        "damping 0": ["scene.elastic_damping=0"],
+        "damping 0.2": ["scene.elastic_damping=0.2"],
+        "volume not averaged": ["scene.volume_averaging=0"],
+        "remap 1 ms": ["scene.remap_time=0.001"],
+        "remap 16 ms": ["scene.remap_time=0.016"],
+        "memory 0": ["scene.velocity_memory=1e-9"],
+        "every step": [
+            "scene.remap_time=0",
+            "scene.velocity_memory=1e-9",
+            "scene.elastic_damping=0",
+            "scene.volume_averaging=0",
+        ],
+        "E 5 MPa": ["material.youngs_modulus=5e6"],
+        "constant friction": ["effects.rate_dependence=false"],
+        "friction map sin": ["material.friction_angle=37.2348", "material.friction_map=sin"],
+        "E 15 MPa": ["material.youngs_modulus=15e6"],
+    }
+    found |= {f"{name}, {change}": [*base, *more] for change, more in changes.items()}
+    if kind == "cut":
+        found["dx 10, 8 per cell"] = at("10", 8)
+        found["dx 6.7, 1 per cell"] = at("6.7", 1)
+        for dx, ppc in (("20", 4), ("10", 4)):
+            for margin in ("-0.5", "0"):
+                found[f"dx {dx}, {ppc} per cell, margin {margin}"] = at(dx, ppc, f"scene.contact_margin={margin}")
+        found["dx 6.7, 4 per cell"] = at("6.7", 4)
+    return found
+
+
+def measure(kind: str, name: str, overrides: list[str]) -> dict[str, float | str]:
+    """One run; its forces [N], cost, and the file with its profile and displacements."""
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        config = compose("simulate", [*(CUT if kind == "cut" else WHEEL), *overrides])
+    scene = scene_from_config(config)
+    effects = Effects(rate_dependence=bool(config.effects.rate_dependence is not False), symmetry=True)
+    solver = Solver(scene, effects)
+    frames, start = [], None
+    for frame in solver.frames():
+        start = start if start is not None else time.process_time()
+        frames.append((frame.force, frame.torque, frame.body_pose))
+        last = frame
+    cost = (time.process_time() - start) / scene.duration
+    force = np.array([f[0] for f in frames])[1:]
+    half = len(force) // 2
+    row = {
+        "setting": name,
+        "particles": solver.particle_count,
+        "steps_per_s": round(solver.substeps_per_frame * scene.frame_rate),
+        "cpu_s_per_simulated_s": round(cost, 2),
+    }
+    if kind == "cut":
+        row |= {
+            "draft": -force[:, 0].mean(),
+            "draft_second_half": -force[half:, 0].mean(),
+            "vertical": force[:, 2].mean(),
+            "vertical_second_half": force[half:, 2].mean(),
+            "swing": np.diff(force[half:, 0]).std(),
+        }
+    else:
+        driving = np.arange(1, len(force) + 1) / scene.frame_rate > scene.settle + 1.0
+        sinkage = scene.sinkage(np.array([f[2] for f in frames])[1:])
+        row |= {
+            "drawbar_pull": force[driving, 0].mean(),
+            "vertical": force[driving, 2].mean(),
+            "torque": np.array([f[1] for f in frames])[1:][driving, 1].mean(),
+            "settled_sinkage_mm": 1e3 * sinkage[round(scene.settle * scene.frame_rate) - 1],
+            "sinkage_mm": 1e3 * sinkage[driving].mean(),
+        }
+    DATA.mkdir(parents=True, exist_ok=True)
+    surface, moved = on_common_points(scene, last.position)
+    np.savez_compressed(DATA / f"{kind}_{name.replace(' ', '_')}.npz", force=force, surface=surface, moved=moved)
+    return {k: round(float(v), 3) if isinstance(v, np.floating) else v for k, v in row.items()}
+
+
+def on_common_points(scene, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The final surface on columns of 2 cm, and displacements near points 2 cm apart, so that different beds compare.
+
+    The height of a column is that of its highest particle, half a particle spacing added.
+    """
+    start, volume = scene.filled
+    lx, ly, lz = scene.bed.size
+    columns = [np.arange(0.0, length - 1e-9, 0.02) for length in (lx, ly)]
+    shape = tuple(len(c) for c in columns)
+    index = [np.clip((position[:, axis] / 0.02).astype(int), 0, shape[axis] - 1) for axis in (0, 1)]
+    surface = np.full(shape, -lz)
+    np.maximum.at(surface, tuple(index), position[:, 2] + 0.5 * volume ** (1.0 / 3.0))
+    points = np.stack(
+        np.meshgrid(*[c + 0.01 for c in columns], np.arange(-lz + 0.01, 0.0, 0.02), indexing="ij"), axis=-1
+    ).reshape(-1, 3)
+    near = cKDTree(start).query(points, k=8)[1]
+    return surface, (position[near] - start[near]).mean(axis=1)
+
+
+def rows_of(kind: str) -> dict[str, dict]:
+    file = HERE / f"{kind}.csv"
+    if not file.exists():
+        return {}
+    with file.open(newline="") as stream:
+        return {row["setting"]: row for row in csv.DictReader(stream)}
+
+
+def save(kind: str, rows: dict[str, dict]) -> None:
+    """The table in the order of the settings, with the distances from the finest run."""
+    order = [name for name in settings(kind) if name in rows]
+    fields = list(next(iter(rows.values())))
+    with (HERE / f"{kind}.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, fields, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows[name] for name in order)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", choices=("cut", "wheel"))
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    tables = {kind: rows_of(kind) for kind in ("cut", "wheel") if options.only in (None, kind)}
+    with ProcessPoolExecutor(options.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        jobs = {
+            pool.submit(measure, kind, name, overrides): (kind, name)
+            for kind, rows in tables.items()
+            for name, overrides in settings(kind).items()
+            if name not in rows
+        }
+        for job in as_completed(jobs):
+            kind, name = jobs[job]
+            try:
+                tables[kind][name] = job.result()
+            except Exception as error:  # one setting that fails must not end the study
+                logging.warning("%s, %s: %s", kind, name, error)
+                continue
+            save(kind, tables[kind])
+            logging.info("%s %s", kind, tables[kind][name])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Leakage: what it counts, and that plates do not leak."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from beds import cut
+
+from mpm_warp import Frame, Plate, Solver
+from mpm_warp.diagnostics import leakage, leaked
+from mpm_warp.rotation import about_y
+
+PLATE = Plate(thickness=0.02, width=0.2, length=0.1)
+
+
+def frame(positions, pose=(0, 0, 0, 0, 0, 0, 1)):
+    nothing = np.zeros((len(positions), 3), dtype=np.float32)
+    return Frame(
+        index=0, time=0.0, position=np.array(positions, dtype=np.float32), velocity=nothing,
+        body_pose=np.array(pose, dtype=float), body_points=np.zeros((0, 3)), force=np.zeros(3),
+        torque=np.zeros(3),
+    )  # fmt: skip
+
+
+def test_what_counts_as_a_leak():
+    start = [[0.01, 0, 0], [-0.01, 0, 0], [0.01, 0.15, 0], [0.01, 0, 0.2], [0.01, 0, 0.045], [0.03, 0, 0]]
+    end = [[-0.01, 0, 0], [0.02, 0, 0], [-0.01, 0.15, 0], [-0.01, 0, 0.2], [-0.01, 0, 0.045], [0.02, 0, 0]]
+    frames = [frame(start), frame(end)]
+    np.testing.assert_array_equal(leaked(frames, PLATE), [-1, 1, 0, 0, -1, 0])
+    np.testing.assert_array_equal(leaked(frames, PLATE, edge=0.01), [-1, 1, 0, 0, 0, 0])
+    np.testing.assert_array_equal(leaked([*frames, frames[0]], PLATE), 0)  # it all came back
+    assert leakage(frames, PLATE) == pytest.approx(3 / 4)  # the last one met the plate and stayed in front
+
+
+def test_a_plate_that_moves_through_resting_soil_leaks():
+    """Turned and moved: the same motion seen from the body."""
+    soil = [[0.05, 0.02, 0.0], [0.05, 0.3, 0.0]]
+    q = about_y(0.3)
+    frames = [frame(soil, (x, 0, 0, *q)) for x in (0.0, 0.1)]
+    np.testing.assert_array_equal(leaked(frames, PLATE), [-1, 0])
+
+
+@pytest.mark.parametrize(("cells", "margin"), [(2.0, -0.5), (1.5, -0.5), (1.0, -0.25), (0.5, 0.0)])
+def test_plates_do_not_leak(cells, margin):
+    """A plate goes down 4 cm and then 10 cm forward: nothing comes through, more than a cell from its edges."""
+    rows = [(0.0, 0.104, 0.105), (0.2, 0.104, 0.06), (0.7, 0.204, 0.06)]
+    scene = cut(
+        blade=Plate(length=0.2, width=0.19, thickness=cells * 0.02),
+        contact_margin=margin,
+        motion="path",
+        path=tuple((t, x, 0.2, z, 0, 0, 0, 1) for t, x, z in rows),
+        duration=0.7,
+        frame_rate=100.0,
+    )
+    frames = list(Solver(scene).frames())
+    assert -np.mean([f.force[0] for f in frames[40:]]) > 20.0
+    assert leakage(frames, scene.body, edge=0.02) == 0.0
+    assert leakage(frames, scene.body, edge=0.01) < 0.06
