@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .column import Column
-from .rotation import angular_velocity, rotate
+from .rotation import angular_velocity
 from .scene import Scene
 
 __all__ = ["Flow", "expected_flow"]
@@ -63,8 +63,7 @@ def _of_body(scene: Scene) -> Flow | None:
     if body is None:
         return None
     poses = scene.body_poses()
-    outline = body.outline()
-    depth = -np.array([(rotate(pose[3:], outline) + pose[:3])[:, 2].min() for pose in poses])
+    depth = -(poses[:, 2] + (_heights(poses[:, 3:]) @ body.outline().T).min(axis=1))
     spin = angular_velocity(poses[:-1, 3:], poses[1:, 3:], 1.0 / scene.frame_rate)
     travel = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) * scene.frame_rate
     speed = np.maximum(travel, np.linalg.norm(spin, axis=1) * body.reach)
@@ -76,6 +75,12 @@ def _of_body(scene: Scene) -> Flow | None:
     if not len(moving):
         return None
     return _sheared(scene, "the body", float(np.percentile(moving, 100.0 - _TOP_SHARE)), thickness)
+
+
+def _heights(q: np.ndarray) -> np.ndarray:
+    """What points in the body's frame are multiplied with for their height in the world, shape (T, 3)."""
+    x, y, z, w = q.T
+    return np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
 
 
 def _of_column(scene: Scene) -> Flow | None:

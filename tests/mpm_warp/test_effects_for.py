@@ -25,6 +25,7 @@ from mpm_warp import (
 )  # fmt: skip
 from mpm_warp.effects_for import EFFECTS
 from mpm_warp.expected_flow import expected_flow
+from mpm_warp.rotation import about_y, multiply, rotate
 
 BEADS = Material(
     youngs_modulus=1e5,
@@ -56,6 +57,18 @@ def test_inertial_number_of_a_cut():
     assert (flow.speed, flow.thickness) == pytest.approx((0.2, 0.06))
     expected = 0.2 / 0.06 * 3e-4 * np.sqrt(2583.0 / (2583.0 * 0.67 * 9.81 * 0.06))
     assert flow.inertial_number == pytest.approx(expected)
+
+
+def test_depth_of_a_turned_plate():
+    """A plate of 0.2 x 0.044 m that leans by 30 degrees about y and by 20 about x, deepest with one corner."""
+    q = multiply(
+        about_y(np.radians(30.0)), np.array([np.sin(np.radians(10.0)), 0.0, 0.0, np.cos(np.radians(10.0))])
+    )
+    path = [(0.0, 0.2, 0.2, 0.05, *q), (1.0, 0.3, 0.2, 0.05, *q)]
+    scene = cut(motion="path", path=path)
+    deepest = rotate(q, scene.blade.outline())[:, 2].min() + 0.05
+    assert -0.15 < deepest < -0.02
+    assert expected_flow(scene).thickness == pytest.approx(-deepest)
 
 
 def test_a_body_above_the_soil_drives_nothing():
