@@ -48,7 +48,9 @@ def fluidity(real: type, effects: Effects) -> SimpleNamespace:
     - `local_fluidity(mu, c, soil)` -> g_loc [1/s],
     - `slowing(mu, soil)` -> m |mu - mu_s| = (A d / xi)^2, xi the cooperativity length [-],
     - `friction_with_excess(mu_trial, a, c, excess, soil)` -> mu,
-    - `fluidity_step(mu_trial, a, c, g, dt, soil)` -> mu and g at the end of the step.
+    - `fluidity_step(mu_trial, a, c, g, dt, soil)` -> mu and g at the end of the step,
+    - `fading(inverse_spacing, dt, soil)` -> share of what a grid cannot see of g that outlasts a step of cooperative
+      flow: that of the shortest wave along an axis of the grid.
     """
     vec2 = wp.types.vector(2, real)
     Soil = soil_struct(real, effects.fluidity)
@@ -163,7 +165,13 @@ def fluidity(real: type, effects: Effects) -> SimpleNamespace:
         g_new = wp.exp(wp.max(y, wp.log(real(least_fluidity))))
         return vec2(mu_trial / (real(1.0) + a * g_new), g_new)
 
+    @wp.func
+    def fading(inverse_spacing: real, dt: real, soil: Soil):
+        length = soil.cooperative_length * inverse_spacing
+        return real(1.0) / (real(1.0) + real(4.0) * length * length * dt / soil.fluidity_time)
+
     return SimpleNamespace(
+        fading=fading,
         coefficients=coefficients,
         local_fluidity=local_fluidity,
         slowing=slowing,

@@ -23,8 +23,8 @@ def lay_grid(
     """The grid's struct, and for each axis that has ghost layers these and their images (images.py).
 
     Walls fall on nodes where the bin is a whole number of cells; otherwise the grid is centred in x and y, which
-    keeps the scene's mirror symmetry, and the nodes just outside the bin are the walls. With `symmetric` the grid ends two layers
-    beyond the plane y = Ly / 2.
+    keeps the scene's mirror symmetry, and the nodes just outside the bin are the walls. With `symmetric` the grid
+    ends two layers beyond the plane y = Ly / 2.
     """
     bed, vec3 = scene.bed, wp.types.vector(3, real)
     h = bed.spacing

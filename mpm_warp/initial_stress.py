@@ -12,8 +12,8 @@ __all__ = ["initial_stress"]
 def initial_stress(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """ln J, shape (n,), and the deviatoric elastic strain xx, yy, zz, xy, xz, yz, shape (n, 6), at time 0.
 
-    Both `geostatic` and `k0` hold the vertical stress of rest at once, so nothing settles. `geostatic` is isotropic; `k0`
-    has the horizontal stress nu / (1 - nu) times the vertical one that an elastic bed filled from above would have.
+    Both `geostatic` and `k0` hold the vertical stress of rest at once, so nothing settles. `geostatic` is isotropic;
+    `k0` has the horizontal stress nu / (1 - nu) times the vertical one, as an elastic bed filled from above has.
     In a tilted bin they hold the shear stress rho g_x d at depth d, too, that carries an endless slope.
     """
     positions, volume = scene.filled

@@ -16,6 +16,11 @@ WALL_CONDUCTANCE at floor and walls where g is to vanish there, otherwise 0.
 Particles get g_i - G_i, not g_i. Were they given g_i, the way to the grid and back would smear the fluidity over a
 grid spacing, which is far more than the physics does where A d is small against it.
 
+With `fluidity` the particles of a cell must also be kept together: where the Laplacian drains a cell, those with
+more g would grow and the others die out, unseen by the grid. Of the difference between a particle's g and the grid's
+(sharpened, so that smooth fields lose nothing) only the share `fading` of fluidity.py outlasts a step, as it does for
+the shortest wave the grid knows. It is 1 where A d is small against the spacing.
+
 The equations are relaxed by Jacobi sweeps, which keep g between 0 and the largest G. The steady form goes on from the
 last step's values, so that a few sweeps a step suffice.
 """
@@ -75,7 +80,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
     - `project`: volume, fluidity and s from the particles to `sums`,
     - `prepare`: `sums` to means in `field` (filled volume, G, s, g), clearing the sums,
     - `sweep`: one Jacobi sweep from one field to another,
-    - `place`: g - G to the nodes' `cooperation`.
+    - `place`: what particles get to the nodes' `cooperation`.
     """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     vec6 = wp.types.vector(6, real)
@@ -83,6 +88,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
     spline, law = splines(real), fluidity(real, effects)
     base_and_offset, weights = spline.base_and_offset, spline.weights
     coefficients, local_fluidity, slowing = law.coefficients, law.local_fluidity, law.slowing
+    fading = law.fading
 
     @wp.func
     def source(e: vec6, ln_j: real, p: int, dt: real, soil: Soil):
@@ -123,9 +129,11 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
             wx = weights(f[0])
             wy = weights(f[1])
             wz = weights(f[2])
-            amount = vec4(found[0], found[1], found[2], real(0.0))
+            size = grid.inverse_spacing * grid.inverse_spacing * grid.inverse_spacing
+            size = size * grid.particle_volume
             if p < on_plane:
-                amount = real(0.5) * amount
+                size = real(0.5) * size
+            amount = size * vec4(found[0], found[1], found[2], real(0.0))
             for i in range(3):
                 for j in range(3):
                     row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
@@ -180,12 +188,42 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
             here[3] = (here[2] * here[1] + scale * flux) / (here[2] + scale * total + ratio * sink[n])
         swept[n] = here
 
+    @wp.func
+    def sharpened(n: int, here: vec4, nz: int, plane: int, field: wp.array(dtype=vec4)):
+        # G less the quarter of dx^2 laplacian(G) by which the way to the grid and back smooths it, along every axis
+        # on which both neighbours hold soil. Ghost nodes have their G from the sweeps.
+        sharp = here[1]
+        for axis in range(3):
+            stride = plane
+            if axis == 1:
+                stride = nz
+            if axis == 2:
+                stride = 1
+            before = field[n - stride]
+            after = field[n + stride]
+            if wp.min(before[0], after[0]) > real(0.25) * here[0]:
+                sharp -= real(0.25) * (before[1] - real(2.0) * here[1] + after[1])
+        return sharp
+
     @wp.kernel(module="unique", enable_backward=False)
-    def place(field: wp.array(dtype=vec4), cooperation: wp.array(dtype=vec4)):
+    def place(
+        grid: Grid,
+        soil: Soil,
+        nz: int,
+        plane: int,
+        field: wp.array(dtype=vec4),
+        cooperation: wp.array(dtype=vec4),
+    ):
         n = wp.tid()
         found = field[n]
-        excess = wp.where(found[0] > real(0.0), found[3] - found[1], real(0.0))
-        cooperation[n] = vec4(excess, real(0.0), real(0.0), real(0.0))
+        amount = real(0.0)
+        if found[0] > real(0.0):
+            amount = found[3] - found[1]
+            if wp.static(effects.fluidity):
+                if n >= plane and n < field.shape[0] - plane:
+                    lost = real(1.0) - fading(grid.inverse_spacing, grid.dt, soil)
+                    amount += lost * sharpened(n, found, nz, plane, field)
+        cooperation[n] = vec4(amount, real(0.0), real(0.0), real(0.0))
 
     return SimpleNamespace(project=project, prepare=prepare, sweep=sweep, place=place)
 
@@ -225,13 +263,14 @@ class NonlocalFluidity:
         walls = wp.array(sink, dtype=real, device=device)
         self._arrays = (sums, other, walls)  # a recorded launch does not promise to keep its arrays
         self.field = field
-        """Filled volume in particles, mean g or g_loc [1/s], s [-] and nodal fluidity g [1/s], shape (nodes, 4)."""
+        """Filled volume in cells, mean g or g_loc [1/s], s [-] and nodal fluidity g [1/s], shape (nodes, 4)."""
         ratio = (soil.cooperative_length / grid.spacing) ** 2
         relaxation = soil.fluidity_time / grid.dt if effects.fluidity else None
+        strides = (grid.nz, grid.ny * grid.nz)
         record = {"device": device, "record_cmd": True}
 
         def sweep(start: wp.array, end: wp.array) -> list[wp.Launch]:
-            inputs = [ratio, grid.nz, grid.ny * grid.nz, walls, start, end]
+            inputs = [ratio, *strides, walls, start, end]
             return [*images.unfold(start), wp.launch(kernels.sweep, count, inputs, **record)]
 
         inputs = [*particles, grid, soil, on_plane, sums]
@@ -241,6 +280,6 @@ class NonlocalFluidity:
             *images.fold(sums),
             wp.launch(kernels.prepare, count, [sums, field], **record),
             *[*sweep(field, other), *sweep(other, field)] * (sweep_count(ratio, relaxation) // 2),
-            wp.launch(kernels.place, count, [field, cooperation], **record),
+            wp.launch(kernels.place, count, [grid, soil, *strides, field, cooperation], **record),
         ]
         """In order, after the grid step and before the particles read the grid."""

@@ -76,9 +76,9 @@ class RigidBody:
         self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, torque)
         data = body_struct(real, self.law)()
         h = scene.bed.spacing
-        data.margin = scene.contact_margin * h
+        data.margin = scene.contact_distance
         data.layer = HOLDING_LAYER * h if scene.bilateral else 0.0
-        outermost = max(0.0, scene.contact_margin * h + float(data.layer))
+        outermost = max(0.0, scene.contact_distance + float(data.layer))
         data.shape, self._mesh = shape_data(shape, real, outermost, device)
         data.reach = shape.reach + math.sqrt(3.0) * outermost + h
         data.friction = shape.friction

@@ -87,13 +87,18 @@ class Bed:
                     "spacings; it must be a whole number of them: change bed.size or bed.spacing"
                 )
 
+    @property
+    def particle_spacing(self) -> float:
+        """Nominal distance between particles [m]."""
+        return self.spacing / self.particles_per_cell ** (1.0 / 3.0)
+
     @cached_property
     def filled(self) -> tuple[np.ndarray, float]:
         """Particle positions (n, 3) [m] and the volume of one [m^3]."""
         return arrange(
             self.arrangement,
             self.size,
-            self.spacing / self.particles_per_cell ** (1.0 / 3.0),
+            self.particle_spacing,
             self.seed,
             self.mirrored,
         )
@@ -151,8 +156,9 @@ class Scene:
     """[s]."""
     frame_rate: float = 60.0
     """Recorded frames per second [Hz]."""
-    contact_margin: float = -0.5
-    """Distance from the body's surface at which it begins to act on particles [grid spacings]; see contact.py."""
+    contact_margin: float = -0.75
+    """Distance from the body's surface at which it begins to act on soil, negative inside [grid spacings]; see
+    contact.py."""
     courant: float = 0.6
     """Time step as a share of spacing / wave speed."""
     elastic_damping: float = 0.1
@@ -186,6 +192,12 @@ class Scene:
             raise SceneError(f"scene.courant is {self.courant}; allowed: above 0, at most 1")
 
     # --- what a solver or a rollout asks of a scene -------------------------------------------------------
+
+    @property
+    def contact_distance(self) -> float:
+        """Distance of a particle's centre from the body's surface at which contact begins [m]: soil reaches half a
+        particle spacing further than the centre."""
+        return self.contact_margin * self.bed.spacing + 0.5 * self.bed.particle_spacing
 
     @property
     def gravity_vector(self) -> np.ndarray:
@@ -285,7 +297,7 @@ class Scene:
 
     def _check_thickness(self, what: str) -> None:
         """A body must be thick enough for soil to be inside before it is pushed out."""
-        core = self.body.half_thickness + self.contact_margin * self.bed.spacing
+        core = self.body.half_thickness + self.contact_distance
         if core < 0.1 * self.bed.spacing:
             raise SceneError(
                 f"{what} of {2.0 * self.body.half_thickness:g} m is too thin for a grid of {self.bed.spacing:g} m: "

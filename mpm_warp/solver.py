@@ -227,7 +227,17 @@ class Solver:
             *self._record_nonlocal(ghosts),
             *ghost.unfold(self._velocity),
             self._record(
-                kernels.gather, n, x, home, felt, c, grid, self._velocity, self._cooperation, self._excess, *watch
+                kernels.gather,
+                n,
+                x,
+                home,
+                felt,
+                c,
+                grid,
+                self._velocity,
+                self._cooperation,
+                self._excess,
+                *watch,
             ),
             self._record(
                 kernels.material, n, felt, c, e, ln_j, self._stress, self._swelling, self._excess, grid, soil
@@ -268,7 +278,16 @@ class Solver:
         ghost = Images(real, self.device, grid, ghosts, mirrored=False)  # fluidity has no direction
         on_plane = self._half.on_plane if self._half is not None else 0
         term = NonlocalFluidity(
-            real, self.effects, self.device, sink, particles, grid, self._soil, ghost, self._cooperation, on_plane
+            real,
+            self.effects,
+            self.device,
+            sink,
+            particles,
+            grid,
+            self._soil,
+            ghost,
+            self._cooperation,
+            on_plane,
         )
         return [*term.launches, *ghost.unfold(self._cooperation)]
 

@@ -18,6 +18,7 @@ import warp as wp
 from .constitutive import constitutive
 from .contact import ContactLaw, body_struct, contact
 from .effects import Effects
+from .fluidity import fluidity
 from .grid import grid_struct
 from .rows import rows
 from .soil import soil_struct
@@ -45,6 +46,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
     with_body = touch is not None
     push = contact(real, touch or ContactLaw(), atomic).push
     update, kirchhoff = law.update, law.kirchhoff
+    fading = fluidity(real, effects).fading
     spline = splines(real)
     base_and_offset, weights, moments = spline.base_and_offset, spline.weights, spline.moments
     lanes = rows(real, gpu=atomic)
@@ -129,7 +131,9 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         if wp.static(with_body):
             u = vec3(felt[p][0], felt[p][1], felt[p][2])
             start += push(p, x[p], u, grid.particle_mass, grid.dt, substep[0], body)
-        deposit(base, f, vec4(start[0], start[1], start[2], grid.particle_mass * swelling[p]), q, grid, impulse)
+        deposit(
+            base, f, vec4(start[0], start[1], start[2], grid.particle_mass * swelling[p]), q, grid, impulse
+        )
 
     @wp.kernel(module="unique", enable_backward=False, module_options=fused)
     def gather(
@@ -213,15 +217,18 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         soil: Soil,
     ):
         p = wp.tid()
-        # What `update` means by its last number.
+        # What `update` means by its last number; `excess` is what cooperative flow adds (nonlocal_fluidity.py).
         g = real(0.0)
         if wp.static(effects.nonlocality):
             g = excess[p]
         if wp.static(effects.fluidity):
-            g = wp.max(soil.g[p] + g, real(0.0))
+            kept = real(1.0)
+            if wp.static(effects.nonlocality):
+                kept = fading(grid.inverse_spacing, grid.dt, soil)
+            g = wp.max(kept * soil.g[p] + g, real(0.0))
         before = e[p]
-        # Volume changes as the mean over the nodes around does: what a particle's own gradient says besides is noise, and
-        # is taken back a step later.
+        # Volume changes as the mean over the nodes around does: what a particle's own gradient says besides is noise,
+        # and is taken back a step later.
         volume_before = ln_j[p] + grid.volume_averaging * (felt[p][3] - swelling[p])
         state = update(before, volume_before, grid.dt * c[p], grid.dt, soil, g)
         after = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
@@ -230,10 +237,11 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         swelling[p] = state[6] - volume_before
         if wp.static(effects.fluidity):
             soil.g[p] = state[7]
-        # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone.
+        # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone. It
+        # takes away at most half of the pressure, since soil can bear no tension.
         volume = state[6] + grid.damping * (state[6] - volume_before)
         if wp.static(effects.separation):
-            volume = wp.where(state[6] < real(0.0), wp.min(volume, real(0.0)), state[6])
+            volume = wp.where(state[6] < real(0.0), wp.min(volume, real(0.5) * state[6]), state[6])
         t = kirchhoff(after + grid.damping * (after - before), volume, soil)
         stress[p] = vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])
 

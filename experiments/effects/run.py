@@ -31,9 +31,9 @@ REPEATS = 3
 SCENES = {
     "excavation": ["scene=quick_excavation", "scene.duration=1.0"],
     "wheel": ["scene=quick_wheel", "scene.duration=1.0"],
-    "column": ["scene=column", "scene.duration=0.5"],
-    "incline": ["scene=incline", "scene.duration=0.5"],
-    "thin_layer": ["scene=thin_layer", "scene.duration=1.0"],
+    "column": ["scene=column", "scene.duration=0.4"],
+    "incline": ["scene=incline", "scene.duration=0.4"],
+    "thin_layer": ["scene=thin_layer", "scene.duration=0.5"],
 }
 EFFECTS = ("yielding", "rate_dependence", "fluidity", "nonlocality", "separation", "symmetry", "torque")
 GRAINS = (1e-4, 3e-4, 1e-3, 2e-3, 5e-3)  # diameters for edge.csv [m]

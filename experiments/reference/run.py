@@ -12,6 +12,7 @@ import argparse
 import csv
 import logging
 import multiprocessing
+import re
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -33,6 +34,18 @@ DX = {"20": 0.02, "13.3": 0.8 / 60, "10": 0.01, "6.7": 0.8 / 120}
 
 CUT = ["scene=excavation", "scene.depth=0.08", "scene.duration=2.0"]
 WHEEL = ["scene=wheel", "scene.duration=3.0"]
+QUANTITIES = {
+    "cut": [
+        ("draft", "draft, mean of 2 s [N]"),
+        ("draft_second_half", "draft, second half [N]"),
+        ("vertical", "vertical force [N]"),
+    ],
+    "wheel": [
+        ("sinkage_mm", "sinkage [mm]"),
+        ("drawbar_pull", "drawbar pull [N]"),
+        ("torque", "torque [N m]"),
+    ],
+}
 
 
 def settings(kind: str) -> dict[str, list[str]]:
@@ -51,10 +64,10 @@ def settings(kind: str) -> dict[str, list[str]]:
     changes = {
         "jittered, seed 0": ["scene.bed.arrangement=jittered", "++scene.bed.mirrored=true"],
         "jittered, seed 1": ["scene.bed.arrangement=jittered", "++scene.bed.mirrored=true", "seed=1"],
+        "margin -1": ["scene.contact_margin=-1"],
         "margin -0.5": ["scene.contact_margin=-0.5"],
         "margin -0.25": ["scene.contact_margin=-0.25"],
         "margin 0": ["scene.contact_margin=0"],
-        "margin 0.25": ["scene.contact_margin=0.25"],
         "courant 0.3": ["scene.courant=0.3"],
         "damping 0": ["scene.elastic_damping=0"],
         "damping 0.2": ["scene.elastic_damping=0.2"],
@@ -78,8 +91,10 @@ def settings(kind: str) -> dict[str, list[str]]:
         found["dx 10, 8 per cell"] = at("10", 8)
         found["dx 6.7, 1 per cell"] = at("6.7", 1)
         for dx, ppc in (("20", 4), ("10", 4)):
-            for margin in ("-0.5", "0"):
-                found[f"dx {dx}, {ppc} per cell, margin {margin}"] = at(dx, ppc, f"scene.contact_margin={margin}")
+            for margin in ("-1", "-0.5"):
+                found[f"dx {dx}, {ppc} per cell, margin {margin}"] = at(
+                    dx, ppc, f"scene.contact_margin={margin}"
+                )
         found["dx 6.7, 4 per cell"] = at("6.7", 4)
     return found
 
@@ -125,7 +140,9 @@ def measure(kind: str, name: str, overrides: list[str]) -> dict[str, float | str
         }
     DATA.mkdir(parents=True, exist_ok=True)
     surface, moved = on_common_points(scene, last.position)
-    np.savez_compressed(DATA / f"{kind}_{name.replace(' ', '_')}.npz", force=force, surface=surface, moved=moved)
+    np.savez_compressed(
+        DATA / f"{kind}_{name.replace(' ', '_')}.npz", force=force, surface=surface, moved=moved
+    )
     return {k: round(float(v), 3) if isinstance(v, np.floating) else v for k, v in row.items()}
 
 
@@ -157,23 +174,92 @@ def rows_of(kind: str) -> dict[str, dict]:
 
 
 def save(kind: str, rows: dict[str, dict]) -> None:
-    """The table in the order of the settings, with the distances from the finest run."""
+    """The table in the order of the settings, with the distances from the finest run that is there."""
     order = [name for name in settings(kind) if name in rows]
-    fields = list(next(iter(rows.values())))
+    finest = max(order, key=lambda name: float(rows[name]["particles"]) * float(rows[name]["steps_per_s"]))
+    reference = np.load(file_of(kind, finest))
+    for name in order:
+        if not file_of(kind, name).exists():
+            continue  # an earlier sitting's, already measured
+        with np.load(file_of(kind, name)) as run:
+            rows[name] |= {
+                "surface_rms_mm": round(1e3 * rms(run["surface"] - reference["surface"]), 2),
+                "moved_rms_mm": round(1e3 * rms(run["moved"] - reference["moved"]), 2),
+                "reference": finest,
+            }
+    fields = list(dict.fromkeys(key for name in order for key in rows[name]))
     with (HERE / f"{kind}.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, fields, extrasaction="ignore")
+        writer = csv.DictWriter(stream, fields)
         writer.writeheader()
         writer.writerows(rows[name] for name in order)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def file_of(kind: str, name: str) -> Path:
+    return DATA / f"{kind}_{name.replace(' ', '_')}.npz"
+
+
+def draw(kind: str, rows: dict[str, dict], names: list[tuple[str, str]]) -> None:
+    """Left: each quantity over the grid spacing. Right: what one change does at one setting."""
+    figure = plt.figure(figsize=(13, 2.6 * len(names)), layout="constrained")
+    axes = figure.subplots(len(names), 2, width_ratios=(1, 1.4), squeeze=False)
+    grid = {
+        name: m
+        for name in rows
+        if (m := re.fullmatch(r"dx ([\d.]+), (\d) per cell(?:, (margin \S+))?", name))
+    }
+    changed = [name for name in rows if name.count(",") > 1 and ", 4 per cell" in name]
+    base = next(name for name in settings(kind) if changed and changed[0].startswith(name))
+    changed = [base, *(name for name in changed if name.startswith(base))]
+    for (left, right), (key, label) in zip(axes, names, strict=True):
+        for ppc, margin in sorted({(m[2], m[3] or "default margin") for m in grid.values()}):
+            points = sorted(
+                (float(m[1]), float(rows[n][key]))
+                for n, m in grid.items()
+                if (m[2], m[3] or "default margin") == (ppc, margin)
+            )
+            if len(points) > 1:
+                left.plot(*zip(*points, strict=True), "o-", label=f"{ppc} per cell, {margin}")
+        left.set_xlim(0.0, None)
+        left.set_ylim(min(0.0, left.get_ylim()[0]), None)
+        left.set_ylabel(label)
+        left.grid(alpha=0.3)
+        values = [float(rows[n][key]) for n in changed]
+        right.bar(range(len(changed)), values, color=["k"] + ["C0"] * (len(changed) - 1))
+        right.axhline(values[0], color="k", lw=0.8)
+        right.set_xticks(range(len(changed)), [n.removeprefix(base).strip(", ") or base for n in changed])
+        right.tick_params(axis="x", rotation=60, labelsize=7)
+        for tick in right.get_xticklabels():
+            tick.set_horizontalalignment("right")
+        if right is not axes[-1, 1]:
+            right.set_xticklabels([])
+        right.grid(alpha=0.3, axis="y")
+    axes[0, 0].legend(fontsize=7)
+    axes[-1, 0].set_xlabel("grid spacing [mm]")
+    figure.savefig(HERE / f"{kind}.png", dpi=90)
+    plt.close(figure)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", choices=("cut", "wheel"))
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--draw", action="store_true", help="only draw the figures from the tables")
     options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     tables = {kind: rows_of(kind) for kind in ("cut", "wheel") if options.only in (None, kind)}
-    with ProcessPoolExecutor(options.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    if not options.draw:
+        compute(tables, options.workers)
+    for kind, rows in tables.items():
+        draw(kind, rows, QUANTITIES[kind])
+
+
+def compute(tables: dict[str, dict[str, dict]], workers: int) -> None:
+    """Make every run that is not in the tables yet."""
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         jobs = {
             pool.submit(measure, kind, name, overrides): (kind, name)
             for kind, rows in tables.items()

@@ -35,8 +35,8 @@ class RetainingWall(Scene):
 
     def poses_at(self, time: np.ndarray) -> np.ndarray:
         poses = super().poses_at(time)
-        # Soil touches the wall where contact begins: `contact_margin` spacings off its face.
-        face = BEHIND - self.contact_margin * self.bed.spacing + self.speed * np.atleast_1d(time)
+        # Soil touches the wall where contact begins.
+        face = self.filled[0][:, 0].min() - self.contact_distance + self.speed * np.atleast_1d(time)
         poses[:, 0] = face - 0.5 * self.body.thickness
         poses[:, 2] = 0.5 * self.body.length - DEPTH
         return poses

@@ -35,8 +35,8 @@ class Silo(Scene):
     def poses_at(self, time: np.ndarray) -> np.ndarray:
         poses = super().poses_at(time)
         poses[:, 0] = 0.5 * self.bed.size[0]
-        # The lowest particles rest where contact begins: `contact_margin` spacings off the piston's face.
-        face = self.filled[0][:, 2].min() - self.contact_margin * self.bed.spacing
+        # The lowest particles rest where contact begins: `contact_distance` off the piston's face.
+        face = self.filled[0][:, 2].min() - self.contact_distance
         poses[:, 2] = face - 0.5 * self.body.length - self.speed * np.atleast_1d(time)
         return poses
 

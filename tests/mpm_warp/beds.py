@@ -33,7 +33,7 @@ def cut(**kw) -> Excavation:
     """A small, fast excavation: 4 800 particles on a 2 cm grid."""
     values = {
         "bed": Bed(size=(0.48, 0.4, 0.16), spacing=0.02, headroom=0.12),
-        "blade": Plate(length=0.2, width=0.19, thickness=0.044),
+        "blade": Plate(length=0.2, width=0.193, thickness=0.044),
         "duration": 0.2,
         "depth": 0.06,
         "speed": 0.2,

@@ -63,13 +63,13 @@ def scaled_cut(length: float, gravity: float):
     rate, speed = math.sqrt(gravity / length), math.sqrt(gravity * length)
     assert speed == pytest.approx(rate * length)
     soil = Material()
-    rows = [(0.0, 0.13, 0.2, 0.105, 0, 0, 0, 1), (0.1, 0.16, 0.2, 0.06, 0, 0, 0, 1)]
+    rows = [(0.0, 0.13, 0.2, 0.105, 0, 0, 0, 1), (0.1, 0.16, 0.2, 0.0607, 0, 0, 0, 1)]
     path = tuple((t / rate, length * x, length * y, length * z, *q) for t, x, y, z, *q in rows)
     return cut(
         bed=Bed(
             size=tuple(length * s for s in (0.48, 0.4, 0.16)), spacing=length * 0.02, headroom=length * 0.12
         ),
-        blade=Plate(length=length * 0.2, width=length * 0.19, thickness=length * 0.044),
+        blade=Plate(length=length * 0.2, width=length * 0.193, thickness=length * 0.044),
         material=replace(
             soil,
             youngs_modulus=soil.youngs_modulus * gravity * length,
