@@ -5,6 +5,7 @@ from .batch import frames_together
 from .bodies import Box, Cylinder, MeshBody, Plate
 from .column import Column
 from .effects import Effects
+from .effects_for import Decision, Tolerances, effects_for
 from .errors import SceneError, SolverStopped
 from .excavation import Excavation
 from .incline import Incline
@@ -22,6 +23,7 @@ __all__ = [
     "Box",
     "Column",
     "Cylinder",
+    "Decision",
     "Effects",
     "Excavation",
     "Frame",
@@ -34,10 +36,12 @@ __all__ = [
     "SceneError",
     "Solver",
     "SolverStopped",
+    "Tolerances",
     "Walls",
     "Wheel",
     "arrange",
     "asymmetry",
+    "effects_for",
     "frames_together",
     "substeps_per_frame",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from .errors import SceneError
@@ -15,6 +17,7 @@ ARRANGEMENTS = ("lattice", "jittered", "poisson")
 POISSON_RADIUS = 0.897
 
 
+@lru_cache(maxsize=8)  # a random bed takes seconds to fill, and all scenes of a dataset share it
 def arrange(
     kind: str, size: tuple[float, float, float], spacing: float, seed: int, mirrored: bool = False
 ) -> tuple[np.ndarray, float]:
@@ -29,8 +32,16 @@ def arrange(
         mirrored: a random bed is its own mirror image about y = Ly / 2.
 
     Returns:
-        Positions [m], shape (n, 3), float64, and the volume of one particle [m^3].
+        Positions [m], shape (n, 3), float64, read-only, and the volume of one particle [m^3].
     """
+    points, volume = _arranged(kind, size, spacing, seed, mirrored)
+    points.flags.writeable = False
+    return points, volume
+
+
+def _arranged(
+    kind: str, size: tuple[float, float, float], spacing: float, seed: int, mirrored: bool
+) -> tuple[np.ndarray, float]:
     if kind == "lattice":
         return lattice(size, spacing)
     if kind == "jittered":

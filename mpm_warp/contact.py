@@ -8,7 +8,7 @@ Particles move with the soil, so the force changes smoothly as the body advances
 comes and goes with every cell the body crosses.
 
 The grid spreads a push over the width of its B-splines, whose support reaches one and a half grid spacings, so a
-body acts further out than it is. Contact therefore begins at a margin of -1/2 grid spacings: when the soil's edge,
+body acts further out than it is. Contact therefore begins at a margin of -1/4 grid spacings: when the soil's edge,
 half a particle spacing from a particle's centre, is that far inside. Wheels, which press on soil and hardly cut it,
 have none.
 
@@ -41,6 +41,8 @@ class ContactLaw:
     """Soil in contact may not leave along the normal."""
     free: bool = False
     """The body's height is not prescribed but computed (axle.py)."""
+    torque: bool = True
+    """The moment of the soil's push is added up."""
 
 
 @cache
@@ -69,7 +71,7 @@ def body_struct(real: type, law: ContactLaw) -> type:
         stick: wp.array(dtype=vec3)  # stretch of each particle's tangential spring, world frame [m]
         impulse: wp.array(
             dtype=vec3
-        )  # [0] by the soil on the body [N s], [1] its moment about the centre of mass
+        )  # [0] by the soil on the body [N s], [1] its moment about the centre of mass, if that is asked for
 
     return Body
 
@@ -83,16 +85,18 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
     vec3 = wp.types.vector(3, real)
     Body = body_struct(real, law)
     outward = signed_distance(real, law.shape)
-    bilateral, free = law.bilateral, law.free
+    bilateral, free, torque = law.bilateral, law.free, law.torque
 
     @wp.func
     def add(body: Body, impulse: vec3, arm: vec3):
         if wp.static(atomic):
             wp.atomic_sub(body.impulse, 0, impulse)
-            wp.atomic_sub(body.impulse, 1, wp.cross(arm, impulse))
+            if wp.static(torque):
+                wp.atomic_sub(body.impulse, 1, wp.cross(arm, impulse))
         else:
             body.impulse[0] = body.impulse[0] - impulse
-            body.impulse[1] = body.impulse[1] - wp.cross(arm, impulse)
+            if wp.static(torque):
+                body.impulse[1] = body.impulse[1] - wp.cross(arm, impulse)
 
     @wp.func
     def push(p: int, x: vec3, v: vec3, mass: real, dt: real, s: int, body: Body):

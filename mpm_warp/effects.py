@@ -24,6 +24,7 @@ _REASONS = {
     ),
     "separation": ("soil below its critical density carries no stress", "soil may carry tension"),
     "symmetry": ("half the bed is computed and mirrored", "the whole bed is computed"),
+    "torque": ("the torque on the body is recorded", "no torque is recorded"),
 }
 
 
@@ -44,6 +45,8 @@ class Effects:
     symmetry: bool = False
     """Half the bed is computed, the other half is its mirror image. Needs a scene that is mirror symmetric about
     y = Ly / 2."""
+    torque: bool = True
+    """The torque on a body is added up; off: it is recorded as 0."""
 
     def __post_init__(self) -> None:
         if self.rate_dependence and not self.yielding:

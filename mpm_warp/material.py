@@ -142,8 +142,29 @@ class Material:
         """Speed of confined compression waves, sqrt((K + 4 G / 3) / rho) [m/s]."""
         return math.sqrt((self.bulk_modulus + 4.0 * self.shear_modulus / 3.0) / self.bulk_density)
 
+    def friction_at(self, inertial_number: float) -> float:
+        """mu(I) of steady flow, by the rate law [-]."""
+        above = self.limit_friction - self.static_friction
+        if self.rate_law == "linear":
+            return self.static_friction + above * inertial_number / self.reference_inertial_number
+        if inertial_number == 0.0:
+            return self.static_friction
+        return self.static_friction + above / (1.0 + self.reference_inertial_number / inertial_number)
+
+    def inertial_number(self, friction: float) -> float:
+        """I of the steady flow with a ratio `friction` of shear stress to pressure [-]: 0 up to mu_s, infinite where
+        the rate law has no such flow."""
+        above, most = friction - self.static_friction, self.limit_friction - self.static_friction
+        if above <= 0.0:
+            return 0.0
+        if self.rate_law == "linear":
+            return self.reference_inertial_number * above / most
+        return self.reference_inertial_number * above / (most - above) if above < most else math.inf
+
     def cooperativity_length(self, friction: float) -> float:
-        """xi [m]: how far flow reaches at a ratio `friction` of shear stress to pressure, below mu_2."""
+        """xi [m]: how far flow reaches at a ratio `friction` of shear stress to pressure."""
+        if self.rate_law == "saturating" and friction >= self.limit_friction:
+            return 0.0
         slowing = abs(friction - self.static_friction)
         if self.rate_law == "saturating":
             slowing *= (self.limit_friction - self.static_friction) / (self.limit_friction - friction)

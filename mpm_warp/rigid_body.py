@@ -56,6 +56,7 @@ class RigidBody:
         particles: how many there are.
         volume: of a particle [m^3].
         share: of the soil's impulse that is computed: 1/2 with mirror symmetry.
+        torque: whether the moment of that impulse is added up.
     """
 
     def __init__(
@@ -68,11 +69,12 @@ class RigidBody:
         particles: int,
         volume: float,
         share: float = 1.0,
+        torque: bool = True,
     ) -> None:
         vec3 = wp.types.vector(3, real)
         self.scene, self.substeps, self.dt = scene, substeps, dt
         shape, axle = scene.body, scene.axle
-        self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None)
+        self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, torque)
         data = body_struct(real, self.law)()
         h = scene.bed.spacing
         data.margin = scene.contact_distance
@@ -88,7 +90,7 @@ class RigidBody:
         data.velocity = wp.zeros(substeps, dtype=vec3, device=device)
         data.spin = wp.zeros(substeps, dtype=vec3, device=device)
         data.stick = wp.zeros(particles, dtype=vec3, device=device)
-        data.impulse = wp.zeros(2, dtype=vec3, device=device)
+        data.impulse = wp.zeros(1 + torque, dtype=vec3, device=device)
         self.launches: list[wp.Launch] = []
         """What has to run in every substep after the soil's push was added up."""
         self._axle: wp.array | None = None
@@ -139,5 +141,9 @@ class RigidBody:
             )
 
     def impulse(self) -> np.ndarray:
-        """By the soil on the body since the frame began [N s], and its moment [N m s], shape (2, 3)."""
-        return on_host(self.data.impulse).astype(float)
+        """By the soil on the body since the frame began [N s], and its moment [N m s], shape (2, 3); a moment that is
+        not added up is 0."""
+        found = np.zeros((2, 3))
+        impulse = on_host(self.data.impulse)
+        found[: len(impulse)] = impulse
+        return found

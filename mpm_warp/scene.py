@@ -105,13 +105,18 @@ class Bed:
 
     @cached_property
     def stored(self) -> np.ndarray:
-        """Indices of the particles that are recorded, increasing: one of every `store_every` that follow each other.
+        """Indices of the particles of a full bed that are recorded; see `stored_of`."""
+        return self.stored_of(len(self.filled[0]))
+
+    def stored_of(self, count: int) -> np.ndarray:
+        """Indices of those of `count` particles that are recorded, increasing: one of every `store_every` that follow
+        each other.
 
         Which one is drawn at random, always the same way: at fixed steps a lattice would be recorded in some of
         its layers only.
         """
-        first = np.arange(0, len(self.filled[0]), self.store_every)
-        left = np.minimum(self.store_every, len(self.filled[0]) - first)
+        first = np.arange(0, count, self.store_every)
+        left = np.minimum(self.store_every, count - first)
         return first + np.random.default_rng(0).integers(left)
 
     @property
@@ -151,7 +156,7 @@ class Scene:
     """[s]."""
     frame_rate: float = 60.0
     """Recorded frames per second [Hz]."""
-    contact_margin: float = -0.5
+    contact_margin: float = -0.25
     """Distance from the body's surface at which it begins to act on soil, negative inside [grid spacings]; see
     contact.py."""
     courant: float = 0.6
@@ -204,6 +209,11 @@ class Scene:
     def filled(self) -> tuple[np.ndarray, float]:
         """Particle positions (n, 3) [m] and the volume of one [m^3]."""
         return self.bed.filled
+
+    @property
+    def stored(self) -> np.ndarray:
+        """Indices of the particles that are recorded; see `Bed.stored_of`."""
+        return self.bed.stored_of(len(self.filled[0]))
 
     @property
     def soil_volume(self) -> float:

@@ -24,7 +24,7 @@ from .scene import Scene
 from .soil import soil_parameters
 from .start import find_device
 from .streams import on_host
-from .symmetry import asymmetry, half
+from .symmetry import half, require_symmetry
 from .time_step import steps_to_remap, substeps_per_frame, top_body_speed
 from .transfer import transfer
 
@@ -51,7 +51,7 @@ class Frame:
     force: np.ndarray
     """By the soil on the body, world frame, mean since the previous frame [N], shape (3,); frame 0: zeros."""
     torque: np.ndarray
-    """About the body's centre of mass, likewise [N m], shape (3,)."""
+    """About the body's centre of mass, likewise [N m], shape (3,); zeros without the effect `torque`."""
 
 
 class Solver:
@@ -81,11 +81,8 @@ class Solver:
         self.device = find_device(device)
         self.precision = precision
         self._real = PRECISIONS[precision]
-        if self.effects.symmetry and (reason := asymmetry(scene)):
-            raise SceneError(
-                f"effects.symmetry needs a scene that is mirror symmetric about mid-width: {reason}; or set "
-                "effects.symmetry=false"
-            )
+        if self.effects.symmetry:
+            require_symmetry(scene)
         self._half = half(scene) if self.effects.symmetry else None
 
         self._top_body_speed = top_body_speed(scene)
@@ -169,7 +166,15 @@ class Solver:
         if scene.body is not None:
             share = 1.0 if self._half is None else 0.5
             self._body = RigidBody(
-                scene, real, device, self.substeps_per_frame, self.time_step, n, volume, share
+                scene,
+                real,
+                device,
+                self.substeps_per_frame,
+                self.time_step,
+                n,
+                volume,
+                share,
+                self.effects.torque,
             )
         self._record_launches(n, nodes, ghosts)
 

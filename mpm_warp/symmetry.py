@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .errors import SceneError
 from .scene import Scene
 
-__all__ = ["Half", "asymmetry", "half"]
+__all__ = ["Half", "asymmetry", "half", "require_symmetry"]
 
 _SAME = 1e-6  # positions closer than this are the same [grid spacings]
 
@@ -63,6 +64,19 @@ def asymmetry(scene: Scene) -> str | None:
             "bed.mirrored=true"
         )
     return None
+
+
+def require_symmetry(scene: Scene) -> None:
+    """Refuse a scene that is not mirror symmetric about y = Ly / 2.
+
+    Raises:
+        SceneError: with what is not symmetric.
+    """
+    if reason := asymmetry(scene):
+        raise SceneError(
+            f"effects.symmetry needs a scene that is mirror symmetric about mid-width: {reason}; or set "
+            "effects.symmetry=false"
+        )
 
 
 def half(scene: Scene) -> Half | None:

@@ -21,6 +21,7 @@ from omegaconf import OmegaConf
 from sgns.campaign import Campaign
 from sgns.published import excavation_case, read_published
 from sgns.runs import Run
+from sgns.scene_effects import asked_effects
 from sgns.scenes import scene_from_config
 from sgns.simulate import simulate_campaign
 
@@ -71,7 +72,7 @@ def main() -> None:
         Path(options.runs),
         scenes,
         dict.fromkeys(scenes, "test"),
-        OmegaConf.to_object(config.effects),
+        asked_effects(config),
         config.solver.precision,
         seed=0,
     )

@@ -22,12 +22,12 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from mpm_warp import Effects
 from sgns.campaign import Dataset, plan
 from sgns.evaluation.provenance import cpu_model
 from sgns.learning.training import train
 from sgns.reduction.reduced import reduce_dataset
 from sgns.rollout import rollout_scene
+from sgns.scene_effects import asked_effects, decided
 from sgns.scenes import scene_from_config
 from sgns.simulate import simulate_campaign, simulate_scene
 from sgns.simulator import Simulator
@@ -43,7 +43,7 @@ def make_simulator(config, folder: Path) -> Simulator:
     short = OmegaConf.to_container(config.scene, resolve=True)
     short |= {"material": OmegaConf.to_container(config.material), "duration": 0.25}
     settings = {"name": "speed", "path": folder / "data", "draw": {"depth": [0.03, 0.05, 0.08]}}
-    campaign = plan(settings, short, OmegaConf.to_container(config.effects), "float32", seed=0)
+    campaign = plan(settings, short, asked_effects(config), "float32", seed=0)
     simulate_campaign(campaign, device="cpu", workers=1)
     with initialize_config_module("sgns.conf", version_base="1.3"):
         learning = OmegaConf.to_container(compose("train", ["training.max_steps=20"]), resolve=False)
@@ -70,7 +70,7 @@ def main() -> None:
             "simulate", ["scene=paper_excavation", "scene.depth=0.08", "scene.speed=0.10", "scene.rake=10"]
         )
     scene = scene_from_config(config)
-    effects = Effects(**OmegaConf.to_container(config.effects))
+    effects, _ = decided(scene, asked_effects(config))
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         simulator = make_simulator(config, folder)

@@ -10,6 +10,7 @@ import itertools
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ import numpy as np
 import yaml
 from omegaconf import OmegaConf
 
-from mpm_warp import Scene
+from mpm_warp import Decision, Effects, Scene
 from sgns.errors import UserError
+from sgns.scene_effects import decided
 from sgns.wholefile import write_whole
 
 __all__ = ["SPLITS", "Campaign", "Dataset", "plan"]
@@ -36,9 +38,15 @@ class Campaign:
     """Run name → scene."""
     split: dict[str, str]
     """Run name → train, validation or test."""
-    effects: dict[str, bool]
+    effects: dict[str, Any]
+    """What was asked for; scenes decide about what is `auto`, each for itself."""
     precision: str
     seed: int
+
+    @cached_property
+    def physics(self) -> dict[str, tuple[Effects, dict[str, Decision]]]:
+        """Run name → its effects and the decision about each."""
+        return {name: decided(scene, self.effects) for name, scene in self.scenes.items()}
 
     def describe(self) -> dict[str, Any]:
         """The contents of dataset.yaml."""
@@ -73,14 +81,14 @@ class Campaign:
 
 
 def plan(
-    settings: Mapping[str, Any], base: Mapping[str, Any], effects: dict[str, bool], precision: str, seed: int
+    settings: Mapping[str, Any], base: Mapping[str, Any], effects: dict[str, Any], precision: str, seed: int
 ) -> Campaign:
     """The runs of a campaign.
 
     Args:
         settings: the `dataset` group: name, path, draw, runs, split.
         base: a scene as nested data; `draw` replaces values in it.
-        effects: which physics.
+        effects: which physics is asked for: effect → true, false or auto, and the group `tolerance`.
         precision: float32 or float64.
         seed: of the drawn combinations and the split.
     """

@@ -25,6 +25,7 @@ from sgns.claim import claimed
 from sgns.cost import RunCost, duration_words, finishing_time, require_space, run_cost, size_words
 from sgns.errors import UserError
 from sgns.runs import Run
+from sgns.scene_effects import decision_summary, recorded
 from sgns.scene_run import scene_stages
 from sgns.settings import flattened
 
@@ -68,6 +69,7 @@ def simulate_campaign(
         raise UserError(
             f"shard is {shard!r}; with shards={shards} it must be a whole number from 0 to {shards - 1}"
         )
+    physics = campaign.physics  # before anything is written: what was asked for may be impossible
     campaign.record()
     costs = {name: run_cost(scene) for name, scene in campaign.scenes.items()}
     by_length = sorted(costs, key=lambda name: costs[name].work, reverse=True)
@@ -78,6 +80,8 @@ def simulate_campaign(
     log.info("dataset %s in %s: %s, %d to do", campaign.name, campaign.path, total, len(missing))
     if not missing:
         return
+    for line in decision_summary(physics[name][1] for name in missing):
+        log.info("%s", line)
     size = sum(costs[name].size for name in missing)
     require_space(campaign.path, size)
     _compile(campaign, missing, device)
@@ -95,7 +99,7 @@ def simulate_campaign(
 def _compile(campaign: Campaign, names: list[str], device: str) -> None:
     """Compile the kernels of every kind of scene, once; the processes find them in Warp's cache.
 
-    Kernels can differ only where scenes differ in something else than the size of a number.
+    Kernels can differ only where scenes differ in their effects or in something else than the size of a number.
     """
     kinds = {}
     for name in names:
@@ -109,9 +113,9 @@ def _compile(campaign: Campaign, names: list[str], device: str) -> None:
             for key, value in flattened(scene.to_dict()).items()
             if key != "name"
         }
-        kinds.setdefault(frozenset(chosen.items()), scene)
-    for scene in kinds.values():
-        Solver(scene, Effects(**campaign.effects), device, campaign.precision)
+        kinds.setdefault((frozenset(chosen.items()), campaign.physics[name][0]), scene)
+    for (_, physics), scene in kinds.items():
+        Solver(scene, physics, device, campaign.precision)
 
 
 class _Production:
@@ -122,7 +126,7 @@ class _Production:
     ) -> None:
         self.campaign, self.costs, self.workers, self.batch = campaign, costs, workers, batch
         self.at_once = workers * batch
-        self._settings = (campaign.effects, campaign.seed, device, campaign.precision)
+        self._settings = (campaign.seed, device, campaign.precision)
         context = multiprocessing.get_context("spawn")
         # Frames done of every run, and whether it has ended; each entry has one writer, so there is no lock.
         self._frames_done, self._ended = context.RawArray("q", len(costs)), context.RawArray("b", len(costs))
@@ -160,11 +164,12 @@ class _Production:
         """Let all workers step runs from all over the list for a moment, at the same time."""
         names = list(self.costs)
         sample = [names[i * len(names) // self.at_once] for i in range(self.at_once)]
-        effects, _, device, precision = self._settings
+        _, device, precision = self._settings
         shares = [sample[worker :: self.workers] for worker in range(self.workers)]
         trials = []
         for share in shares:
             scenes = [self.campaign.scenes[name].to_dict() for name in share]
+            effects = [self.campaign.physics[name][0] for name in share]
             trials.append(self._pool.submit(_try, scenes, effects, device, precision))
         for share, trial in zip(shares, trials, strict=True):
             frames, seconds = trial.result()
@@ -174,10 +179,11 @@ class _Production:
 
     def _submit(self) -> None:
         """Every run is a job, but a worker that makes several at once gets its share of the runs as one job."""
-        jobs = [
-            (name, index, self.campaign.scenes[name].to_dict(), self.campaign.file(name))
-            for index, name in enumerate(self.costs)
-        ]
+        jobs = []
+        for index, name in enumerate(self.costs):
+            scene, file = self.campaign.scenes[name].to_dict(), self.campaign.file(name)
+            effects, decisions = self.campaign.physics[name]
+            jobs.append((name, index, scene, file, effects, recorded(decisions)))
         if self.batch > 1:
             shares = [jobs[worker :: self.workers] for worker in range(self.workers)]
         else:
@@ -260,11 +266,11 @@ def _start_worker(frames_done: Any, ended: Any, barrier: Any) -> None:
 
 
 def _try(
-    scenes: list[dict[str, Any]], effects: dict[str, bool], device: str, precision: str
+    scenes: list[dict[str, Any]], effects: list[Effects], device: str, precision: str
 ) -> tuple[list[int], float]:
     """Frames made of each scene and the seconds they took all together, while the other workers do the same."""
     found = [Scene.from_dict(scene) for scene in scenes]
-    frames = frames_together(found, Effects(**effects), device, precision, at_once=len(found))
+    frames = frames_together(found, effects, device, precision, at_once=len(found))
     for _ in found:
         next(frames)  # the state at the start
     with suppress(threading.BrokenBarrierError):
@@ -278,15 +284,15 @@ def _try(
 
 
 def _make_share(
-    jobs: list[tuple[str, int, dict[str, Any], Path]],
+    jobs: list[tuple[str, int, dict[str, Any], Path, Effects, dict[str, Any]]],
     batch: int,
-    effects: dict[str, bool],
     seed: int,
     device: str,
     precision: str,
 ) -> dict[str, tuple[str, str]]:
-    """Make the runs (name, number in the campaign, scene, file), `batch` at once; gives what `_make` says of each."""
-    tasks = (_make(*job, effects, seed, device, precision) for _, *job in jobs)
+    """Make the runs (name, number in the campaign, scene, file, effects and their reasons), `batch` at once; gives what
+    `_make` says of each."""
+    tasks = (_make(*job, seed, device, precision) for _, *job in jobs)
     outcomes = {}
     for number, outcome in in_turns(tasks, batch, device):
         name, index, *_ = jobs[number]
@@ -299,7 +305,8 @@ def _make(
     index: int,
     scene: dict[str, Any],
     output: Path,
-    effects: dict[str, bool],
+    effects: Effects,
+    reasons: dict[str, dict[str, Any]],
     seed: int,
     device: str,
     precision: str,
@@ -319,7 +326,8 @@ def _make(
                 for timing in scene_stages(
                     Scene.from_dict(scene),
                     output,
-                    effects=Effects(**effects),
+                    effects=effects,
+                    reasons=reasons,
                     seed=seed,
                     device=device,
                     precision=precision,

@@ -6,10 +6,9 @@ import heapq
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
-from mpm_warp import Bed, Scene, substeps_per_frame
+from mpm_warp import Scene, substeps_per_frame
 from sgns.errors import UserError
 
 __all__ = ["RunCost", "duration_words", "finishing_time", "require_space", "run_cost", "size_words"]
@@ -48,7 +47,7 @@ class RunCost:
 
 def run_cost(scene: Scene) -> RunCost:
     """The cost of a scene's run."""
-    particles, stored = _particle_counts(scene.bed)
+    particles, stored = len(scene.filled[0]), len(scene.stored)
     per_frame = (
         stored * _BYTES_PER_PARTICLE + len(scene.body_points()) * _BYTES_PER_BODY_POINT + _BYTES_PER_FRAME
     )
@@ -58,12 +57,6 @@ def run_cost(scene: Scene) -> RunCost:
         frames=scene.frame_count,
         size=scene.frame_count * per_frame + _BYTES_PER_FILE,
     )
-
-
-@cache
-def _particle_counts(bed: Bed) -> tuple[int, int]:
-    """Particles of a bed and how many of them are recorded; filling a bed takes seconds, so once for equal beds."""
-    return len(bed.filled[0]), len(bed.stored)
 
 
 def finishing_time(waiting: Sequence[float], running: Sequence[float], workers: int) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,7 @@ def scene_stages(
     output: Path,
     *,
     effects: Effects,
+    reasons: Mapping[str, Mapping[str, Any]] | None = None,
     seed: int = 0,
     device: str = "cpu",
     precision: str = "float32",
@@ -54,17 +55,18 @@ def scene_stages(
     """Compute a scene and write its run file, with the particles that `scene.bed.store_every` leaves in it.
 
     Args:
+        reasons: effect → on, reason, number, for the run file; by default what `effects` says of itself.
         progress: called once after every frame.
 
     Yields:
         None wherever other scenes may have their turn (mpm_warp's streams.py), and at the end what it cost.
     """
     solver = Solver(scene, effects, device, precision)
-    stored = scene.bed.stored
+    stored = scene.stored
     with RunWriter(
         output,
         scene=scene.to_dict(),
-        effects=effects.described(),
+        effects=reasons or effects.described(),
         arrangement_hash=scene.arrangement_hash,
         particle_count=len(stored),
         body_points=len(scene.body_points()),

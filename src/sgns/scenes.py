@@ -7,10 +7,10 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from mpm_warp import Effects, Scene
+from mpm_warp import Scene
 from sgns.errors import UserError
 
-__all__ = ["effects_from_config", "read_path", "scene_from_config"]
+__all__ = ["read_path", "scene_from_config"]
 
 
 def scene_from_config(cfg: DictConfig) -> Scene:
@@ -20,18 +20,6 @@ def scene_from_config(cfg: DictConfig) -> Scene:
     if isinstance(data.get("path"), str):
         data["path"] = read_path(Path(data["path"]))
     return Scene.from_dict(data)
-
-
-def effects_from_config(cfg: DictConfig) -> Effects:
-    """The effects in `cfg.effects`."""
-    data = OmegaConf.to_container(cfg.effects, resolve=True)
-    allowed = Effects().described()
-    for key, value in data.items():
-        if key not in allowed:
-            raise UserError(f"effects has no key {key!r}; allowed: {', '.join(allowed)}")
-        if not isinstance(value, bool):
-            raise UserError(f"effects.{key} is {value!r}; allowed: true, false")
-    return Effects(**data)
 
 
 def read_path(file: Path) -> list[list[float]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,9 @@ from sgns.campaign_runs import simulate_campaign
 from sgns.cost import require_space, run_cost
 from sgns.errors import UserError
 from sgns.runs import Run
+from sgns.scene_effects import asked_effects, decided, decision_line, recorded
 from sgns.scene_run import Timing, simulate_scene
-from sgns.scenes import effects_from_config, scene_from_config
+from sgns.scenes import scene_from_config
 
 __all__ = ["Timing", "main", "simulate_campaign", "simulate_scene"]
 
@@ -45,12 +45,12 @@ def main(cfg: DictConfig) -> float | None:
     Returns:
         Wall seconds per simulated second of a single scene.
     """
-    effects, batch = effects_from_config(cfg), cfg.solver.batch
+    asked, batch = asked_effects(cfg), cfg.solver.batch
     if type(batch) is not int or batch < 1:
         raise UserError(f"solver.batch is {batch!r}; it must be a whole number, 1 or more")
     if cfg.get("dataset") is not None:  # `dataset: null` in a defaults list leaves no key
         settings = OmegaConf.to_container(cfg.dataset, resolve=True)
-        campaign = plan(settings, _base_scene(settings), asdict(effects), cfg.solver.precision, cfg.seed)
+        campaign = plan(settings, _base_scene(settings), asked, cfg.solver.precision, cfg.seed)
         simulate_campaign(
             campaign,
             device=cfg.device,
@@ -64,6 +64,9 @@ def main(cfg: DictConfig) -> float | None:
     scene = scene_from_config(cfg)
     for warning in scene.warnings():
         log.warning("%s", warning)
+    effects, decisions = decided(scene, asked)
+    for name, decision in decisions.items():
+        log.info("%s", decision_line(name, decision))
     output = Path(cfg.output)
     require_space(output.parent, run_cost(scene).size)
     with tqdm(total=scene.frame_count, unit="frame", desc=scene.name, disable=None) as bar:
@@ -71,6 +74,7 @@ def main(cfg: DictConfig) -> float | None:
             scene,
             output,
             effects=effects,
+            reasons=recorded(decisions),
             seed=cfg.seed,
             device=cfg.device,
             precision=cfg.solver.precision,

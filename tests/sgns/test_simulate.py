@@ -16,6 +16,7 @@ from sgns.runs import Run, check_run
 from sgns.scene_run import scene_stages, simulate_scene
 
 SMALL = [
+    "scene.bed.particles_per_cell=1",
     "scene.duration=0.05",
     "scene.bed.size=[0.4,0.2,0.16]",
     "scene.bed.spacing=0.04",

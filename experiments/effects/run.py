@@ -1,0 +1,229 @@
+"""Each effect on and off in five scenes: what it costs, what it changes, and whether effects=auto decides well.
+
+    python experiments/effects/run.py
+
+Appends to table.csv (each effect) and edge.csv (rate dependence and nonlocality for grains of several sizes) beside
+this script; rows that are there are not made again. Then draws effects.png. About ten minutes on one core.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+import math
+import statistics
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from hydra import compose, initialize_config_module
+
+from mpm_warp import Decision, Effects, Scene, Solver, Tolerances, asymmetry, effects_for
+from sgns.scenes import scene_from_config
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+HERE = Path(__file__).parent
+REPEATS = 3
+SCENES = {
+    "excavation": ["scene=quick_excavation", "scene.duration=1.0"],
+    "wheel": ["scene=quick_wheel", "scene.duration=1.0"],
+    "column": ["scene=column", "scene.duration=0.4"],
+    "incline": ["scene=incline", "scene.duration=0.4"],
+    "thin_layer": ["scene=thin_layer", "scene.duration=0.5"],
+}
+EFFECTS = ("yielding", "rate_dependence", "fluidity", "nonlocality", "separation", "symmetry", "torque")
+GRAINS = (1e-4, 3e-4, 1e-3, 2e-3, 5e-3)  # diameters for edge.csv [m]
+STATED = 0.03  # what auto leaves out changes force and displacement by less, says docs/solver.md
+
+
+def make_scene(name: str, *more: str) -> Scene:
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        return scene_from_config(compose("simulate", [*SCENES[name], *more]))
+
+
+def pair(chosen: Effects, effect: str) -> tuple[Effects, Effects]:
+    """With `effect` off and on, otherwise what auto chose; what needs the effect is off in both, what it needs on."""
+    without = {"fluidity": False, "nonlocality": False} if effect in ("rate_dependence", "yielding") else {}
+    if effect == "yielding":
+        without |= {"rate_dependence": False}
+    needs = {"rate_dependence": True} if effect in ("fluidity", "nonlocality") else {}
+    base = replace(chosen, **without)
+    return replace(base, **{effect: False}), replace(base, **needs, **{effect: True})
+
+
+def play(scene: Scene, effects: Effects) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Force at the frames (T, 3), first and last positions (n, 3), and processor time [s]."""
+    frames = Solver(scene, effects).frames()
+    first = next(frames)
+    force, last, start = [], first, time.process_time()
+    for frame in frames:
+        force.append(frame.force)
+        last = frame
+    return np.array(force), first.position, last.position, time.process_time() - start
+
+
+def changes(scene: Scene, one: tuple, two: tuple) -> dict[str, float]:
+    """How far two runs are apart: RMS over frames of the force, and over particles of the last position, as shares
+    of the RMS force and displacement of the run `one`."""
+
+    def rms(a: np.ndarray) -> float:
+        return float(np.sqrt((a.astype(float) ** 2).sum(axis=1).mean()))
+
+    force = rms(two[0] - one[0]) / rms(one[0]) if scene.body is not None else math.nan
+    moved = rms(two[2] - one[2]) / rms(one[2] - one[1])
+    return {"force_change": force, "displacement_change": moved}
+
+
+def impossible(scene: Scene, effect: str) -> bool:
+    return (effect == "symmetry" and asymmetry(scene) is not None) or (
+        effect == "torque" and scene.body is None
+    )
+
+
+def each_effect(name: str, effect: str) -> dict:
+    scene = make_scene(name)
+    chosen, decisions = effects_for(scene)
+    decision: Decision = decisions[effect]
+    row = {"scene": name, "effect": effect, "auto": "on" if decision.on else "off", "number": decision.number}
+    if impossible(scene, effect):
+        return row
+    off, on = pair(chosen, effect)
+    runs = {side: [] for side in (off, on)}
+    for _ in range(REPEATS):  # in turn, so that a machine that slows down slows both
+        for side in (off, on):
+            runs[side].append(play(scene, side))
+    seconds = {side: statistics.median(run[3] for run in runs[side]) for side in (off, on)}
+    reference, other = (on, off) if getattr(chosen, effect) else (off, on)
+    return row | {
+        "time_ratio": seconds[on] / seconds[off],
+        **changes(scene, runs[reference][0], runs[other][0]),
+        "seconds_off": seconds[off],
+        "seconds_on": seconds[on],
+    }
+
+
+def at_the_edge(name: str, effect: str, grain: float) -> dict:
+    scene = make_scene(name, f"material.grain_diameter={grain}")
+    chosen, decisions = effects_for(scene)
+    off, on = (play(scene, side) for side in pair(chosen, effect))
+    decision, tolerances = decisions[effect], Tolerances()
+    which = next(key for key in ("friction", "grid", "reach") if f"tolerance.{key}" in decision.reason)
+    return {
+        "scene": name,
+        "effect": effect,
+        "grain_diameter": grain,
+        "auto": "on" if decision.on else "off",
+        "tolerance": which,
+        "number": decision.number,
+        "number_over_tolerance": decision.number / getattr(tolerances, which),
+        **changes(scene, off, on),
+    }
+
+
+def resume(file: Path, keys: tuple[str, ...], jobs: list[tuple], make) -> list[dict[str, str]]:
+    """Rows of `file`, made where they are missing and written one by one."""
+    rows = list(csv.DictReader(file.open(newline=""))) if file.exists() else []
+    done = {tuple(row[key] for key in keys) for row in rows}
+    for job in jobs:
+        if tuple(str(part) for part in job) in done:
+            continue
+        row = {key: f"{v:.4g}" if isinstance(v, float) else v for key, v in make(*job).items()}
+        logging.info("%s", {key: value for key, value in row.items() if value is not None})
+        names = TABLE if len(job) == 2 else EDGE
+        new = not file.exists()
+        with file.open("a", newline="") as stream:
+            writer = csv.DictWriter(stream, names, extrasaction="ignore", restval="")
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+    return list(csv.DictReader(file.open(newline="")))
+
+
+TABLE = (
+    "scene", "effect", "auto", "number", "time_ratio", "force_change", "displacement_change", "seconds_off",
+    "seconds_on",
+)  # fmt: skip
+EDGE = (
+    "scene", "effect", "grain_diameter", "auto", "tolerance", "number", "number_over_tolerance", "force_change",
+    "displacement_change",
+)  # fmt: skip
+
+
+def largest(row: dict[str, str]) -> float:
+    """The larger of both changes; nan where there is none."""
+    found = [
+        float(row[key]) for key in ("force_change", "displacement_change") if row[key] not in ("", "nan")
+    ]
+    return max(found, default=math.nan)
+
+
+def draw(table: list[dict[str, str]], edge: list[dict[str, str]]) -> None:
+    figure, (cost, change, sizes) = plt.subplots(1, 3, figsize=(15, 5), layout="constrained")
+    colours = {name: f"C{i}" for i, name in enumerate(SCENES)}
+    for k, name in enumerate(SCENES):
+        rows = {row["effect"]: row for row in table if row["scene"] == name}
+        at = np.arange(len(EFFECTS)) + 0.16 * (k - 2)
+        times = [float(rows[e]["time_ratio"] or "nan") for e in EFFECTS]
+        cost.barh(at, np.array(times) - 1.0, 0.15, left=1.0, color=colours[name], label=name)
+        for place, effect in zip(at, EFFECTS, strict=True):
+            value = max(largest(rows[effect]), 1e-7)
+            filled = colours[name] if rows[effect]["auto"] == "on" else "white"
+            change.plot(value, place, "o", color=colours[name], mfc=filled, ms=7)
+    for axis in (cost, change):
+        axis.set_yticks(range(len(EFFECTS)), EFFECTS)
+        axis.invert_yaxis()
+        axis.grid(alpha=0.3, axis="x")
+    cost.axvline(1.0, color="k", lw=1)
+    cost.set(xlabel="processor time with the effect / without")
+    cost.legend(fontsize=8)
+    change.axvline(STATED, color="k", ls=":")
+    change.set(
+        xscale="log",
+        xlabel="change of force or displacement, the larger (1e-7: none)\nfilled: auto turns it on",
+    )
+    for row in edge:
+        marker = "o" if row["effect"] == "rate_dependence" else "s"
+        filled = colours[row["scene"]] if row["auto"] == "on" else "white"
+        sizes.plot(
+            float(row["number_over_tolerance"]),
+            largest(row),
+            marker,
+            color=colours[row["scene"]],
+            mfc=filled,
+            ms=7,
+        )
+    sizes.plot([], [], "o", color="0.4", label="rate_dependence")
+    sizes.plot([], [], "s", color="0.4", label="nonlocality")
+    sizes.axvline(1.0, color="k", lw=1)
+    sizes.axhline(STATED, color="k", ls=":", label=f"stated: {STATED:.0%}")
+    sizes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="auto's number / its tolerance, grains of 0.1 to 5 mm",
+        ylabel="change of force or displacement, the larger",
+    )
+    sizes.grid(alpha=0.3)
+    sizes.legend(fontsize=8)
+    figure.savefig(HERE / "effects.png", dpi=100)
+
+
+def main() -> None:
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    jobs = [(name, effect) for name in SCENES for effect in EFFECTS]
+    table = resume(HERE / "table.csv", ("scene", "effect"), jobs, each_effect)
+    jobs = [
+        (name, effect, grain)
+        for name in ("excavation", "wheel", "column", "incline")
+        for effect in ("rate_dependence", "nonlocality")
+        for grain in GRAINS
+    ]
+    edge = resume(HERE / "edge.csv", ("scene", "effect", "grain_diameter"), jobs, at_the_edge)
+    draw(table, edge)
+
+
+if __name__ == "__main__":
+    main()
