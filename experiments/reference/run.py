@@ -215,7 +215,11 @@ def draw(kind: str, rows: dict[str, dict], names: list[tuple[str, str]]) -> None
                 (float(m[1]), float(rows[n][key])) for n, m in grid.items() if (m[2], m[3]) == (ppc, margin)
             )
             if len(points) > 1:
-                left.plot(*zip(*points, strict=True), "o-", label=f"{ppc} per cell, {margin}")
+                style = {"1": "o--", "4": "o-", "8": "o:"}[ppc]
+                colour = {"-0.75": "C0", "-0.5": "C1", "-0.25": "C2", "0": "C3"}[margin.split()[1]]
+                left.plot(
+                    *zip(*points, strict=True), style, ms=4, color=colour, label=f"{ppc} per cell, {margin}"
+                )
         left.set_xlim(0.0, None)
         left.set_ylim(min(0.0, left.get_ylim()[0]), None)
         left.set_ylabel(label)
@@ -230,7 +234,7 @@ def draw(kind: str, rows: dict[str, dict], names: list[tuple[str, str]]) -> None
         if right is not axes[-1, 1]:
             right.set_xticklabels([])
         right.grid(alpha=0.3, axis="y")
-    axes[0, 0].legend(fontsize=7)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4, fontsize=8)
     axes[-1, 0].set_xlabel("grid spacing [mm]")
     figure.savefig(HERE / f"{kind}.png", dpi=90)
     plt.close(figure)
