@@ -87,6 +87,7 @@ def draw(figure, rows: list[dict]) -> None:
             scale = np.exp(np.mean(np.log(runout[part]) - power * np.log(aspect[part])))
             axis.loglog(aspect[part], scale * aspect[part] ** power, "-", color=colour, lw=1)
     axis.set_xticks(ASPECTS, [f"{a:g}" for a in ASPECTS])
+    axis.set_yticks([0.25, 0.5, 1, 2, 4, 8], ["0.25", "0.5", "1", "2", "4", "8"])
     axis.minorticks_off()
     axis.set_xlabel("height over radius")
     axis.set_ylabel("run-out over radius")
