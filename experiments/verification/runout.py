@@ -9,20 +9,20 @@ import numpy as np
 from mpm_warp import Bed, Column, Effects, Material, Solver, Walls
 
 RADIUS = 0.04  # [m]
-CELLS = 5  # grid spacings in the radius
+CELLS = {"cylinder": 8, "slab": 10}  # grid spacings in the radius
 SOIL = Material(static_friction=0.5, limit_friction=0.7)
 
 
 def collapse(shape: str, aspect: float) -> Column:
     """A column on a rough floor, let go for as long as it takes to fall and stop."""
-    h = RADIUS / CELLS
+    h = RADIUS / CELLS[shape]
     height = aspect * RADIUS
     reach = RADIUS * (2.0 + (2.5 if shape == "cylinder" else 3.0) * aspect ** (0.6 if aspect > 2 else 1.0))
     side = 2.0 * h * math.ceil(reach / h)
     bed = Bed(
         size=(side, side if shape == "cylinder" else 4 * h, height),
         spacing=h,
-        particles_per_cell=8.0,
+        particles_per_cell=1.0,
         headroom=4 * h,
         walls=Walls("no_slip", "no_slip" if shape == "cylinder" else "slip"),
     )
@@ -31,33 +31,29 @@ def collapse(shape: str, aspect: float) -> Column:
 
 
 def pile(scene: Column) -> dict:
-    """Run-out over the first radius and slope of the pile at the end [degrees], and its fastest 1 % [m/s]."""
+    """Run-out over the first radius, height over it, mean slope [degrees] and fastest 1 % [m/s] at the end.
+
+    The front is where 99 % of the soil lie within, compared with the same measure of the column.
+    """
     frame = list(Solver(scene, Effects(symmetry=True)).frames())[-1]
-    off = frame.position[:, :2] - 0.5 * np.asarray(scene.bed.size[:2])
-    away = np.abs(off[:, 0]) if scene.shape == "slab" else np.hypot(off[:, 0], off[:, 1])
-    # The front is where the pile, in rings one spacing wide, is less than a spacing's share of particles high.
-    h = scene.bed.spacing
-    rings = np.arange(0.0, away.max() + h, h)
-    area = (
-        np.diff(math.pi * rings**2) if scene.shape == "cylinder" else np.diff(rings) * 2.0 * scene.bed.size[1]
-    )
-    height = np.histogram(away, rings)[0] * scene.filled[1] / area
-    middle = 0.5 * (rings[1:] + rings[:-1])
-    front = float(np.interp(-0.5 * h, -height[height.argmax() :], middle[height.argmax() :]))
-    slope = [s for s in -np.diff(height) / h if s > 0]
+    before, after = (_distance(scene, x) for x in (scene.initial_positions(), frame.position))
+    front = RADIUS * float(np.quantile(after, 0.99) / np.quantile(before, 0.99))
+    half_cell = 0.5 * scene.bed.spacing  # a particle stands for soil half a cell further up
+    top = np.quantile(frame.position[after < 0.5 * RADIUS, 2], 0.99) + half_cell + scene.bed.size[2]
     return {
-        "runout": (front - RADIUS) / RADIUS,
-        "final_height": height.max() / RADIUS,
-        "slope": math.degrees(math.atan(height.max() / front)),
-        "steepest": math.degrees(math.atan(np.median(sorted(slope)[-3:]))),
+        "runout": front / RADIUS - 1.0,
+        "final_height": float(top) / RADIUS,
+        "slope": math.degrees(math.atan(top / front)),
         "speed": float(np.quantile(np.linalg.norm(frame.velocity, axis=1), 0.99)),
     }
 
 
-ASPECTS = {
-    "cylinder": (0.5, 0.75, 1.0, 1.5, 3.0, 4.5, 6.0, 8.0),
-    "slab": (0.5, 0.75, 1.0, 1.5, 3.0, 4.5, 6.0, 8.0),
-}
+def _distance(scene: Column, position: np.ndarray) -> np.ndarray:
+    off = position[:, :2] - 0.5 * np.asarray(scene.bed.size[:2])
+    return np.abs(off[:, 0]) if scene.shape == "slab" else np.hypot(off[:, 0], off[:, 1])
+
+
+ASPECTS = (0.5, 1.0, 1.5, 3.0, 5.0, 8.0)
 EXPONENTS = {"cylinder": (1.0, 0.5), "slab": (1.0, 2.0 / 3.0)}
 
 
@@ -73,8 +69,8 @@ def exponents(rows: list[dict], shape: str) -> tuple[float, float]:
 def measure() -> list[dict]:
     return [
         {"shape": shape, "aspect": aspect} | pile(collapse(shape, aspect))
-        for shape, aspects in ASPECTS.items()
-        for aspect in aspects
+        for shape in EXPONENTS
+        for aspect in ASPECTS
     ]
 
 
@@ -84,11 +80,15 @@ def draw(figure, rows: list[dict]) -> None:
         found = [r for r in rows if r["shape"] == shape]
         aspect, runout = (np.array([r[key] for r in found]) for key in ("aspect", "runout"))
         squat, tall = exponents(rows, shape)
-        label = f"{shape}: exponents {squat:.2f} and {tall:.2f}"
+        known = " and ".join(f"{power:.2f}" for power in EXPONENTS[shape])
+        label = f"{shape}: exponents {squat:.2f} and {tall:.2f}; lines {known}"
         axis.loglog(aspect, runout, "o", color=colour, label=label)
         for part, power in zip((aspect <= 1.5, aspect >= 3.0), EXPONENTS[shape], strict=True):
             scale = np.exp(np.mean(np.log(runout[part]) - power * np.log(aspect[part])))
             axis.loglog(aspect[part], scale * aspect[part] ** power, "-", color=colour, lw=1)
+    axis.set_xticks(ASPECTS, [f"{a:g}" for a in ASPECTS])
+    axis.set_yticks([0.25, 0.5, 1, 2, 4, 8], ["0.25", "0.5", "1", "2", "4", "8"])
+    axis.minorticks_off()
     axis.set_xlabel("height over radius")
     axis.set_ylabel("run-out over radius")
     axis.grid(alpha=0.3, which="both")
