@@ -4,7 +4,7 @@
 
 Every solver runs in a process of its own, bound to one core, warm, in turn; a row is the median over all repeats. A
 package that the named Python does not have gives a row "not measured". Writes table.csv and
-growth.png beside this script.
+growth.png beside this script. The clock is the processor time of each process: wall time, if its core is idle.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def draw(rows: list[dict[str, object]]) -> None:
             if points:
                 axis.plot(*zip(*points, strict=True), "o-", label=solver)
     axes[0].set(xscale="log", xlabel="particles", ylabel="million particle-steps per second", ylim=(0, None))
-    axes[1].set(xscale="log", yscale="log", xlabel="particles", ylabel="wall seconds per simulated second")
+    axes[1].set(xscale="log", yscale="log", xlabel="particles", ylabel="seconds per simulated second")
     axes[1].legend()
     figure.savefig(HERE / "growth.png", dpi=130)
 
