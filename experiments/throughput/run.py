@@ -63,6 +63,7 @@ def summary(solver: str, what: str, asked: int, results: list[dict | None]) -> d
     row = dict.fromkeys(COLUMNS, MISSING) | {"solver": solver, "what": what, "particles": asked}
     if None in results:
         return row
+    row |= dict.fromkeys(("M_steps_per_s", "min", "max"), "")  # implicit steps are not comparable
     row |= {"particles": results[0]["particles"], "version": results[0]["version"], "repeats": len(results)}
     row["machine"] = f"one core of {cpu_model()}"
     rates = [rate for result in results for rate in result.get("rates", [])]
@@ -86,7 +87,7 @@ def draw(rows: list[dict[str, object]]) -> None:
             points = [
                 (row["particles"], float(row[key]))
                 for row in rows
-                if row["solver"] == solver and row[key] != MISSING
+                if row["solver"] == solver and row[key] not in (MISSING, "")
             ]
             if points:
                 axis.plot(*zip(*points, strict=True), "o-", label=solver)
