@@ -85,7 +85,7 @@ def draw(rows: list[dict[str, object]]) -> None:
     for solver in dict.fromkeys(row["solver"] for row in rows):
         for axis, key in zip(axes, ("M_steps_per_s", "s_per_simulated_s"), strict=True):
             points = [
-                (row["particles"], float(row[key]))
+                (int(row["particles"]), float(row[key]))
                 for row in rows
                 if row["solver"] == solver and row[key] not in (MISSING, "")
             ]
