@@ -4,7 +4,7 @@
 
 Every solver runs in a process of its own, bound to one core, warm, in turn; a row is the median over all repeats. A
 package that the named Python does not have gives a row "not measured". Writes table.csv and
-growth.png beside this script.
+growth.png beside this script. The clock is the processor time of each process: wall time, if its core is idle.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ def summary(solver: str, what: str, asked: int, results: list[dict | None]) -> d
     row = dict.fromkeys(COLUMNS, MISSING) | {"solver": solver, "what": what, "particles": asked}
     if None in results:
         return row
+    row |= dict.fromkeys(("M_steps_per_s", "min", "max"), "")  # implicit steps are not comparable
     row |= {"particles": results[0]["particles"], "version": results[0]["version"], "repeats": len(results)}
     row["machine"] = f"one core of {cpu_model()}"
     rates = [rate for result in results for rate in result.get("rates", [])]
@@ -84,14 +85,14 @@ def draw(rows: list[dict[str, object]]) -> None:
     for solver in dict.fromkeys(row["solver"] for row in rows):
         for axis, key in zip(axes, ("M_steps_per_s", "s_per_simulated_s"), strict=True):
             points = [
-                (row["particles"], float(row[key]))
+                (int(row["particles"]), float(row[key]))
                 for row in rows
-                if row["solver"] == solver and row[key] != MISSING
+                if row["solver"] == solver and row[key] not in (MISSING, "")
             ]
             if points:
                 axis.plot(*zip(*points, strict=True), "o-", label=solver)
     axes[0].set(xscale="log", xlabel="particles", ylabel="million particle-steps per second", ylim=(0, None))
-    axes[1].set(xscale="log", yscale="log", xlabel="particles", ylabel="wall seconds per simulated second")
+    axes[1].set(xscale="log", yscale="log", xlabel="particles", ylabel="seconds per simulated second")
     axes[1].legend()
     figure.savefig(HERE / "growth.png", dpi=130)
 
