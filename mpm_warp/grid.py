@@ -23,6 +23,7 @@ def grid_struct(real: type) -> type:
         nz: int
         dt: real  # [s]
         volume_averaging: real  # share of a particle's own volume change that the mean replaces
+        forgetting: real  # share of recent volume changes that a step forgets
         damping: real  # viscous time of the elastic strain / dt
         gravity: vec3  # [m/s^2]
         # Nodes with index <= low or >= high belong to the floor and the walls.

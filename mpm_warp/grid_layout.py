@@ -54,6 +54,7 @@ def lay_grid(
     grid.nx, grid.ny, grid.nz = (int(c) for c in count)
     grid.dt, grid.gravity = time_step, vec3(*scene.gravity_vector)
     grid.volume_averaging = scene.volume_averaging
+    grid.forgetting = min(1.0, time_step * scene.material.wave_speed / h)
     grid.damping = scene.elastic_damping * h / scene.material.wave_speed / time_step
     grid.low, grid.high = wp.vec3i(*low), wp.vec3i(*(int(i) for i in high))
     grid.wall_friction = vec3(*bed.walls.friction)

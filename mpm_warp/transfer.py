@@ -228,13 +228,15 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
             g = wp.max(kept * soil.g[p] + g, real(0.0))
         before = e[p]
         # Volume changes as the mean over the nodes around does: what a particle's own gradient says besides is noise,
-        # and is taken back a step later.
-        volume_before = ln_j[p] + grid.volume_averaging * (felt[p][3] - swelling[p])
+        # and is taken back within the time a wave needs for a cell. `swelling` is the sum of its recent changes, and
+        # felt[p][3] the mean of that.
+        recent = swelling[p]
+        volume_before = ln_j[p] + grid.volume_averaging * grid.forgetting * (felt[p][3] - recent)
         state = update(before, volume_before, grid.dt * c[p], grid.dt, soil, g)
         after = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
         e[p] = after
         ln_j[p] = state[6]
-        swelling[p] = state[6] - volume_before
+        swelling[p] = (real(1.0) - grid.forgetting) * recent + state[6] - volume_before
         if wp.static(effects.fluidity):
             soil.g[p] = state[7]
         # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone. It
