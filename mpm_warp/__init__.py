@@ -1,6 +1,7 @@
 """A 3D material point method for granular soil, in NVIDIA Warp. Usable alone; needs warp and numpy only."""
 
 from .arrangement import arrange
+from .batch import frames_together
 from .bodies import Box, Cylinder, MeshBody, Plate
 from .column import Column
 from .effects import Effects
@@ -41,5 +42,6 @@ __all__ = [
     "arrange",
     "asymmetry",
     "effects_for",
+    "frames_together",
     "substeps_per_frame",
 ]

@@ -8,8 +8,9 @@ Particles move with the soil, so the force changes smoothly as the body advances
 comes and goes with every cell the body crosses.
 
 The grid spreads a push over the width of its B-splines, whose support reaches one and a half grid spacings, so a
-body acts further out than it is. Contact therefore begins at a margin of -3/4 grid spacings: when the soil's edge,
-half a particle spacing from a particle's centre, is that far inside.
+body acts further out than it is. Contact therefore begins at a margin of -1/2 grid spacings: when the soil's edge,
+half a particle spacing from a particle's centre, is that far inside. Wheels, which press on soil and hardly cut it,
+have none.
 
 Bilateral contact holds the soil as well: within a layer half a grid spacing thick outside the place where the spring
 begins, the damper takes away the particle's normal velocity relative to the body, towards it or away from it.

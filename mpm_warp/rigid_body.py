@@ -13,6 +13,7 @@ from .contact import HOLDING_LAYER, ContactLaw, body_struct
 from .errors import SolverStopped
 from .rotation import angular_velocity
 from .shapes import shape_data
+from .streams import on_host
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -122,7 +123,7 @@ class RigidBody:
         """Centre of mass [m] and quaternion now, at `time` [s], shape (7,)."""
         pose = self.scene.poses_at(np.array([time]))[0]
         if self._axle is not None:
-            pose[2] = self._axle.numpy()[0]
+            pose[2] = on_host(self._axle)[0]
         return pose
 
     def check(self, time: float) -> None:
@@ -133,7 +134,7 @@ class RigidBody:
         """
         if self._axle is None:
             return
-        lowest = self._axle.numpy()[0] - self.scene.body.half_size[2]
+        lowest = on_host(self._axle)[0] - self.scene.body.half_size[2]
         if not lowest > -self.scene.bed.size[2]:
             raise SolverStopped(
                 f"the body reached the floor of the bin by {time:.3f} s: make scene.bed.size deeper or the load smaller"
@@ -143,6 +144,6 @@ class RigidBody:
         """By the soil on the body since the frame began [N s], and its moment [N m s], shape (2, 3); a moment that is
         not added up is 0."""
         found = np.zeros((2, 3))
-        impulse = self.data.impulse.numpy()
+        impulse = on_host(self.data.impulse)
         found[: len(impulse)] = impulse
         return found

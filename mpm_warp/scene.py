@@ -156,7 +156,7 @@ class Scene:
     """[s]."""
     frame_rate: float = 60.0
     """Recorded frames per second [Hz]."""
-    contact_margin: float = -0.75
+    contact_margin: float = -0.5
     """Distance from the body's surface at which it begins to act on soil, negative inside [grid spacings]; see
     contact.py."""
     courant: float = 0.6

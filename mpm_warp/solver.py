@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,8 @@ from .rigid_body import RigidBody
 from .rotation import rotate
 from .scene import Scene
 from .soil import soil_parameters
-from .start import start_warp
+from .start import find_device
+from .streams import on_host
 from .symmetry import half, require_symmetry
 from .time_step import steps_to_remap, substeps_per_frame, top_body_speed
 from .transfer import transfer
@@ -75,16 +76,9 @@ class Solver:
     ) -> None:
         if precision not in PRECISIONS:
             raise SceneError(f"precision is {precision!r}; allowed: {', '.join(PRECISIONS)}")
-        start_warp()
-        if device not in {str(d) for d in wp.get_devices()} | {"cuda"} or (
-            device == "cuda" and not wp.is_cuda_available()
-        ):
-            raise SceneError(
-                f"device is {device!r}; allowed here: {', '.join(str(d) for d in wp.get_devices())}"
-            )
         self.scene = scene
         self.effects = effects or Effects()
-        self.device = wp.get_device(device)
+        self.device = find_device(device)
         self.precision = precision
         self._real = PRECISIONS[precision]
         if self.effects.symmetry:
@@ -113,12 +107,17 @@ class Solver:
         Raises:
             SolverStopped: at the end of the first frame in which a particle or the body went wrong.
         """
+        return (frame for frame in self.stages() if frame is not None)
+
+    def stages(self) -> Generator[Frame | None, None, None]:
+        """As `frames`, with None wherever the host is about to wait for the device, which may do something else
+        meanwhile (batch.py)."""
         for index in range(self.scene.frame_count):
             if index > 0:
                 self._substep.zero_()
                 if self._body is not None:
                     self._body.start_frame(index - 1)
-                self._advance(index)
+                yield from self._advance(index)
                 if self._body is not None:
                     self._body.check(index / self.scene.frame_rate)
             yield self._frame(index)
@@ -304,19 +303,21 @@ class Solver:
 
     # --- stepping -----------------------------------------------------------------------------------------
 
-    def _advance(self, index: int) -> None:
+    def _advance(self, index: int) -> Iterator[None]:
         left = self.substeps_per_frame
         while left:
             self._top_speed.zero_()
             for launch in self._to_grid:
                 launch.launch()
-            speed = max(self._top_body_speed, float(self._top_speed.numpy()[0]))
+            yield
+            speed = max(self._top_body_speed, float(on_host(self._top_speed)[0]))
             steps = min(left, steps_to_remap(self.scene, self.time_step, speed))
             left -= steps
             if self.device.is_cuda:
                 wp.capture_launch(self._captured(steps))
             else:
                 self._until_remap(steps)
+        yield
         self._check_particles(index)
 
     def _until_remap(self, steps: int) -> None:
@@ -339,11 +340,11 @@ class Solver:
         return self._graphs[steps]
 
     def _check_particles(self, index: int) -> None:
-        count, particle, substep, near = (int(i) for i in self._stray.numpy())
+        count, particle, substep, near = (int(i) for i in on_host(self._stray))
         if not count:
             return
         time = (index - 1) / self.scene.frame_rate + substep * self.time_step
-        at = ", ".join(f"{c:.4f}" for c in self._x.numpy()[particle])
+        at = ", ".join(f"{c:.4f}" for c in on_host(self._x)[particle])
         if self._half is not None:
             particle = int(self._half.kept[particle])
         cause = (
@@ -364,10 +365,10 @@ class Solver:
         impulse = np.zeros((2, 3))
         if self._body is not None:
             pose, impulse = self._body.pose(time), self._body.impulse() * (scene.frame_rate if index else 0.0)
-        position, velocity = self._x.numpy(), self._felt.numpy()[:, :3]
+        position, velocity = on_host(self._x), on_host(self._felt)[:, :3]
         for axis, turns in self._turns.items():
             position = position.copy()  # on the CPU it is the solver's own memory
-            position[:, axis] += turns.numpy() * scene.bed.size[axis]
+            position[:, axis] += on_host(turns) * scene.bed.size[axis]
         if self._half is not None:
             position, velocity = self._half.whole(position, velocity)
             # The other half doubles force along and moment within the plane of symmetry, and cancels the rest.

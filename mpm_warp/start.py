@@ -1,4 +1,4 @@
-"""Starting Warp without noise."""
+"""Starting Warp without noise, and finding its devices."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from functools import cache
 
 import warp as wp
 
-__all__ = ["start_warp"]
+from .errors import SceneError
+
+__all__ = ["find_device", "start_warp"]
 
 
 @cache
@@ -20,10 +22,27 @@ def start_warp() -> None:
     # Warp announces every kernel it loads; here only its warnings are of use.
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     if _has_cuda_driver():
+        # Work queues of a device, read when CUDA starts. Streams that share one wait for each other; 32 is the most.
+        os.environ.setdefault("CUDA_DEVICE_MAX_CONNECTIONS", "32")
         wp.init()
     else:
         with _silent_stderr():
             wp.init()
+
+
+def find_device(name: str) -> wp.Device:
+    """The device called `cpu`, `cuda`, `cuda:0`, ..., with Warp started.
+
+    Raises:
+        SceneError: there is no such device here.
+    """
+    start_warp()
+    if name == "cuda" and wp.is_cuda_available():
+        return wp.get_device(name)
+    devices = {str(device): device for device in wp.get_devices()}
+    if name not in devices:
+        raise SceneError(f"device is {name!r}; allowed here: {', '.join(devices)}")
+    return devices[name]
 
 
 def _has_cuda_driver() -> bool:

@@ -27,6 +27,7 @@ class Wheel(Scene):
 
     name: str = "wheel"
     kind: str = "wheel"
+    contact_margin: float = 0.0
     duration: float = 1.0 + 16.0 / 3.0
     """Settling and driving [s]."""
     load: float = 100.0

@@ -22,6 +22,7 @@ from mpm_warp import Wheel
 from sgns.campaign import Campaign
 from sgns.published import read_published, wheel_case
 from sgns.runs import Run
+from sgns.scene_effects import asked_effects
 from sgns.scenes import scene_from_config
 from sgns.simulate import simulate_campaign
 
@@ -62,7 +63,7 @@ def main() -> None:
         Path(options.runs),
         scenes,
         dict.fromkeys(scenes, "test"),
-        OmegaConf.to_object(config.effects),
+        asked_effects(config),
         config.solver.precision,
         seed=0,
     )

@@ -51,29 +51,21 @@ QUANTITIES = {
 def settings(kind: str) -> dict[str, list[str]]:
     """Name → overrides of every run, the cheapest questions first."""
 
-    def at(dx: str, ppc: int, *more: str) -> list[str]:
-        return [f"scene.bed.spacing={DX[dx]:.10f}", f"scene.bed.particles_per_cell={ppc}", *more]
+    def at(dx: str, ppc: int, margin: str) -> list[str]:
+        return [
+            f"scene.bed.spacing={DX[dx]:.10f}",
+            f"scene.bed.particles_per_cell={ppc}",
+            f"scene.contact_margin={margin}",
+        ]
 
-    if kind == "wheel":
-        found = {f"dx {dx}, {ppc} per cell": at(dx, ppc) for dx in ("13.3", "10", "6.7") for ppc in (1, 4, 8)}
-        base, name = at("10", 4), "dx 10, 4 per cell"
-    else:
-        found = {f"dx {dx}, {ppc} per cell": at(dx, ppc) for dx in ("20", "13.3") for ppc in (1, 4, 8)}
-        found |= {f"dx 10, {ppc} per cell": at("10", ppc) for ppc in (1, 4)}
-        base, name = at("13.3", 4), "dx 13.3, 4 per cell"
     changes = {
         "jittered, seed 0": ["scene.bed.arrangement=jittered", "++scene.bed.mirrored=true"],
         "jittered, seed 1": ["scene.bed.arrangement=jittered", "++scene.bed.mirrored=true", "seed=1"],
-        "margin -1": ["scene.contact_margin=-1"],
-        "margin -0.5": ["scene.contact_margin=-0.5"],
-        "margin -0.25": ["scene.contact_margin=-0.25"],
-        "margin 0": ["scene.contact_margin=0"],
         "courant 0.3": ["scene.courant=0.3"],
         "damping 0": ["scene.elastic_damping=0"],
         "damping 0.2": ["scene.elastic_damping=0.2"],
         "volume not averaged": ["scene.volume_averaging=0"],
         "remap 1 ms": ["scene.remap_time=0.001"],
-        "remap 16 ms": ["scene.remap_time=0.016"],
         "memory 0": ["scene.velocity_memory=1e-9"],
         "every step": [
             "scene.remap_time=0",
@@ -81,21 +73,27 @@ def settings(kind: str) -> dict[str, list[str]]:
             "scene.elastic_damping=0",
             "scene.volume_averaging=0",
         ],
-        "E 5 MPa": ["material.youngs_modulus=5e6"],
         "constant friction": ["effects.rate_dependence=false"],
         "friction map sin": ["material.friction_angle=37.2348", "material.friction_map=sin"],
+        "E 5 MPa": ["material.youngs_modulus=5e6"],
         "E 15 MPa": ["material.youngs_modulus=15e6"],
     }
-    found |= {f"{name}, {change}": [*base, *more] for change, more in changes.items()}
-    if kind == "cut":
-        found["dx 10, 8 per cell"] = at("10", 8)
-        found["dx 6.7, 1 per cell"] = at("6.7", 1)
-        for dx, ppc in (("20", 4), ("10", 4)):
-            for margin in ("-1", "-0.5"):
-                found[f"dx {dx}, {ppc} per cell, margin {margin}"] = at(
-                    dx, ppc, f"scene.contact_margin={margin}"
-                )
-        found["dx 6.7, 4 per cell"] = at("6.7", 4)
+    sizes = {"cut": ("20", "13.3", "10"), "wheel": ("20", "13.3", "10", "6.7")}[kind]
+    found = {
+        f"dx {dx}, {ppc} per cell, margin {margin}": at(dx, ppc, margin)
+        for margin in ("-0.75", "-0.25", "-0.5", "0")
+        for ppc in (1, 4)
+        for dx in sizes
+    }
+    base = "dx 13.3, 4 per cell, margin -0.25"
+    found |= {f"{base}, {change}": [*at("13.3", 4, "-0.25"), *more] for change, more in changes.items()}
+    for dx, ppc, margin in (
+        ("13.3", 8, "-0.25"),
+        ("6.7", 1, "-0.25"),
+        ("6.7", 1, "-0.75"),
+        ("6.7", 4, "-0.25"),
+    ):
+        found[f"dx {dx}, {ppc} per cell, margin {margin}"] = at(dx, ppc, margin)
     return found
 
 
@@ -207,19 +205,14 @@ def draw(kind: str, rows: dict[str, dict], names: list[tuple[str, str]]) -> None
     figure = plt.figure(figsize=(13, 2.6 * len(names)), layout="constrained")
     axes = figure.subplots(len(names), 2, width_ratios=(1, 1.4), squeeze=False)
     grid = {
-        name: m
-        for name in rows
-        if (m := re.fullmatch(r"dx ([\d.]+), (\d) per cell(?:, (margin \S+))?", name))
+        name: m for name in rows if (m := re.fullmatch(r"dx ([\d.]+), (\d) per cell, (margin \S+)", name))
     }
-    changed = [name for name in rows if name.count(",") > 1 and ", 4 per cell" in name]
-    base = next(name for name in settings(kind) if changed and changed[0].startswith(name))
-    changed = [base, *(name for name in changed if name.startswith(base))]
+    base = "dx 13.3, 4 per cell, margin -0.25"
+    changed = [name for name in rows if name.startswith(base)]
     for (left, right), (key, label) in zip(axes, names, strict=True):
-        for ppc, margin in sorted({(m[2], m[3] or "default margin") for m in grid.values()}):
+        for ppc, margin in sorted({(m[2], m[3]) for m in grid.values()}):
             points = sorted(
-                (float(m[1]), float(rows[n][key]))
-                for n, m in grid.items()
-                if (m[2], m[3] or "default margin") == (ppc, margin)
+                (float(m[1]), float(rows[n][key])) for n, m in grid.items() if (m[2], m[3]) == (ppc, margin)
             )
             if len(points) > 1:
                 left.plot(*zip(*points, strict=True), "o-", label=f"{ppc} per cell, {margin}")

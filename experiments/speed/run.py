@@ -67,7 +67,7 @@ def main() -> None:
     torch.set_num_threads(1)
     with initialize_config_module("sgns.conf", version_base="1.3"):
         config = compose(
-            "simulate", ["scene=excavation", "scene.depth=0.08", "scene.speed=0.10", "scene.rake=10"]
+            "simulate", ["scene=paper_excavation", "scene.depth=0.08", "scene.speed=0.10", "scene.rake=10"]
         )
     scene = scene_from_config(config)
     effects, _ = decided(scene, asked_effects(config))

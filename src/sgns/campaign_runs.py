@@ -1,4 +1,4 @@
-"""The runs of a campaign, made by one process per core."""
+"""The runs of a campaign, made by one process per core, or many at once on a GPU."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Generator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -17,14 +18,15 @@ from typing import Any
 
 from tqdm import tqdm
 
-from mpm_warp import Effects, Scene, SceneError, Solver, SolverStopped
+from mpm_warp import Frame, Scene, SceneError, Solver, SolverStopped, frames_together
+from mpm_warp.streams import in_turns
 from sgns.campaign import Campaign
 from sgns.claim import claimed
 from sgns.cost import RunCost, duration_words, finishing_time, require_space, run_cost, size_words
 from sgns.errors import UserError
 from sgns.runs import Run
-from sgns.scene_effects import decision_summary, recorded
-from sgns.scene_run import simulate_scene
+from sgns.scene_effects import decided, decision_summary, recorded
+from sgns.scene_run import scene_stages
 from sgns.settings import flattened
 
 __all__ = ["simulate_campaign"]
@@ -37,7 +39,13 @@ _LOG_EVERY = 60.0  # seconds between lines about the progress where there is no 
 
 
 def simulate_campaign(
-    campaign: Campaign, *, device: str, workers: int | None = None, shard: int = 0, shards: int = 1
+    campaign: Campaign,
+    *,
+    device: str,
+    workers: int | None = None,
+    batch: int = 1,
+    shard: int = 0,
+    shards: int = 1,
 ) -> None:
     """Make every run of a campaign that is not there yet, one process per core, the longest first.
 
@@ -46,7 +54,8 @@ def simulate_campaign(
     Args:
         campaign: what to make, and where.
         device: cpu or cuda.
-        workers: runs at once; by default one for each core of a CPU, and one on a GPU.
+        workers: processes at once; by default one for each core of a CPU, and one on a GPU.
+        batch: runs that a process has under way at once; more than one pays on a GPU only.
         shard: which share of the runs to make, 0 to `shards` - 1.
         shards: into how many shares of like work the runs are divided.
 
@@ -77,7 +86,8 @@ def simulate_campaign(
     require_space(campaign.path, size)
     _compile(campaign, missing, device)
     workers = min(workers or (1 if device != "cpu" else len(os.sched_getaffinity(0))), len(missing))
-    production = _Production(campaign, {name: costs[name] for name in missing}, device, workers)
+    batch = min(batch, math.ceil(len(missing) / workers))
+    production = _Production(campaign, {name: costs[name] for name in missing}, device, workers, batch)
     failed = production.make_all(f"about {size_words(size)} of disk")
     if failed:
         name, message = next(iter(failed.items()))
@@ -111,17 +121,19 @@ def _compile(campaign: Campaign, names: list[str], device: str) -> None:
 class _Production:
     """Worker processes, what they have done, and how long the rest will take."""
 
-    def __init__(self, campaign: Campaign, costs: dict[str, RunCost], device: str, workers: int) -> None:
-        self.campaign, self.costs, self.workers = campaign, costs, workers
-        self._settings = (campaign.seed, device, campaign.precision)
+    def __init__(
+        self, campaign: Campaign, costs: dict[str, RunCost], device: str, workers: int, batch: int = 1
+    ) -> None:
+        self.campaign, self.costs, self.workers, self.batch = campaign, costs, workers, batch
+        self.at_once = workers * batch
+        self._settings = (campaign.effects, campaign.seed, device, campaign.precision)
         context = multiprocessing.get_context("spawn")
-        # Frames done of every run; each entry has one writer, so there is no lock.
-        self._frames_done = context.RawArray("q", len(costs))
-        self._pool = ProcessPoolExecutor(
-            workers, context, _start_worker, (self._frames_done, context.Barrier(workers))
-        )
-        self._jobs: dict[str, Future[tuple[str, str]]] = {}
-        # What the estimates rest on: particle-steps made, and the seconds of a worker that they took.
+        # Frames done of every run, and whether it has ended; each entry has one writer, so there is no lock.
+        self._frames_done, self._ended = context.RawArray("q", len(costs)), context.RawArray("b", len(costs))
+        shared = (self._frames_done, self._ended, context.Barrier(workers))
+        self._pool = ProcessPoolExecutor(workers, context, _start_worker, shared)
+        self._jobs: dict[str, Future[dict[str, tuple[str, str]]]] = {}
+        # What the estimates rest on: particle-steps made, and the seconds that they took, of each run for itself.
         self._work_seen, self._seconds_seen = 0.0, 0.0
 
     def make_all(self, disk: str) -> dict[str, str]:
@@ -129,14 +141,10 @@ class _Production:
         with self._pool:
             try:
                 self._measure()
-                log.info("about %s with %d at once, %s", self._left(), self.workers, disk)
-                for index, name in enumerate(self.costs):
-                    scene, file = self.campaign.scenes[name].to_dict(), self.campaign.file(name)
-                    effects, decisions = self.campaign.physics[name]
-                    job = (index, scene, file, effects, recorded(decisions), *self._settings)
-                    self._jobs[name] = self._pool.submit(_make, *job)
+                log.info("about %s with %d at once, %s", self._left(), self.at_once, disk)
+                self._submit()
                 self._follow()
-                outcomes = {name: job.result() for name, job in self._jobs.items()}
+                outcomes = {name: job.result()[name] for name, job in self._jobs.items()}
             except BrokenProcessPool:
                 raise UserError(
                     f"a process that simulated died, perhaps for lack of memory; the complete runs are kept in "
@@ -155,29 +163,43 @@ class _Production:
     def _measure(self) -> None:
         """Let all workers step runs from all over the list for a moment, at the same time."""
         names = list(self.costs)
-        sample = [names[i * len(names) // self.workers] for i in range(self.workers)]
-        _, device, precision = self._settings
-        trials = [
-            self._pool.submit(
-                _try, self.campaign.scenes[name].to_dict(), self.campaign.physics[name][0], device, precision
-            )
-            for name in sample
-        ]
-        for name, trial in zip(sample, trials, strict=True):
+        sample = [names[i * len(names) // self.at_once] for i in range(self.at_once)]
+        effects, _, device, precision = self._settings
+        shares = [sample[worker :: self.workers] for worker in range(self.workers)]
+        trials = []
+        for share in shares:
+            scenes = [self.campaign.scenes[name].to_dict() for name in share]
+            trials.append(self._pool.submit(_try, scenes, effects, device, precision))
+        for share, trial in zip(shares, trials, strict=True):
             frames, seconds = trial.result()
-            self._work_seen += frames * self.costs[name].work_per_frame
-            self._seconds_seen += seconds
+            for name, count in zip(share, frames, strict=True):
+                self._work_seen += count * self.costs[name].work_per_frame
+                self._seconds_seen += seconds
+
+    def _submit(self) -> None:
+        """Every run is a job, but a worker that makes several at once gets its share of the runs as one job."""
+        jobs = [
+            (name, index, self.campaign.scenes[name].to_dict(), self.campaign.file(name))
+            for index, name in enumerate(self.costs)
+        ]
+        if self.batch > 1:
+            shares = [jobs[worker :: self.workers] for worker in range(self.workers)]
+        else:
+            shares = [[job] for job in jobs]
+        for share in shares:
+            future = self._pool.submit(_make_share, share, self.batch, *self._settings)
+            self._jobs.update((name, future) for name, *_ in share)
 
     def _follow(self) -> None:
         """Wait for all runs, keeping the bar and the estimate up to date."""
         total = sum(cost.work for cost in self.costs.values())
         made, last, last_line = 0, time.monotonic(), time.monotonic()
         layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
-        with tqdm(total=total, desc=f"{self.workers} at once", bar_format=layout, disable=None) as bar:
+        with tqdm(total=total, desc=f"{self.at_once} at once", bar_format=layout, disable=None) as bar:
             while rest := self._rest():
                 time.sleep(0.2)
                 now, work = time.monotonic(), self._work_made()
-                self._see(work - made, now - last, busy=min(self.workers, len(rest)))
+                self._see(work - made, now - last, busy=min(self.at_once, len(rest)))
                 made, last = work, now
                 done = f"{len(self._jobs) - len(rest)} of {len(self._jobs)} runs"
                 bar.set_postfix_str(f"{done}, {self._left()} left", refresh=False)
@@ -189,7 +211,7 @@ class _Production:
             bar.update(total - bar.n)
 
     def _see(self, work: float, elapsed: float, busy: int) -> None:
-        """Add the particle-steps of `busy` workers in the last `elapsed` seconds; a machine's speed may change."""
+        """Add the particle-steps of `busy` runs in the last `elapsed` seconds; a machine's speed may change."""
         kept = math.exp(-elapsed / _MEMORY)
         self._work_seen = kept * self._work_seen + work
         self._seconds_seen = kept * self._seconds_seen + elapsed * busy
@@ -201,10 +223,11 @@ class _Production:
 
     def _rest(self) -> dict[str, int]:
         """Particle-steps that are left of every run that is not finished."""
+        runs = zip(self.costs.items(), self._frames_done, self._ended, strict=True)
         return {
             name: cost.work - max(0, frames - 1) * cost.work_per_frame
-            for frames, (name, cost) in zip(self._frames_done, self.costs.items(), strict=True)
-            if name not in self._jobs or not self._jobs[name].done()
+            for (name, cost), frames, ended in runs
+            if name not in self._jobs or not (ended or self._jobs[name].done())
         }
 
     def _left(self) -> str:
@@ -213,21 +236,22 @@ class _Production:
             return "an unknown time"
         rest = self._rest()
         begun = {name for name, frames in zip(self.costs, self._frames_done, strict=True) if frames}
-        running = [work for name, work in rest.items() if name in begun][: self.workers]
+        running = [work for name, work in rest.items() if name in begun][: self.at_once]
         waiting = [work for name, work in rest.items() if name not in begun]
         rate = self._work_seen / self._seconds_seen
-        return duration_words(finishing_time(waiting, running, self.workers) / rate)
+        return duration_words(finishing_time(waiting, running, self.at_once) / rate)
 
 
 # --- in the worker processes ------------------------------------------------------------------------------
 
-_frames_done: Any = None  # shared with the first process and set once, like the barrier
+_frames_done: Any = None  # shared with the first process and set once, like the other two
+_ended: Any = None
 _barrier: Any = None
 
 
-def _start_worker(frames_done: Any, barrier: Any) -> None:
-    global _frames_done, _barrier
-    _frames_done, _barrier = frames_done, barrier
+def _start_worker(frames_done: Any, ended: Any, barrier: Any) -> None:
+    global _frames_done, _ended, _barrier
+    _frames_done, _ended, _barrier = frames_done, ended, barrier
     # Ctrl-C reaches all processes of the terminal; the first one ends the others.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -239,53 +263,80 @@ def _start_worker(frames_done: Any, barrier: Any) -> None:
     threading.Thread(target=leave_with_parent, daemon=True).start()
 
 
-def _try(scene: dict[str, Any], effects: Effects, device: str, precision: str) -> tuple[int, float]:
-    """Frames made and the seconds they took, while the other workers do the same."""
-    frames = Solver(Scene.from_dict(scene), effects, device, precision).frames()
-    next(frames)
+def _try(
+    scenes: list[dict[str, Any]], effects: dict[str, Any], device: str, precision: str
+) -> tuple[list[int], float]:
+    """Frames made of each scene and the seconds they took all together, while the other workers do the same."""
+    found = [Scene.from_dict(scene) for scene in scenes]
+    physics = [decided(scene, effects)[0] for scene in found]
+    frames = frames_together(found, physics, device, precision, at_once=len(found))
+    for _ in found:
+        next(frames)  # the state at the start
     with suppress(threading.BrokenBarrierError):
         _barrier.wait(timeout=120.0)
-    start, count = time.perf_counter(), 0
-    with suppress(SolverStopped):  # whoever makes the run says so
-        for _ in frames:
-            count += 1
-            if time.perf_counter() - start > _MEASURED:
-                break
-    return count, time.perf_counter() - start
+    start, counts = time.perf_counter(), [0] * len(found)
+    for number, frame in frames:
+        counts[number] += isinstance(frame, Frame)  # if it is an error, whoever makes the run says so
+        if time.perf_counter() - start > _MEASURED:
+            break
+    return counts, time.perf_counter() - start
+
+
+def _make_share(
+    jobs: list[tuple[str, int, dict[str, Any], Path]],
+    batch: int,
+    effects: dict[str, Any],
+    seed: int,
+    device: str,
+    precision: str,
+) -> dict[str, tuple[str, str]]:
+    """Make the runs (name, number in the campaign, scene, file), `batch` at once; gives what `_make` says of each."""
+    tasks = (_make(*job, effects, seed, device, precision) for _, *job in jobs)
+    outcomes = {}
+    for number, outcome in in_turns(tasks, batch, device):
+        name, index, *_ = jobs[number]
+        outcomes[name] = outcome
+        _ended[index] = True
+    return outcomes
 
 
 def _make(
     index: int,
     scene: dict[str, Any],
     output: Path,
-    effects: Effects,
-    reasons: dict[str, dict[str, Any]],
+    effects: dict[str, Any],
     seed: int,
     device: str,
     precision: str,
-) -> tuple[str, str]:
-    """Make one run unless another process does; gives made, elsewhere or failed, and what went wrong in words."""
+) -> Generator[tuple[str, str] | None, None, None]:
+    """Make one run unless another process does, pausing where others may have their turn; gives made, elsewhere or
+    failed, and what went wrong in words."""
 
     def count_frame() -> None:
         _frames_done[index] += 1
 
+    outcome = "made", ""
     try:
         with claimed(output) as ours:
             if not ours or _done(output, Scene.from_dict(scene)):
-                return "elsewhere", ""
-            simulate_scene(
-                Scene.from_dict(scene),
-                output,
-                effects=effects,
-                reasons=reasons,
-                seed=seed,
-                device=device,
-                precision=precision,
-                progress=count_frame,
-            )
+                outcome = "elsewhere", ""
+            else:
+                physics, decisions = decided(Scene.from_dict(scene), effects)
+                for timing in scene_stages(
+                    Scene.from_dict(scene),
+                    output,
+                    effects=physics,
+                    reasons=recorded(decisions),
+                    seed=seed,
+                    device=device,
+                    precision=precision,
+                    progress=count_frame,
+                ):
+                    if timing is None:
+                        yield
     except (UserError, SceneError, SolverStopped) as error:
-        return "failed", str(error)
-    return "made", ""
+        outcome = "failed", str(error)
+    yield outcome
 
 
 def _done(file: Path, scene: Scene) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from mpm_warp import Effects, Scene, Solver
 from sgns.runs import RunWriter
 
-__all__ = ["Timing", "simulate_scene"]
+__all__ = ["Timing", "scene_stages", "simulate_scene"]
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Timing:
     """What a run cost; compilation and set-up are not in it, recording the frames is."""
 
     wall_time: float
-    """[s]"""
+    """[s]; of scenes that take turns, each has its own turns, which add up to the time that passed."""
     simulated: float
     """[s]"""
     particle_steps: int
@@ -35,7 +35,13 @@ class Timing:
         return self.particle_steps / self.wall_time
 
 
-def simulate_scene(
+def simulate_scene(scene: Scene, output: Path, **settings: Any) -> Timing:
+    """Compute a scene and write its run file; arguments as in `scene_stages`."""
+    *_, timing = scene_stages(scene, output, **settings)
+    return timing
+
+
+def scene_stages(
     scene: Scene,
     output: Path,
     *,
@@ -45,12 +51,15 @@ def simulate_scene(
     device: str = "cpu",
     precision: str = "float32",
     progress: Any = None,
-) -> Timing:
+) -> Generator[Timing | None, None, None]:
     """Compute a scene and write its run file, with the particles that `scene.bed.store_every` leaves in it.
 
     Args:
         reasons: effect → on, reason, number, for the run file; by default what `effects` says of itself.
         progress: called once after every frame.
+
+    Yields:
+        None wherever other scenes may have their turn (mpm_warp's streams.py), and at the end what it cost.
     """
     solver = Solver(scene, effects, device, precision)
     stored = scene.stored
@@ -72,10 +81,15 @@ def simulate_scene(
             "particles_simulated": solver.particle_count,
         },
     ) as writer:
-        start = None
-        for frame in solver.frames():
+        wall_time, start = 0.0, None
+        for frame in solver.stages():
             # The clock starts with the first step: loading kernels is not part of the cost of a run.
             start = start if start is not None else time.perf_counter()
+            if frame is None:
+                wall_time += time.perf_counter() - start
+                yield
+                start = time.perf_counter()
+                continue
             writer.append(
                 frame.time,
                 frame.position[stored],
@@ -87,9 +101,9 @@ def simulate_scene(
             )
             if progress is not None:
                 progress()
-        wall_time = time.perf_counter() - start
+        wall_time += time.perf_counter() - start
         writer.finish(wall_time)
     frames = scene.frame_count - 1
-    return Timing(
+    yield Timing(
         wall_time, frames / scene.frame_rate, frames * solver.substeps_per_frame * solver.computed_count
     )

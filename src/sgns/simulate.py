@@ -45,11 +45,19 @@ def main(cfg: DictConfig) -> float | None:
     Returns:
         Wall seconds per simulated second of a single scene.
     """
-    asked = asked_effects(cfg)
+    asked, batch = asked_effects(cfg), cfg.solver.batch
+    if type(batch) is not int or batch < 1:
+        raise UserError(f"solver.batch is {batch!r}; it must be a whole number, 1 or more")
     if cfg.get("dataset") is not None:  # `dataset: null` in a defaults list leaves no key
         settings = OmegaConf.to_container(cfg.dataset, resolve=True)
         campaign = plan(settings, _base_scene(settings), asked, cfg.solver.precision, cfg.seed)
-        simulate_campaign(campaign, device=cfg.device, shard=cfg.shard, shards=cfg.shards)
+        simulate_campaign(
+            campaign,
+            device=cfg.device,
+            batch=1 if cfg.device == "cpu" else batch,
+            shard=cfg.shard,
+            shards=cfg.shards,
+        )
         return None
     if (cfg.shard, cfg.shards) != (0, 1):
         raise UserError("shard and shards divide the runs of a dataset; give dataset=... or leave them out")

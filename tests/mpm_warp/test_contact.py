@@ -76,7 +76,10 @@ def test_a_body_scene_survives_plain_data(tool):
     [
         ({"path": None}, "scene.path is missing"),
         ({"path": path(-0.2, 0.1)}, "the body leaves the bin at 0.000 s: z = "),
-        ({"tool": Box(size=(0.1, 0.1, 0.01))}, "a body of 0.01 m is too thin for a grid of 0.02 m"),
+        (
+            {"tool": Box(size=(0.1, 0.1, 0.01)), "contact_margin": -1.0},
+            "a body of 0.01 m is too thin for a grid of 0.02 m",
+        ),
     ],
 )
 def test_what_a_body_scene_refuses(change, words):

@@ -87,7 +87,10 @@ def test_recorded_particles_are_one_of_every_few():
         ({"courant": 1.5}, "scene.courant is 1.5; allowed"),
         ({"body_grid": (0, 5)}, "scene.body_grid"),
         ({"contact_margin": 2.0}, "scene.contact_margin"),
-        ({"blade": Plate(length=0.2, width=0.193, thickness=0.012)}, "too thin for a grid of 0.02 m"),
+        (
+            {"blade": Plate(length=0.2, width=0.193, thickness=0.012), "contact_margin": -1.0},
+            "too thin for a grid of 0.02 m",
+        ),
     ],
 )
 def test_what_a_scene_refuses(change, words):

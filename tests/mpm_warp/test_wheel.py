@@ -27,6 +27,7 @@ def wheel(**kw) -> Wheel:
         "rim_speed": 0.1,
         "settle": 0.4,
         "start": 0.4,
+        "contact_margin": -0.37,  # contact begins when a particle's centre is at the surface
     }
     values |= kw
     values.setdefault("duration", values["settle"] + 1.0 / 60.0)

@@ -83,6 +83,19 @@ def test_campaign_is_resumed(tmp_path, caplog):
     assert sorted(f.name for f in files[0].parent.iterdir()) == sorted(f.name for f in files)
 
 
+def test_runs_that_take_turns_are_the_runs_made_one_by_one(tmp_path, caplog):
+    one, two = campaign(tmp_path / "one", runs=5), campaign(tmp_path / "two", runs=5)
+    simulate_campaign(one, device="cpu", workers=1)
+    with caplog.at_level(logging.INFO):
+        simulate_campaign(two, device="cpu", workers=1, batch=3)
+    assert "with 3 at once" in caplog.text
+    for name in two.scenes:
+        assert check_run(two.file(name)) == []
+        with Run(one.file(name)) as alone, Run(two.file(name)) as together:
+            np.testing.assert_array_equal(alone.positions(), together.positions())
+            np.testing.assert_array_equal(alone.force, together.force)
+
+
 def test_the_longest_runs_come_first(tmp_path, order):
     c = unequal(tmp_path)
     simulate_campaign(c, device="cpu", workers=2)
@@ -164,21 +177,23 @@ def test_time_left_follows_from_the_work_left_and_the_speed_seen(tmp_path):
         production._pool.shutdown()
 
 
-def test_a_run_that_fails_does_not_stop_the_others(tmp_path, monkeypatch):
+@pytest.mark.parametrize("batch", [1, 2])
+def test_a_run_that_fails_does_not_stop_the_others(tmp_path, batch):
     c = campaign(tmp_path, draw={"depth": [0.02, 0.04, 0.05], "path": [None]}, runs=None)
     name = next(iter(c.scenes))
     c.file(name).mkdir(parents=True)  # nothing can be written there
     with pytest.raises(UserError, match=f"1 of 3 runs could not be made .* first is {name}: .* is a folder"):
-        simulate_campaign(c, device="cpu", workers=1)
+        simulate_campaign(c, device="cpu", workers=1, batch=batch)
     assert [check_run(c.file(n)) for n in list(c.scenes)[1:]] == [[], []]
 
 
-def test_a_run_that_another_process_makes_is_left_to_it(tmp_path, caplog):
+@pytest.mark.parametrize("batch", [1, 2])
+def test_a_run_that_another_process_makes_is_left_to_it(tmp_path, caplog, batch):
     c = campaign(tmp_path, runs=3)
     first, *others = c.scenes
     with claimed(c.file(first)) as ours, caplog.at_level(logging.INFO):
         assert ours
-        simulate_campaign(c, device="cpu", workers=1)
+        simulate_campaign(c, device="cpu", workers=1, batch=batch)
     assert "runs left to another process that is making them or has made them: 1" in caplog.text
     assert not c.file(first).exists()
     assert all(c.file(name).exists() for name in others)
@@ -208,5 +223,5 @@ def test_two_processes_may_compile_into_an_empty_cache_at_once(tmp_path):
     said = [process.communicate("go\n", timeout=100)[0] for process in processes]
     assert said == ["done\n"] * 2
     # One kernel, and no half-made folder beside it.
-    assert len(list(tmp_path.glob("*/wp_step*"))) == 1
-    assert len(list(tmp_path.glob("*/wp_step*/*.o"))) == 1
+    assert len(list(tmp_path.glob("*/wp_grid_step*"))) == 1
+    assert len(list(tmp_path.glob("*/wp_grid_step*/*.o"))) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 
 import h5py
 import pytest
@@ -12,7 +13,7 @@ from test_campaign import campaign
 from mpm_warp import Effects, SolverStopped
 from sgns.errors import UserError
 from sgns.runs import Run, check_run
-from sgns.simulate import simulate_scene
+from sgns.scene_run import scene_stages, simulate_scene
 
 SMALL = [
     "scene.duration=0.05",
@@ -62,6 +63,7 @@ def test_command_writes_fewer_particles(tmp_path):
         ("device=tpu", "device is 'tpu'"),
         ("scene.bed.store_every=0", "bed.store_every is 0"),
         ("shards=4", "give dataset=..."),
+        ("solver.batch=0", "solver.batch is 0"),
         ("scene.depth=deep", "scene.depth is 'deep'"),
         ("scene.path=nowhere.csv", "scene.path"),
     ],
@@ -90,10 +92,22 @@ def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
         raise SolverStopped("particle 1 went wrong")
         yield
 
-    monkeypatch.setattr("sgns.scene_run.Solver.frames", stops)
+    monkeypatch.setattr("sgns.scene_run.Solver.stages", stops)
     with pytest.raises(SolverStopped):
         simulate_scene(scene, tmp_path / "run.h5", effects=Effects())
     assert not list(tmp_path.glob("*"))
+
+
+def test_a_run_counts_the_time_of_its_own_turns(tmp_path):
+    scene = next(iter(campaign(tmp_path).scenes.values()))
+    slept = 0.0
+    for timing in scene_stages(scene, tmp_path / "run.h5", effects=Effects()):
+        if timing is None:
+            time.sleep(0.05)
+            slept += 0.05
+    assert 0.0 < timing.wall_time < 0.5 * slept
+    with Run(tmp_path / "run.h5") as run:
+        assert run.wall_time_s == timing.wall_time
 
 
 def test_output_that_is_a_folder(tmp_path):

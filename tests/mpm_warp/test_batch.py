@@ -1,0 +1,159 @@
+"""Many scenes at once: the same frames as one by one, and one that fails leaves the others alone."""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+
+import numpy as np
+import pytest
+import warp as wp
+from beds import block, cut
+
+from mpm_warp import (
+    Bed,
+    Effects,
+    Frame,
+    Material,
+    Scene,
+    SceneError,
+    Solver,
+    SolverStopped,
+    Wheel,
+    frames_together,
+)
+from mpm_warp.streams import in_turns, on_host
+
+needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
+
+
+class Thrown(Scene):
+    """Soil that flies out of the grid within a few frames."""
+
+    def initial_velocities(self):
+        return np.tile([0.0, 0.0, 4.0], (len(self.filled[0]), 1))
+
+
+def different_scenes():
+    """Scenes of different motion, gravity, material, kind, time step and number of frames."""
+    return [
+        cut(duration=0.15),
+        cut(duration=0.12, rake=30.0, gravity=1.62, material=Material(youngs_modulus=2.0e6)),
+        Wheel(bed=cut().bed, duration=0.08, settle=0.02),
+    ]
+
+
+def by_scene(frames):
+    """What came of each scene, in order."""
+    found = {}
+    for number, frame in frames:
+        found.setdefault(number, []).append(frame)
+    return [found[number] for number in sorted(found)]
+
+
+@pytest.mark.parametrize("at_once", [2, 32])
+def test_scenes_together_are_the_scenes_alone(at_once):
+    scenes = different_scenes()
+    together = by_scene(frames_together(scenes, at_once=at_once))
+    for scene, frames in zip(scenes, together, strict=True):
+        assert len(frames) == scene.frame_count
+        for one, two in zip(frames, Solver(scene).frames(), strict=True):
+            for a, b in zip(astuple(one), astuple(two), strict=True):
+                np.testing.assert_array_equal(a, b)
+        assert np.linalg.norm(frames[-1].force) > 0.1
+
+
+def test_scenes_may_have_effects_of_their_own():
+    scene, effects = (
+        cut(duration=0.15),
+        [Effects(), Effects(rate_dependence=False), Effects(separation=False)],
+    )
+    found = [frames[-1].force for frames in by_scene(frames_together([scene] * 3, effects))]
+    for force, own in zip(found, effects, strict=True):
+        np.testing.assert_array_equal(force, list(Solver(scene, own).frames())[-1].force)
+    assert len({tuple(force) for force in found}) == 3
+
+
+def test_scenes_that_fail_leave_the_others():
+    sound = cut(duration=0.05)
+    uneven = Scene(bed=Bed(size=(0.2, 0.2, 0.1), spacing=0.05, arrangement="jittered"), duration=0.05)
+    thrown = Thrown(bed=block().bed, gravity=0.0, duration=0.2, frame_rate=50.0)
+    effects = Effects(symmetry=True)
+    refused, stopped, whole = by_scene(frames_together([uneven, thrown, sound], effects, at_once=2))
+    assert len(refused) == 1 and isinstance(refused[0], SceneError)
+    assert len(stopped) < thrown.frame_count
+    assert all(isinstance(frame, Frame) for frame in stopped[:-1])
+    assert isinstance(stopped[-1], SolverStopped) and "headroom" in str(stopped[-1])
+    np.testing.assert_array_equal(whole[-1].force, list(Solver(sound, effects).frames())[-1].force)
+    assert len(whole) == sound.frame_count
+
+
+def test_turns_go_round_and_the_next_begins_when_one_ends():
+    log = []
+
+    def task(name, turns):
+        log.append(f"{name} begins")
+        for turn in range(turns):
+            yield turn or None
+        log.append(f"{name} ends")
+
+    given = list(in_turns((task(name, turns) for name, turns in [("a", 3), ("b", 2), ("c", 3)]), 2, "cpu"))
+    assert given == [(0, 1), (1, 1), (0, 2), (2, 1), (2, 2)]
+    assert log == ["a begins", "b begins", "b ends", "a ends", "c begins", "c ends"]
+
+
+def test_when_one_breaks_the_others_are_closed():
+    closed = []
+
+    def waits(name):
+        try:
+            while True:
+                yield name
+        finally:
+            closed.append(name)
+
+    def breaks():
+        yield
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        list(in_turns([waits("a"), breaks(), waits("b")], 3, "cpu"))
+    assert sorted(closed) == ["a", "b"]
+
+
+def test_unknown_device():
+    with pytest.raises(SceneError, match="device is 'tpu'; allowed here: cpu"):
+        list(in_turns([], 2, "tpu"))
+
+
+@needs_cuda
+def test_many_scenes_on_cuda_agree_with_the_cpu():
+    scenes = [cut(duration=0.15, depth=depth) for depth in np.linspace(0.02, 0.06, 9)]
+    for scene, frames in zip(
+        scenes, by_scene(frames_together(scenes, device="cuda", at_once=8)), strict=True
+    ):
+        one, two = frames[-1], list(Solver(scene).frames())[-1]
+        np.testing.assert_allclose(one.force, two.force, atol=0.01 * np.linalg.norm(two.force))
+        assert np.abs(one.position - two.position).max() < 1e-4
+
+
+@wp.kernel
+def busy(end: wp.array(dtype=float)):
+    number = end[0]
+    for _ in range(30_000_000):
+        number = wp.sin(number + 1.0)
+    end[0] = number
+
+
+@needs_cuda
+def test_reading_does_not_wait_for_other_streams():
+    end, number = (wp.full(1, 3.0, dtype=float, device="cuda") for _ in range(2))
+    wp.load_module(busy.module, device="cuda")
+    one, two = wp.Stream("cuda"), wp.Stream("cuda")
+    wp.synchronize_device("cuda")
+    with wp.ScopedStream(one, sync_enter=False):
+        wp.launch(busy, 1, [end], device="cuda")
+    with wp.ScopedStream(two, sync_enter=False):
+        assert on_host(number)[0] == 3.0
+    assert not one.is_complete
+    wp.synchronize_stream(one)
+    assert end.numpy()[0] != 3.0
