@@ -1,0 +1,45 @@
+"""A wheel sinks into sand and drives: side views at two slips, and how sinkage and drawbar pull follow.
+
+    python experiments/wheel/run.py
+
+Makes two runs in data/wheel (kept), then side.png beside this script.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+from hydra import compose, initialize_config_module
+
+matplotlib.use("Agg")
+
+from sgns.evaluation.sideview import side_views
+from sgns.runs import Run
+from sgns.scene_effects import asked_effects, decided
+from sgns.scene_run import simulate_scene
+from sgns.scenes import scene_from_config
+
+HERE, DATA = Path(__file__).parent, Path("data/wheel")
+SLIPS = (0.2, 0.7)
+SCENE = ["scene=wheel", "scene.load=100", "scene.duration=6.0", "scene.bed.particles_per_cell=8"]
+
+
+def main() -> None:
+    runs = {}
+    for slip in SLIPS:
+        file = DATA / f"slip_{slip}.h5"
+        with initialize_config_module("sgns.conf", version_base="1.3"):
+            config = compose("simulate", [*SCENE, f"scene.slip={slip}"])
+        scene = scene_from_config(config)
+        if not file.exists():
+            simulate_scene(scene, file, effects=decided(scene, asked_effects(config))[0])
+        runs[f"slip {100 * slip:.0f} %"] = Run(file)
+    for title, run in runs.items():
+        print(title, scene.summary(run.force, run.torque, run.pose))
+    figure = side_views(runs, [60, 200, 359], scene.initial_positions())
+    figure.savefig(HERE / "side.png", dpi=90)
+
+
+if __name__ == "__main__":
+    main()
