@@ -2,8 +2,9 @@
 
     python experiments/published_forces/run.py <folder of the authors' excavation files>
 
-Makes one run file per case (about 200 MB each, in data/published_forces; finished ones are kept), then table.csv and
-histories.png beside this script.
+Makes one run file per case (about 200 MB each, in data/published_excavation; finished ones are kept), then table.csv
+and histories.png beside this script. With `--scene excavation` the same cuts at the reference setting, into files of
+that name.
 """
 
 from __future__ import annotations
@@ -52,16 +53,22 @@ def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("published", help="folder with valid.tfrecord and metadata.json")
-    parser.add_argument("--runs", default="data/published_forces", help="folder for the run files")
+    parser.add_argument("--runs", default=None, help="folder for the run files (default: data/<scene>)")
+    parser.add_argument(
+        "--scene",
+        default="published_excavation",
+        help="published_excavation, or excavation: the reference setting",
+    )
     parser.add_argument("--workers", type=int, default=None, help="runs at once (default: one per core)")
     parser.add_argument("overrides", nargs="*", help="changes of the scene, for example scene.courant=0.4")
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
     with initialize_config_module("sgns.conf", version_base="1.3"):
-        config = compose("simulate", ["scene=published_excavation", *options.overrides])
+        config = compose("simulate", [f"scene={options.scene}", *options.overrides])
     published = read_published(options.published, scene_from_config(config).bed.size)
     published.sort(key=lambda run: run.case)
+    suffix = "" if options.scene == "published_excavation" else f"_{options.scene}"
     scenes = {}
     for run in published:
         for key, value in excavation_case(run.case).items():
@@ -69,7 +76,7 @@ def main() -> None:
         scenes[f"case_{run.case:03d}"] = scene_from_config(config)
     campaign = Campaign(
         "published_forces",
-        Path(options.runs),
+        Path(options.runs or f"data/{options.scene}"),
         scenes,
         dict.fromkeys(scenes, "test"),
         asked_effects(config),
@@ -105,8 +112,8 @@ def main() -> None:
     axes[-1].legend(*axes[0].get_legend_handles_labels(), loc="center")
     figure.supxlabel("time [s]")
     figure.supylabel("force on the blade, centred mean over 0.25 s [N]")
-    figure.savefig(HERE / "histories.png", dpi=100)
-    with (HERE / "table.csv").open("w", newline="") as stream:
+    figure.savefig(HERE / f"histories{suffix}.png", dpi=100)
+    with (HERE / f"table{suffix}.csv").open("w", newline="") as stream:
         writer = csv.DictWriter(stream, rows[0])
         writer.writeheader()
         writer.writerows(rows)
