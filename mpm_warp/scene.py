@@ -190,6 +190,17 @@ class Scene:
             raise SceneError(f"scene.contact_margin is {self.contact_margin} grid spacings; allowed: -1 to 1")
         if not 0.0 < self.courant <= 1.0:
             raise SceneError(f"scene.courant is {self.courant}; allowed: above 0, at most 1")
+        for name in ("elastic_damping", "volume_averaging"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise SceneError(f"scene.{name} is {getattr(self, name)}; allowed: 0 to 1")
+        if not 0.0 <= self.remap_time < math.inf:
+            raise SceneError(f"scene.remap_time is {self.remap_time} s; it must be 0 (every step) or more")
+        if not 0.0 < self.remap_distance <= 0.5:
+            raise SceneError(
+                f"scene.remap_distance is {self.remap_distance} grid spacings; allowed: above 0, at most 0.5"
+            )
+        if not 0.0 < self.velocity_memory < math.inf:
+            raise SceneError(f"scene.velocity_memory is {self.velocity_memory} s; it must be above 0")
 
     # --- what a solver or a rollout asks of a scene -------------------------------------------------------
 

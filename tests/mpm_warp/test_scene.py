@@ -85,6 +85,11 @@ def test_recorded_particles_are_one_of_every_few():
         ({"gravity": -1.0}, "scene.gravity"),
         ({"duration": 0.0}, "scene.duration"),
         ({"courant": 1.5}, "scene.courant is 1.5; allowed"),
+        ({"elastic_damping": -0.1}, "scene.elastic_damping is -0.1; allowed"),
+        ({"volume_averaging": 1.5}, "scene.volume_averaging is 1.5; allowed"),
+        ({"remap_time": -1.0}, "scene.remap_time is -1.0 s"),
+        ({"remap_distance": 0.0}, "scene.remap_distance is 0.0 grid spacings; allowed"),
+        ({"velocity_memory": 0.0}, "scene.velocity_memory is 0.0 s"),
         ({"body_grid": (0, 5)}, "scene.body_grid"),
         ({"contact_margin": 2.0}, "scene.contact_margin"),
         (
