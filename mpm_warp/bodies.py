@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +18,7 @@ from .mesh_file import closed_mesh, read_mesh
 __all__ = ["Body", "Box", "Cylinder", "MeshBody", "Plate"]
 
 
-class Body:
+class Body(ABC):
     """What a solver asks of any body. The body frame's origin is its centre of mass."""
 
     surface: ClassVar[str]
@@ -25,9 +26,9 @@ class Body:
     friction: float
 
     @property
+    @abstractmethod
     def half_size(self) -> np.ndarray:
         """Half the sides of the box around it, aligned with the body's axes and its origin [m], shape (3,)."""
-        raise NotImplementedError
 
     @property
     def half_thickness(self) -> float:
@@ -39,13 +40,13 @@ class Body:
         """Radius of a sphere around the origin that holds it [m]."""
         return float(np.linalg.norm(self.half_size))
 
+    @abstractmethod
     def points(self) -> np.ndarray:
         """Body nodes in the body frame [m], shape (M, 3)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def outline(self) -> np.ndarray:
         """Points of the surface, body frame [m], shape (k, 3): where it can touch a wall first."""
-        raise NotImplementedError
 
     def warnings(self) -> list[str]:
         """What a user should know about it."""

@@ -40,9 +40,10 @@ def test_a_plate_that_moves_through_resting_soil_leaks():
     np.testing.assert_array_equal(leaked(frames, PLATE), [-1, 0])
 
 
-@pytest.mark.parametrize(("cells", "margin"), [(2.0, -0.75), (1.5, -0.75), (1.0, -0.75), (0.5, -0.5)])
+@pytest.mark.parametrize(("cells", "margin"), [(2.0, -0.75), (1.5, -0.5), (1.5, -0.25), (0.5, -0.25)])
 def test_plates_do_not_leak(cells, margin):
-    """A plate goes down 4 cm and then 10 cm forward: nothing comes through, more than a cell from its edges."""
+    """A plate goes down 4 cm and then 10 cm forward: nothing comes through more than half a cell from its edges, and at
+    the default margin nothing at all."""
     rows = [(0.0, 0.104, 0.105), (0.2, 0.104, 0.06), (0.7, 0.204, 0.06)]
     scene = cut(
         blade=Plate(length=0.2, width=0.193, thickness=cells * 0.02),
@@ -54,4 +55,4 @@ def test_plates_do_not_leak(cells, margin):
     )
     frames = list(Solver(scene).frames())
     assert -np.mean([f.force[0] for f in frames[40:]]) > 20.0
-    assert leakage(frames, scene.body, edge=0.02) == 0.0
+    assert leakage(frames, scene.body, edge=0.01 if margin < cut().contact_margin else 0.0) == 0.0

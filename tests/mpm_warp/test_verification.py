@@ -20,8 +20,8 @@ from mpm_warp import Bed, Material, Plate, Solver
 @pytest.mark.parametrize("kind", ["compression", "shear"])
 @pytest.mark.parametrize("particles_per_cell", [1, 8])
 def test_elastic_waves_converge_with_second_order(kind, particles_per_cell):
-    coarse, fine = (waves.error_after_a_period(kind, cells, particles_per_cell) for cells in (12, 24))
-    assert fine < 0.045
+    coarse, fine = (waves.error_after_a_period(kind, cells, particles_per_cell) for cells in (16, 32))
+    assert fine < 0.03
     assert math.log2(coarse / fine) > 1.8
 
 
