@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sgns.learning.graph import complete_graph
+from sgns.learning.graph import edge_indices
 from sgns.learning.network import MLP, EncodeProcessDecode, InteractionNetwork
 
 
@@ -24,7 +24,7 @@ def by_hand(mlp: MLP, x: np.ndarray) -> np.ndarray:
 def test_one_step_by_hand(residual: bool) -> None:
     torch.manual_seed(1)
     step = InteractionNetwork(5, 7, 2, residual=residual).double()
-    nodes, edges, index = torch.randn(4, 5).double(), torch.randn(12, 5).double(), complete_graph(4)
+    nodes, edges, index = torch.randn(4, 5).double(), torch.randn(12, 5).double(), edge_indices(3, 1)
     found_nodes, found_edges = step(nodes, edges, index)
 
     v, e = nodes.numpy(), edges.numpy()
@@ -40,7 +40,7 @@ def test_one_step_by_hand(residual: bool) -> None:
 def test_gradients_are_those_of_the_plain_concatenation() -> None:
     torch.manual_seed(2)
     step = InteractionNetwork(5, 7, 2).double()
-    nodes, edges, index = torch.randn(3, 4, 5).double(), torch.randn(3, 12, 5).double(), complete_graph(4)
+    nodes, edges, index = torch.randn(3, 4, 5).double(), torch.randn(3, 12, 5).double(), edge_indices(3, 1)
     step(nodes, edges, index)[0].square().sum().backward()
     split = [p.grad.clone() for p in step.parameters()]
     step.zero_grad()
@@ -55,7 +55,7 @@ def test_gradients_are_those_of_the_plain_concatenation() -> None:
 def test_a_batch_is_its_graphs_one_by_one() -> None:
     torch.manual_seed(3)
     network = EncodeProcessDecode(6, 4, 9, hidden=16, steps=2, layer_norm=True, residual=True).double()
-    nodes, edges, index = torch.randn(3, 5, 6).double(), torch.randn(3, 20, 4).double(), complete_graph(5)
+    nodes, edges, index = torch.randn(3, 5, 6).double(), torch.randn(3, 20, 4).double(), edge_indices(4, 1)
     together = network(nodes, edges, index)
     alone = torch.stack([network(n, e, index) for n, e in zip(nodes, edges, strict=True)])
     torch.testing.assert_close(together, alone)
@@ -64,7 +64,7 @@ def test_a_batch_is_its_graphs_one_by_one() -> None:
 def test_renaming_nodes_renames_the_answer() -> None:
     torch.manual_seed(4)
     network = EncodeProcessDecode(6, 4, 9, hidden=16, steps=2).double()
-    nodes, index = torch.randn(1, 5, 6).double(), complete_graph(5)
+    nodes, index = torch.randn(1, 5, 6).double(), edge_indices(4, 1)
     pair = torch.randn(5, 5, 4).double()
     order = torch.randperm(5)
     first = network(nodes, pair[index[0], index[1]][None], index)
@@ -76,7 +76,7 @@ def test_renaming_nodes_renames_the_answer() -> None:
 def test_the_order_of_edges_does_not_matter() -> None:
     torch.manual_seed(5)
     network = EncodeProcessDecode(6, 4, 9, hidden=16).double()
-    nodes, edges, index = torch.randn(1, 5, 6).double(), torch.randn(1, 20, 4).double(), complete_graph(5)
+    nodes, edges, index = torch.randn(1, 5, 6).double(), torch.randn(1, 20, 4).double(), edge_indices(4, 1)
     order = torch.randperm(20)
     torch.testing.assert_close(network(nodes, edges, index), network(nodes, edges[:, order], index[:, order]))
 
