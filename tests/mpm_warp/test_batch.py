@@ -21,7 +21,7 @@ from mpm_warp import (
     Wheel,
     frames_together,
 )
-from mpm_warp.streams import in_turns, on_host
+from mpm_warp.batch import all_together
 
 needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
 
@@ -87,44 +87,6 @@ def test_scenes_that_fail_leave_the_others():
     assert len(whole) == sound.frame_count
 
 
-def test_turns_go_round_and_the_next_begins_when_one_ends():
-    log = []
-
-    def task(name, turns):
-        log.append(f"{name} begins")
-        for turn in range(turns):
-            yield turn or None
-        log.append(f"{name} ends")
-
-    given = list(in_turns((task(name, turns) for name, turns in [("a", 3), ("b", 2), ("c", 3)]), 2, "cpu"))
-    assert given == [(0, 1), (1, 1), (0, 2), (2, 1), (2, 2)]
-    assert log == ["a begins", "b begins", "b ends", "a ends", "c begins", "c ends"]
-
-
-def test_when_one_breaks_the_others_are_closed():
-    closed = []
-
-    def waits(name):
-        try:
-            while True:
-                yield name
-        finally:
-            closed.append(name)
-
-    def breaks():
-        yield
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        list(in_turns([waits("a"), breaks(), waits("b")], 3, "cpu"))
-    assert sorted(closed) == ["a", "b"]
-
-
-def test_unknown_device():
-    with pytest.raises(SceneError, match="device is 'tpu'; allowed here: cpu"):
-        list(in_turns([], 2, "tpu"))
-
-
 @needs_cuda
 def test_many_scenes_on_cuda_agree_with_the_cpu():
     scenes = [cut(duration=0.15, depth=depth) for depth in np.linspace(0.02, 0.06, 9)]
@@ -134,26 +96,3 @@ def test_many_scenes_on_cuda_agree_with_the_cpu():
         one, two = frames[-1], list(Solver(scene).frames())[-1]
         np.testing.assert_allclose(one.force, two.force, atol=0.01 * np.linalg.norm(two.force))
         assert np.abs(one.position - two.position).max() < 1e-4
-
-
-@wp.kernel
-def busy(end: wp.array(dtype=float)):
-    number = end[0]
-    for _ in range(30_000_000):
-        number = wp.sin(number + 1.0)
-    end[0] = number
-
-
-@needs_cuda
-def test_reading_does_not_wait_for_other_streams():
-    end, number = (wp.full(1, 3.0, dtype=float, device="cuda") for _ in range(2))
-    wp.load_module(busy.module, device="cuda")
-    one, two = wp.Stream("cuda"), wp.Stream("cuda")
-    wp.synchronize_device("cuda")
-    with wp.ScopedStream(one, sync_enter=False):
-        wp.launch(busy, 1, [end], device="cuda")
-    with wp.ScopedStream(two, sync_enter=False):
-        assert on_host(number)[0] == 3.0
-    assert not one.is_complete
-    wp.synchronize_stream(one)
-    assert end.numpy()[0] != 3.0
