@@ -41,11 +41,6 @@ class SceneKernel:
         return self._kernel("", arguments, f"one_item(wp.tid(), {', '.join(self._types)})")
 
     @cached_property
-    def row(self) -> Any:
-        """Struct of one scene's arguments."""
-        return wp.struct(type(f"{self.name}_arguments", (), {"__annotations__": self._types}))
-
-    @cached_property
     def together(self) -> wp.Kernel:
         """Over (scenes, items); `counts` are the scenes' items, and a scene with no more than `step` steps to do is
         left as it is."""
@@ -57,6 +52,12 @@ class SceneKernel:
             f"    one_item(i, {', '.join(f'table[s].{name}' for name in self._types)})",
         )
 
+    @property
+    def row(self) -> Any:
+        """Struct of one scene's arguments in the table of `together`."""
+        # Not the one made below: where Warp has met the same text and types before, it gives the kernel it made then.
+        return self.together.adj.arg_types["table"].dtype
+
     def _kernel(self, ending: str, arguments: str, *lines: str) -> wp.Kernel:
         # Warp translates a kernel's text. This one stands in no file, so Python has to be told of it.
         name = self.name + ending
@@ -65,7 +66,7 @@ class SceneKernel:
         linecache.cache[file] = len(text), None, text.splitlines(keepends=True), file
         names = {"wp": wp, "one_item": self._function, "types": self._types, "__name__": self._body.__module__}
         if ending:
-            names["row"] = self.row
+            names["row"] = wp.struct(type(f"{self.name}_row", (), {"__annotations__": self._types}))
         exec(compile(text, file, "exec"), names)
         function: Any = names[name]
         function.__qualname__ = self._body.__qualname__ + ending
@@ -111,12 +112,13 @@ class Together:
     def __init__(self, launches: Sequence[Launch], steps: wp.array) -> None:
         self._launches = launches  # they hold the arrays that the table points to
         kernel, device, rows = launches[0].kernel, launches[0].device, []
+        row = kernel.row
         for launch in launches:
-            rows.append(kernel.row())
-            for name, value in zip(kernel.row.vars, launch.arguments, strict=True):
+            rows.append(row())
+            for name, value in zip(row.vars, launch.arguments, strict=True):
                 setattr(rows[-1], name, value)
         counts = [launch.count for launch in launches]
-        table = wp.array(rows, dtype=kernel.row, device=device), wp.array(counts, dtype=int, device=device)
+        table = wp.array(rows, dtype=row, device=device), wp.array(counts, dtype=int, device=device)
         self._recorded = wp.launch(
             kernel.together,
             (len(launches), max(counts)),

@@ -38,7 +38,7 @@ from mpm_warp.start import start_warp
 start_warp()
 print("ready", flush=True)
 input()
-kernel = grid_step(wp.float32, ("no_slip",) * 3).step
+kernel = grid_step(wp.float32, ("no_slip",) * 3).step.alone
 wp.load_module(kernel.module, device="cpu")
 print("done")
 """
