@@ -44,7 +44,12 @@ def images(real: type) -> SimpleNamespace:
 
     @scene_kernel()
     def fold(
-        row: int, nodes: wp.array(dtype=vec4), pairs: wp.array(dtype=wp.vec2i), sign: vec4, stride: int, extent: int
+        row: int,
+        nodes: wp.array(dtype=vec4),
+        pairs: wp.array(dtype=wp.vec2i),
+        sign: vec4,
+        stride: int,
+        extent: int,
     ):
         """Add ghost layers to their images; `sign` mirrors a node's momentum, `stride` and `extent` are the axis'."""
         for q in range(pairs.shape[0]):
@@ -57,7 +62,12 @@ def images(real: type) -> SimpleNamespace:
 
     @scene_kernel()
     def unfold(
-        row: int, velocity: wp.array(dtype=vec4), pairs: wp.array(dtype=wp.vec2i), sign: vec4, stride: int, extent: int
+        row: int,
+        velocity: wp.array(dtype=vec4),
+        pairs: wp.array(dtype=wp.vec2i),
+        sign: vec4,
+        stride: int,
+        extent: int,
     ):
         """Give ghost layers the velocity of their images."""
         for q in range(pairs.shape[0]):

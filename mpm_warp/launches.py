@@ -64,7 +64,8 @@ class SceneKernel:
         text = "\n    ".join((f"def {name}({arguments}):", *lines)) + "\n"
         file = f"<{self._body.__module__}.{self._body.__qualname__}{ending} {id(self)}>"
         linecache.cache[file] = len(text), None, text.splitlines(keepends=True), file
-        names = {"wp": wp, "one_item": self._function, "types": self._types, "__name__": self._body.__module__}
+        names: dict[str, Any] = {"wp": wp, "one_item": self._function, "types": self._types}
+        names["__name__"] = self._body.__module__
         if ending:
             names["row"] = wp.struct(type(f"{self.name}_row", (), {"__annotations__": self._types}))
         exec(compile(text, file, "exec"), names)

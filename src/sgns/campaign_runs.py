@@ -312,8 +312,8 @@ def _make(
     device: str,
     precision: str,
 ) -> Generator[tuple[str, str] | Work, None, None]:
-    """Make one run unless another process does, passing on the work for the device; gives made, elsewhere or failed, and
-    what went wrong in words."""
+    """Make one run unless another process does, passing on the work for the device; gives made, elsewhere or failed,
+    and what went wrong in words."""
 
     def count_frame() -> None:
         _frames_done[index] += 1

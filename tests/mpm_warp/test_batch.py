@@ -94,8 +94,15 @@ def test_every_effect_knows_its_own_scene(effects):
 
 
 def test_periodic_bins_keep_their_own_length():
-    scenes = [Incline(bed=Bed(size=(length, 0.06, 0.05), spacing=0.01, walls=Walls(x="periodic", y="periodic")),
-                      tilt=40.0, flowing=True, duration=0.05) for length in (0.06, 0.1)]
+    scenes = [
+        Incline(
+            bed=Bed(size=(length, 0.06, 0.05), spacing=0.01, walls=Walls(x="periodic", y="periodic")),
+            tilt=40.0,
+            flowing=True,
+            duration=0.05,
+        )
+        for length in (0.06, 0.1)
+    ]
     for scene, frames in zip(scenes, by_scene(frames_together(scenes)), strict=True):
         assert_same(frames[-1], list(Solver(scene).frames())[-1])
 
@@ -157,7 +164,9 @@ def test_tasks_go_side_by_side_and_the_next_begins_when_one_ends():
             yield name, turn
         log.append(f"{name} ends")
 
-    given = list(all_together((task(name, turns) for name, turns in [("a", 2), ("b", 1), ("c", 2)]), 2, "cpu"))
+    given = list(
+        all_together((task(name, turns) for name, turns in [("a", 2), ("b", 1), ("c", 2)]), 2, "cpu")
+    )
     assert given == [(0, ("a", 0)), (1, ("b", 0)), (0, ("a", 1)), (2, ("c", 0)), (2, ("c", 1))]
     assert log == ["a begins", "b begins", "b ends", "c begins", "a ends", "c ends"]
 

@@ -101,7 +101,7 @@ def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
 
 
 def test_scenes_side_by_side_share_the_time_that_passes(tmp_path):
-    scenes, begin = list(campaign(tmp_path, runs=2).scenes.values()), time.perf_counter()
+    scenes, begin = list(campaign(tmp_path).scenes.values())[:2], time.perf_counter()
     stages = [scene_stages(scene, tmp_path / f"{n}.h5", effects=Effects()) for n, scene in enumerate(scenes)]
     timings = dict(all_together(stages, 2, "cpu"))
     passed = time.perf_counter() - begin
