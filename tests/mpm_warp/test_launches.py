@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 import warp as wp
 
+from mpm_warp import Effects
+from mpm_warp.contact import ContactLaw
+from mpm_warp.grid import grid_step
 from mpm_warp.launches import Launch, scene_kernel
 from mpm_warp.start import find_device
+from mpm_warp.transfer import transfer
 from mpm_warp.work import Program, Work, Worker
 
 
@@ -76,3 +80,17 @@ def test_programs_of_other_kernels_are_done_apart():
     Worker(find_device("cpu")).do(works)
     assert to.numpy()[0] == 12.0
     assert [work.shared_by for work in works] == [2, 2]
+
+
+def test_kernels_compile_for_a_gpu(tmp_path):
+    """Also where there is none: Warp brings CUDA's compiler."""
+    find_device("cpu")
+    if not (targets := wp.get_cuda_supported_archs()):
+        pytest.skip("this Warp was built without CUDA")
+    everything = Effects(fluidity=True, nonlocality=True)
+    particles = transfer(wp.float32, everything, ContactLaw(free=True), atomic=True)
+    nodes = grid_step(wp.float32, ("no_slip",) * 3)
+    kernels = [*vars(particles).values(), *vars(nodes).values()]
+    for kernel in kernels:
+        wp.compile_aot_module(kernel.together.module, arch=targets[0], module_dir=tmp_path, use_ptx=True)
+    assert len(list(tmp_path.glob("*.ptx"))) == len(kernels) == 7
