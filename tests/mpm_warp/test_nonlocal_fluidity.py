@@ -441,7 +441,7 @@ def test_separated_soil_has_no_part_in_it():
 def test_what_is_off_costs_nothing():
     """No array and no instruction of an effect that is off; its arrays when it is on."""
     plain, fluid = Solver(cut(duration=0.05)), Solver(cut(duration=0.05), DYNAMIC)
-    assert [launch.kernel.func.__name__ for launch in launches(plain)] == [
+    assert [launch.kernel.name for launch in launches(plain)] == [
         "to_grid", "begin", "scatter", "step", "gather", "material", "from_grid"
     ]  # fmt: skip
     assert len(fluid._step) > len(plain._step)
@@ -464,8 +464,9 @@ def launches(solver):
 
 def compiled_source(launch):
     """What Warp compiled for a kernel with a module of its own, from its cache."""
+    launch.load()
     (newest, *_) = sorted(
-        Path(wp.config.kernel_cache_dir).glob(f"wp_{launch.kernel.module.name}_*/*.cpp"),
+        Path(wp.config.kernel_cache_dir).glob(f"wp_{launch.kernel.alone.module.name}_*/*.cpp"),
         key=lambda file: file.stat().st_mtime,
         reverse=True,
     )
