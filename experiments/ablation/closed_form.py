@@ -25,8 +25,7 @@ from torch import Tensor
 
 from sgns.campaign import Dataset
 from sgns.learning.body import BodyTrack
-from sgns.learning.closed_form import ClosedForm
-from sgns.learning.closed_form_fit import candidates, choose, unfitted
+from sgns.learning.closed_form_fit import candidates, choose, fit, unfitted
 from sgns.learning.data import TrainingWindows
 from sgns.learning.surrogate import load_surrogate
 from sgns.learning.validation import RolloutScore, ValidationRollouts
@@ -113,6 +112,7 @@ def scores(
     validation: ValidationRollouts,
     others: Sequence[ValidationRollouts],
     penalties: Sequence[float],
+    everything: TrainingWindows | None = None,
 ) -> Iterator[tuple[dict[str, Any], list[RolloutScore]]]:
     """Every baseline and fitted model with its scores on some rollouts.
 
@@ -121,8 +121,9 @@ def scores(
         validation: What chooses the settings.
         others: What the scores are of.
         penalties: To choose from.
+        everything: What to fit to again once the settings are chosen.
     """
-    baseline = unfitted(windows, 1)
+    baseline = unfitted(windows if everything is None else everything, 1)
     still = [rollouts.measure(baseline) for rollouts in others]
     yield {"model": "frozen, mean force"}, still
     moving = [constant_velocity(rollouts, score) for rollouts, score in zip(others, still, strict=True)]
@@ -130,7 +131,9 @@ def scores(
     for name, degree, threshold in MODELS:
         began = time.perf_counter()
         model = unfitted(windows, degree)
-        motion, force, _ = choose(model, candidates(model, windows, NOISES, penalties, threshold), validation)
+        motion, force = choose(model, candidates(model, windows, NOISES, penalties, threshold), validation)
+        if everything is not None:
+            model = fit(everything, degree, motion, force)
         yield (
             {
                 "model": name,
@@ -241,30 +244,41 @@ def rollouts_of(runs: Sequence[ReducedRun], context: Tensor) -> ValidationRollou
 def published_rows(folder: Path) -> Iterator[dict[str, Any]]:
     """All models on the authors' runs, every run predicted by the models of the fold that leaves it out.
 
-    Within a fold, every third of the other runs chooses the settings; the coefficients are of the rest of them.
+    In a fold, every third of the other runs chooses the settings for which the rest of them were fitted; then all of
+    them are fitted.
     """
     for kind, particles in PARTICLES.items():
         runs, context = published_runs(folder, kind)
-        rows: dict[tuple, dict[str, Any]] = {}
-        totals: dict[tuple, Totals] = {}
+        rows: dict[tuple[str, float], dict[str, Any]] = {}
+        totals: dict[tuple[str, float], Totals] = {}
         for fold in range(FOLDS):
-            places = [i for i in range(len(runs)) if i % FOLDS != fold]
-            groups = [places[:], places[::3], list(range(fold, len(runs), FOLDS))]
-            groups[0] = [i for i in places if i not in groups[1]]
-            training, choosing, test = (([runs[i] for i in group], context[group]) for group in groups)
+            known = [i for i in range(len(runs)) if i % FOLDS != fold]
+            choosing = known[::3]
+            training, choice, test, everything = (
+                ([runs[i] for i in group], context[group])
+                for group in (
+                    [i for i in known if i not in choosing],
+                    choosing,
+                    list(range(fold, len(runs), FOLDS)),
+                    known,
+                )
+            )
             rollouts = rollouts_of(*test)
             for about, measured in scores(
-                windows_of(*training), rollouts_of(*choosing), [rollouts], PUBLISHED_PENALTIES
+                windows_of(*training),
+                rollouts_of(*choice),
+                [rollouts],
+                PUBLISHED_PENALTIES,
+                windows_of(*everything),
             ):
                 logging.info("%s, fold %d: %s, skill %.3f", kind, fold, about, measured[0].skill)
                 key = (about["model"], about.get("threshold", 0.0))
-                # Settings differ from fold to fold; the row has what they share and the sums.
-                row = rows.setdefault(
-                    key, {"data": f"published {kind}", "num_modes": runs[0].latent.shape[1], "model": key[0]}
-                )
+                # The settings differ from fold to fold: the table has the sums.
+                row = {"data": f"published {kind}", "num_modes": runs[0].latent.shape[1], "model": key[0]}
                 if "threshold" in about:
-                    row["threshold"] = key[1]
-                    row["seconds"] = round(row.get("seconds", 0.0) + about["seconds"], 1)
+                    seconds = rows.get(key, {}).get("seconds", 0.0) + about["seconds"]
+                    row |= {"threshold": key[1], "library": about["library"], "seconds": round(seconds, 1)}
+                rows[key] = row
                 totals.setdefault(key, Totals(particles)).add(rollouts, measured[0])
         for key, row in rows.items():
             yield row | totals[key].columns("test")

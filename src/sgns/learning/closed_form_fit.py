@@ -23,7 +23,7 @@ from sgns.learning.normalisation import Standardiser
 if TYPE_CHECKING:
     from sgns.learning.validation import RolloutScore, ValidationRollouts
 
-__all__ = ["Moments", "Setting", "candidates", "choose", "moments", "ridge", "sparse", "unfitted"]
+__all__ = ["Moments", "Setting", "candidates", "choose", "fit", "moments", "ridge", "sparse", "unfitted"]
 
 # Windows whose monomials are in memory at once.
 _CHUNK = 2048
@@ -170,6 +170,13 @@ def sparse(known: Moments, penalty: float, threshold: float, rounds: int = 10) -
     return found
 
 
+def coefficients(known: Moments, setting: Setting) -> Tensor:
+    """`sparse` where the setting has a threshold, else `ridge`, shape (m, o)."""
+    if setting.threshold:
+        return sparse(known, setting.penalty, setting.threshold)
+    return ridge(known, setting.penalty)
+
+
 def candidates(
     model: ClosedForm,
     windows: TrainingWindows,
@@ -177,20 +184,19 @@ def candidates(
     penalties: Sequence[float],
     threshold: float = 0.0,
 ) -> dict[Setting, Tensor]:
-    """Coefficients for every noise and penalty; `sparse` ones where there is a threshold, else `ridge`."""
+    """Coefficients of a model for every noise and penalty."""
     found = {}
     for noise in noises:
         known = moments(model, windows, noise)
         for penalty in penalties:
-            found[Setting(noise, penalty, threshold)] = (
-                sparse(known, penalty, threshold) if threshold else ridge(known, penalty)
-            )
+            setting = Setting(noise, penalty, threshold)
+            found[setting] = coefficients(known, setting)
     return found
 
 
 def choose(
     model: ClosedForm, found: Mapping[Setting, Tensor], rollouts: ValidationRollouts
-) -> tuple[Setting, Setting, RolloutScore]:
+) -> tuple[Setting, Setting]:
     """Give a model the best coefficients: of the modes by the skill of rollouts, then of force and torque by the
     force error along the rollouts of these modes.
 
@@ -200,14 +206,28 @@ def choose(
         rollouts: Of the validation runs.
 
     Returns:
-        The setting of the modes, that of force and torque, and the score of both together.
+        The setting of the modes, and that of force and torque.
     """
-    modes = 3 * model.num_modes
 
     def score(motion: Setting, force: Setting) -> RolloutScore:
-        model.weights.copy_(torch.cat([found[motion][:, :modes], found[force][:, modes:]], dim=1))
+        take(model, found[motion], found[force])
         return rollouts.measure(model)  # type: ignore[arg-type]
 
     motion = max(found, key=lambda setting: score(setting, setting).skill)
     force = min(found, key=lambda setting: score(motion, setting).force_nrmse)
-    return motion, force, score(motion, force)
+    take(model, found[motion], found[force])
+    return motion, force
+
+
+def fit(windows: TrainingWindows, degree: int, motion: Setting, force: Setting) -> ClosedForm:
+    """A model of known settings, for instance those that `choose` found on a part of the runs."""
+    model = unfitted(windows, degree)
+    parts = [coefficients(moments(model, windows, setting.noise), setting) for setting in (motion, force)]
+    take(model, *parts)
+    return model
+
+
+def take(model: ClosedForm, motion: Tensor, force: Tensor) -> None:
+    """Coefficients of the modes from one matrix, those of force and torque from another."""
+    modes = 3 * model.num_modes
+    model.weights.copy_(torch.cat([motion[:, :modes], force[:, modes:]], dim=1))
