@@ -25,7 +25,7 @@ from torch import Tensor
 
 from sgns.campaign import Dataset
 from sgns.learning.body import BodyTrack
-from sgns.learning.closed_form_fit import candidates, choose, fit, unfitted
+from sgns.learning.closed_form_fit import candidates, choose, fit, moments, unfitted
 from sgns.learning.data import TrainingWindows
 from sgns.learning.surrogate import load_surrogate
 from sgns.learning.validation import RolloutScore, ValidationRollouts
@@ -34,18 +34,13 @@ from sgns.reduction.reduced import ReducedRun, reduce_dataset
 
 HERE = Path(__file__).parent
 HISTORY = 3  # d, as in conf/model
+NUM_MODES = (2, 4, 8)
 NOISES = (0.1, 0.3, 1.0)
-# Name, degree and threshold of the models that are fitted.
-MODELS = (
-    ("linear ridge", 1, 0.0),
-    ("quadratic ridge", 2, 0.0),
-    ("sparse quadratic", 2, 0.01),
-    ("sparse quadratic", 2, 0.03),
-    ("sparse quadratic", 2, 0.1),
-)
-OWN_PENALTIES = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
-# A third of the runs, and noisier forces: larger penalties, too; coarser, because there are four folds.
-PUBLISHED_PENALTIES = (1e-3, 1e-2, 1e-1, 1.0)
+PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+THRESHOLDS = (0.01, 0.03, 0.1)
+# Degree and thresholds; a threshold of zero means ridge regression.
+MODELS = ((1, (0.0,)), (2, (0.0, *THRESHOLDS)))
+RIDGE = ((1, (0.0,)), (2, (0.0,)))
 
 FOLDS = 4
 # Soil particles of the published bases (which are not published themselves).
@@ -111,7 +106,7 @@ def scores(
     windows: TrainingWindows,
     validation: ValidationRollouts,
     others: Sequence[ValidationRollouts],
-    penalties: Sequence[float],
+    models: Sequence[tuple[int, Sequence[float]]],
     everything: TrainingWindows | None = None,
 ) -> Iterator[tuple[dict[str, Any], list[RolloutScore]]]:
     """Every baseline and fitted model with its scores on some rollouts.
@@ -120,34 +115,35 @@ def scores(
         windows: What to fit to.
         validation: What chooses the settings.
         others: What the scores are of.
-        penalties: To choose from.
+        models: Degrees and thresholds.
         everything: What to fit to again once the settings are chosen.
     """
-    baseline = unfitted(windows if everything is None else everything, 1)
+    baseline = unfitted(everything or windows, 1)
     still = [rollouts.measure(baseline) for rollouts in others]
     yield {"model": "frozen, mean force"}, still
     moving = [constant_velocity(rollouts, score) for rollouts, score in zip(others, still, strict=True)]
     yield {"model": "constant velocity, mean force"}, moving
-    for name, degree, threshold in MODELS:
+    for degree, thresholds in models:
         began = time.perf_counter()
         model = unfitted(windows, degree)
-        motion, force = choose(model, candidates(model, windows, NOISES, penalties, threshold), validation)
-        if everything is not None:
-            model = fit(everything, degree, motion, force)
-        yield (
-            {
-                "model": name,
+        known = {noise: moments(model, windows, noise) for noise in NOISES}
+        shared = time.perf_counter() - began
+        for threshold in thresholds:
+            began = time.perf_counter()
+            motion, force = choose(model, candidates(known, PENALTIES, threshold), validation)
+            chosen = fit(everything, degree, motion, force) if everything else model
+            about = {
+                "model": ("linear", "quadratic")[degree - 1] + (", sparse" if threshold else " ridge"),
                 "threshold": threshold,
                 "noise": motion.noise,
                 "penalty": motion.penalty,
                 "force_noise": force.noise,
                 "force_penalty": force.penalty,
-                "library": len(model.terms),
-                "terms": model.num_terms,
-                "seconds": round(time.perf_counter() - began, 1),
-            },
-            [rollouts.measure(model) for rollouts in others],
-        )
+                "library": len(chosen.terms),
+                "terms": chosen.num_terms,
+                "seconds": round(shared + time.perf_counter() - began, 1),
+            }
+            yield about, [rollouts.measure(chosen) for rollouts in others]
 
 
 def own_rows(overrides: Sequence[str], checkpoint: Path | None) -> Iterator[dict[str, Any]]:
@@ -156,11 +152,11 @@ def own_rows(overrides: Sequence[str], checkpoint: Path | None) -> Iterator[dict
         config = compose("train", list(overrides))
     reduced = reduce_dataset(Dataset.open(config.dataset.path), config.reduction)
     network = None if checkpoint is None else load_surrogate(checkpoint).dynamics
-    for r in (2, 4, 8):
+    for r in NUM_MODES:
         splits = ("validation", "test")
         rollouts = [ValidationRollouts(reduced.runs(split), r, HISTORY, "pose") for split in splits]
         windows = TrainingWindows(reduced.runs("train"), r, HISTORY, "pose")
-        found = list(scores(windows, rollouts[0], rollouts, OWN_PENALTIES))
+        found = list(scores(windows, rollouts[0], rollouts, MODELS))
         if network is not None and (network.num_modes, network.history) == (r, HISTORY):
             found.append(({"model": "network"}, [one.measure(network) for one in rollouts]))
         for about, measured in found:
@@ -268,7 +264,7 @@ def published_rows(folder: Path) -> Iterator[dict[str, Any]]:
                 windows_of(*training),
                 rollouts_of(*choice),
                 [rollouts],
-                PUBLISHED_PENALTIES,
+                RIDGE,
                 windows_of(*everything),
             ):
                 logging.info("%s, fold %d: %s, skill %.3f", kind, fold, about, measured[0].skill)

@@ -95,7 +95,7 @@ def joined(parts: Sequence[Standardiser]) -> Standardiser:
     return Standardiser(torch.cat([p.mean for p in parts]), torch.cat([p.scale for p in parts]))
 
 
-def moments(model: ClosedForm, windows: TrainingWindows, noise: float = 0.0, draws: int = 4) -> Moments:
+def moments(model: ClosedForm, windows: TrainingWindows, noise: float = 0.0, draws: int = 2) -> Moments:
     """Moments of a model's monomials and outputs; its coefficients do not matter.
 
     Args:
@@ -178,20 +178,17 @@ def coefficients(known: Moments, setting: Setting) -> Tensor:
 
 
 def candidates(
-    model: ClosedForm,
-    windows: TrainingWindows,
-    noises: Sequence[float],
-    penalties: Sequence[float],
-    threshold: float = 0.0,
+    known: Mapping[float, Moments], penalties: Sequence[float], threshold: float = 0.0
 ) -> dict[Setting, Tensor]:
-    """Coefficients of a model for every noise and penalty."""
-    found = {}
-    for noise in noises:
-        known = moments(model, windows, noise)
-        for penalty in penalties:
-            setting = Setting(noise, penalty, threshold)
-            found[setting] = coefficients(known, setting)
-    return found
+    """Coefficients for every penalty and noise.
+
+    Args:
+        known: Moments of one model by noise.
+        penalties: As in `Setting`.
+        threshold: As in `Setting`.
+    """
+    settings = [Setting(noise, penalty, threshold) for noise in known for penalty in penalties]
+    return {setting: coefficients(known[setting.noise], setting) for setting in settings}
 
 
 def choose(
@@ -222,8 +219,8 @@ def choose(
 def fit(windows: TrainingWindows, degree: int, motion: Setting, force: Setting) -> ClosedForm:
     """A model of known settings, for instance those that `choose` found on a part of the runs."""
     model = unfitted(windows, degree)
-    parts = [coefficients(moments(model, windows, setting.noise), setting) for setting in (motion, force)]
-    take(model, *parts)
+    known = {noise: moments(model, windows, noise) for noise in {motion.noise, force.noise}}
+    take(model, *(coefficients(known[setting.noise], setting) for setting in (motion, force)))
     return model
 
 
