@@ -27,22 +27,18 @@ class Graph(NamedTuple):
     edge_index: Tensor
 
 
-def complete_graph(node_count: int, device: torch.device | str = "cpu", self_loops: bool = False) -> Tensor:
-    """Every ordered pair of nodes, receivers ascending, then senders.
+def complete_graph(node_count: int, device: torch.device | str = "cpu") -> Tensor:
+    """Every ordered pair of different nodes, receivers ascending.
 
     Args:
         node_count: V.
         device: Where the indices live.
-        self_loops: Whether a node is also paired with itself.
 
     Returns:
-        Senders in row 0 and receivers in row 1 (PyG's order), int64, shape (2, E) with E = V (V - 1), or V² with
-        self loops.
+        Senders in row 0 and receivers in row 1 (PyG's order), int64, shape (2, V (V - 1)).
     """
     index = torch.arange(node_count, device=device)
     receiver, sender = torch.meshgrid(index, index, indexing="ij")
-    if self_loops:
-        return torch.stack([sender.flatten(), receiver.flatten()])
     keep = receiver != sender
     return torch.stack([sender[keep], receiver[keep]])
 

@@ -11,8 +11,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sgns.learning.graph import complete_graph
-
 __all__ = ["CompletePairs", "IndexedPairs", "Pairs", "pairs_of"]
 
 
@@ -135,11 +133,11 @@ class IndexedPairs:
 
 
 def pairs_of(edge_index: Tensor, node_count: int) -> Pairs:
-    """The quickest form of these edges."""
+    """The quickest form of these edges; they are those of a complete graph only in its order."""
+    index = torch.arange(node_count, device=edge_index.device)
+    receiver, sender = torch.meshgrid(index, index, indexing="ij")
     for self_loops in (False, True):
-        count = node_count * (node_count - (not self_loops))
-        if edge_index.shape[1] == count > 0 and torch.equal(
-            edge_index, complete_graph(node_count, edge_index.device, self_loops)
-        ):
+        keep = (receiver != sender) | self_loops
+        if node_count > 1 and torch.equal(edge_index, torch.stack([sender[keep], receiver[keep]])):
             return CompletePairs(node_count, self_loops)
     return IndexedPairs(edge_index, node_count)

@@ -13,11 +13,6 @@ def test_every_ordered_pair_of_different_nodes_is_an_edge_once() -> None:
     assert {(s, r) for s, r in edges} == {(s, r) for s in range(5) for r in range(5) if s != r}
 
 
-def test_self_loops_complete_the_square() -> None:
-    edges = complete_graph(4, self_loops=True).T.tolist()
-    assert edges == [[s, r] for r in range(4) for s in range(4)]
-
-
 def test_one_node_has_no_edges() -> None:
     assert complete_graph(1).shape == (2, 0)
 

@@ -40,7 +40,7 @@ def test_one_step_by_hand(residual: bool) -> None:
 
 EDGES = {
     "complete": complete_graph,
-    "self_loops": lambda v: complete_graph(v, self_loops=True),
+    "self_loops": with_self_loops,
     # In no order, with a node that receives nothing.
     "sparse": lambda v: complete_graph(v)[:, torch.randperm(v * (v - 1))][:, : 2 * v].clamp(max=v - 2),
 }
