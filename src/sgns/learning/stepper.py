@@ -122,16 +122,17 @@ class GraphStepper:
             return [*hidden_layers(encode, encode.linears[:-1], rows), Layer(*joined, rows)]
 
         self.encode_edges = layers(count)
-        changing = (edge_index < modes).any(0)
-        self.changing = changing.nonzero().flatten()
-        self.encode_changing = layers(len(self.changing)) if len(self.changing) < count else []
         self.update_edges = hidden_layers(update, update.linears[1:-1], count)
-        self.own = own.new_empty(count, self.width)
-        self.spread = torch.empty_like(self.own)
-        self.has_kept = False
+        self.spread = own.new_empty(count, self.width)
+        self.modes = modes
+        self.kept: Tensor | None = None
         if isinstance(self.pairs, CompletePairs):
             self.by_receiver = self.pairs.by_receiver(self.spread[None])[0]
             self.by_turn = self.pairs.by_turn(self.spread[None])[0]
+            self.within_body = self.by_receiver[modes:, modes:].shape[:2].numel()
+            changing = (edge_index < modes).any(0)
+            self.changing = changing.nonzero().flatten()
+            self.encode_changing = layers(len(self.changing))
 
     def __call__(self, nodes: Tensor, edges: Tensor, same_body: bool = False) -> Tensor:
         """Decoded quantities of every node, shape (V, outputs); overwritten by the next call.
@@ -145,8 +146,7 @@ class GraphStepper:
             nodes = layer(nodes)
         projected = self.project(nodes)
         receiver, sender, kept = projected.split(self.width, 1)
-        messages = self.add_nodes(self.encoded(edges, same_body), receiver, sender)
-        messages = self.activate(messages)
+        messages = self.activate(self.first_of_edges(edges, receiver, sender, same_body))
         for layer in self.update_edges:
             messages = layer(messages)
         kept = kept + self.update_bias
@@ -160,25 +160,35 @@ class GraphStepper:
         """The activation, in place where it can be."""
         return x.relu_() if isinstance(self.activation, nn.ReLU) else self.activation(x)
 
-    def encoded(self, edges: Tensor, same_body: bool) -> Tensor:
-        """The edges' own share of the first layer of their update, shape (E, H)."""
-        if not self.encode_changing:
-            return through(self.encode_edges, edges)
-        if same_body and self.has_kept:
-            changed = through(self.encode_changing, edges.index_select(0, self.changing))
-            return self.own.index_copy_(0, self.changing, changed)
-        self.has_kept = True
-        return self.own.copy_(through(self.encode_edges, edges))
-
-    def add_nodes(self, own: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
+    def first_of_edges(self, edges: Tensor, receiver: Tensor, sender: Tensor, same_body: bool) -> Tensor:
         """The first layer of the edge update before its activation, shape (E, H)."""
         pairs = self.pairs
-        if isinstance(pairs, CompletePairs):
-            torch.add(own.view_as(self.by_receiver), receiver[:, None], out=self.by_receiver)
-            self.by_turn.add_(pairs.senders(sender[None])[0])
-            return self.spread
-        torch.index_select(receiver, 0, pairs.receiver, out=self.spread)
-        return self.spread.add_(own).add_(sender.index_select(0, pairs.sender))
+        if not isinstance(pairs, CompletePairs):
+            torch.index_select(receiver, 0, pairs.receiver, out=self.spread)
+            own = through(self.encode_edges, edges)
+            return self.spread.add_(own).add_(sender.index_select(0, pairs.sender))
+        if same_body and self.kept is not None:
+            self.add_receivers_beside_kept(edges, receiver)
+        else:
+            own = through(self.encode_edges, edges).view_as(self.by_receiver)
+            torch.add(own, receiver[:, None], out=self.by_receiver)
+            if self.within_body:
+                self.kept = own[self.modes :, self.modes :].clone()
+        self.by_turn.add_(pairs.senders(sender[None])[0])
+        return self.spread
+
+    def add_receivers_beside_kept(self, edges: Tensor, receiver: Tensor) -> None:
+        """Fill `spread` with own shares and receivers', computing those of the edges outside the body only.
+
+        In the order of a complete graph these are all edges to modes, then those from modes to each body node.
+        """
+        r = self.modes
+        to_modes, to_body = self.by_receiver[:r], self.by_receiver[r:]
+        changed = through(self.encode_changing, edges.index_select(0, self.changing))
+        own, from_modes = changed.split([r * self.pairs.degree, len(changed) - r * self.pairs.degree])
+        torch.add(own.view(to_modes.shape), receiver[:r, None], out=to_modes)
+        torch.add(from_modes.view(-1, r, self.width), receiver[r:, None], out=to_body[:, :r])
+        torch.add(self.kept, receiver[r:, None], out=to_body[:, r:])
 
     def gather(self, messages: Tensor) -> Tensor:
         """Sum of the edges at their receivers, shape (V, H)."""
