@@ -10,7 +10,15 @@ import numpy as np
 
 from sgns.errors import UserError
 
-__all__ = ["check_poses", "in_body_frame", "in_world_frame", "rotation_matrices", "rotation_vectors"]
+__all__ = [
+    "check_poses",
+    "fitted_poses",
+    "in_body_frame",
+    "in_world_frame",
+    "quaternions",
+    "rotation_matrices",
+    "rotation_vectors",
+]
 
 
 def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
@@ -44,6 +52,33 @@ def in_world_frame(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
 def in_body_frame(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """World points (M, 3) [m] seen from a pose (7,); shape (M, 3) [m]."""
     return (points - pose[:3]) @ rotation_matrices(pose[3:])
+
+
+def quaternions(matrices: np.ndarray) -> np.ndarray:
+    """Unit quaternions x, y, z, w of rotation matrices (..., 3, 3), with w >= 0; shape (..., 4)."""
+    m = np.asarray(matrices)
+    trace = np.trace(m, axis1=-2, axis2=-1)
+    # Four times the products of two components each; the row of the largest component is the accurate one.
+    table = np.empty((*m.shape[:-2], 4, 4))
+    table[..., :3, :3] = m + np.swapaxes(m, -1, -2)
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        table[..., i, i] = 1.0 + 2.0 * m[..., i, i] - trace
+        table[..., i, 3] = table[..., 3, i] = m[..., k, j] - m[..., j, k]
+    table[..., 3, 3] = 1.0 + trace
+    best = np.argmax(np.diagonal(table, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(table, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def fitted_poses(points: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """The poses (T, 7) in which body points (M, 3) [m] lie nearest to world points (T, M, 3) [m] (Kabsch 1976)."""
+    middle, there = points.mean(axis=0), world.mean(axis=1)
+    u, _, vt = np.linalg.svd(np.einsum("mi,tmj->tij", points - middle, world - there[:, None]))
+    turn = np.ones((len(world), 3))
+    turn[:, 2] = np.sign(np.linalg.det(u @ vt))
+    rotation = np.swapaxes((u * turn[:, None]) @ vt, -1, -2)
+    return np.concatenate([there - rotation @ middle, quaternions(rotation)], axis=1)
 
 
 def check_poses(poses: np.ndarray, what: str = "tool path") -> np.ndarray:

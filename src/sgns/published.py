@@ -18,10 +18,12 @@ import numpy as np
 
 from sgns.errors import UserError
 
-__all__ = ["PublishedRun", "excavation_case", "read_published", "wheel_case"]
+__all__ = ["PublishedRun", "excavation_case", "published_files", "read_published", "wheel_case"]
 
 _SUBSPACE = 6  # the particle type of a subspace node; all others are nodes of the rigid body
+_FREE = 0  # the particle type of a wheel's nodes; those of a blade, which is prescribed, are 3
 _MARGIN = 0.1  # the authors' bin starts at this coordinate on each axis [m]
+_BINS = {"excavation": (0.80, 0.60, 0.15), "wheel": (0.40, 0.19, 0.0583)}  # Lx, Ly, Lz [m]
 
 DEPTHS = (0.02, 0.04, 0.05, 0.08, 0.10)  # [m]
 SPEEDS = (0.01, 0.04, 0.08, 0.10, 0.15)  # [m/s]
@@ -44,8 +46,10 @@ ANGLES = (30.0, 37.0, 43.0)  # friction angles [degrees]
 class PublishedRun:
     """One run. T frames at 60 Hz; the file's duplicated first frame is dropped."""
 
-    case: int
-    """Number of the run among all of its kind, from 1."""
+    kind: str
+    """excavation or wheel."""
+    case: int | None
+    """Number of the run among all of its kind, from 1; None where metadata.json does not say."""
     body_points: np.ndarray
     """Nodes of the rigid body [m], shape (T, M, 3)."""
     latent: np.ndarray
@@ -77,22 +81,36 @@ def wheel_case(case: int) -> dict[str, float]:
     return found | {"width": WIDTHS[found["diameter"]]}
 
 
+def published_files(folder: str | Path) -> list[str]:
+    """Names of the splits in a folder: of every <split>.tfrecord."""
+    folder = Path(folder)
+    found = sorted(file.stem for file in folder.glob("*.tfrecord"))
+    if not found or not (folder / "metadata.json").is_file():
+        raise UserError(
+            f"{folder} does not hold published runs; it needs metadata.json and at least one <split>.tfrecord, as the "
+            "paper's authors published them"
+        )
+    return found
+
+
 def read_published(
-    folder: str | Path, bin_size: tuple[float, float, float], split: str = "valid"
+    folder: str | Path, bin_size: tuple[float, float, float] | None = None, split: str = "valid"
 ) -> list[PublishedRun]:
     """The runs of one folder with `<split>.tfrecord` and `metadata.json`.
 
     Args:
-        bin_size: Lx, Ly, Lz of the soil bin [m].
+        bin_size: Lx, Ly, Lz of the soil bin [m]; None: the authors' own.
     """
     folder = Path(folder)
     try:
         metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
-        cases = metadata["dataset_split"][split]
+        cases = metadata["dataset_split"].get(split)
         records = list(_records((folder / f"{split}.tfrecord").read_bytes()))
-    except (OSError, ValueError, KeyError, TypeError, struct.error) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, struct.error) as error:
         raise UserError(f"{folder} does not hold the published {split} runs: {error}") from None
-    if len(cases) != len(records):
+    if cases is None:
+        cases = [None] * len(records)
+    if not isinstance(cases, list) or len(cases) != len(records):
         raise UserError(
             f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {len(records)}"
         )
@@ -102,7 +120,7 @@ def read_published(
         raise UserError(f"{folder}/{split}.tfrecord is not a file of published runs: {error}") from None
 
 
-def _run(case: int, record: bytes, bin_size: tuple[float, float, float]) -> PublishedRun:
+def _run(case: int | None, record: bytes, bin_size: tuple[float, float, float] | None) -> PublishedRun:
     about, frames = _sequence_example(record)
     types = np.frombuffer(about["particle_type"], dtype="<i8")
     nodes = np.array([np.frombuffer(f, dtype="<f4") for f in frames["position"]], dtype=float)
@@ -110,11 +128,17 @@ def _run(case: int, record: bytes, bin_size: tuple[float, float, float]) -> Publ
     force = np.array([np.frombuffer(f, dtype="<f4") for f in frames["force"]], dtype=float).reshape(-1, 3)[1:]
     context = [np.frombuffer(f, dtype="<f4") for f in frames.get("step_context", [b""] * (len(nodes) + 1))]
     soil = types == _SUBSPACE
-    lx, _, lz = bin_size
+    kind = "wheel" if bool((types == _FREE).any()) else "excavation"
+    lx, _, lz = bin_size or _BINS[kind]
     x, y, z = np.moveaxis(nodes[:, ~soil], -1, 0)
     body = np.stack([_MARGIN + lx - x, z - _MARGIN, y - _MARGIN - lz], axis=-1)
     return PublishedRun(
-        case, body, nodes[:, soil], force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0], np.array(context, dtype=float)[1:]
+        kind,
+        case,
+        body,
+        nodes[:, soil],
+        force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0],
+        np.array(context, dtype=float)[1:],
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ __all__ = [
     "RolloutTiming",
     "main",
     "require_known_bed",
-    "require_prescribed_body",
+    "require_same_freedom",
     "rollout_scene",
     "single_thread",
     "write_rollout",
@@ -173,13 +173,17 @@ def require_known_bed(simulator: Simulator, scene: Scene, checkpoint: str | Path
         )
 
 
-def require_prescribed_body(scene: Scene) -> None:
-    """Refuses a scene whose body moves as the soil lets it: a network is told the body's path."""
-    if scene.axle is not None:
-        raise UserError(
-            f"scene.kind is {scene.kind}: its height follows from the soil, and a network can only follow a path that "
-            "is given; roll out a scene with a prescribed body, or simulate this one: sgns simulate"
-        )
+def require_same_freedom(simulator: Simulator, scene: Scene, checkpoint: str | Path) -> None:
+    """Refuses a wheel for a network that knows of prescribed bodies only, and the other way round."""
+    if (scene.axle is not None) == simulator.predicts_body:
+        return
+    learned, asked = (
+        ("wheels", "is prescribed") if simulator.predicts_body else ("prescribed bodies", "is free")
+    )
+    raise UserError(
+        f"scene.kind is {scene.kind}, whose height {asked}; {checkpoint} was trained on {learned}: use a checkpoint "
+        "that was trained on such scenes"
+    )
 
 
 def bed_differences(known: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
@@ -194,16 +198,36 @@ def bed_differences(known: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     return "it knows " + ", ".join(named[:4]) + more
 
 
-def unlearned(known: Mapping[str, Any], asked: Mapping[str, Any]) -> list[str]:
-    """What a scene changes that the training runs' scene fixes and no tool path can tell the network.
+# What changes soil and force beside the path: named when it differs and the network is not told.
+_FIXED = (
+    "blade",
+    "material",
+    "gravity",
+    "friction",
+    "load",
+    "diameter",
+    "width",
+    "friction_angle",
+    "grousers",
+    "damping",
+)
+
+
+def unlearned(known: Mapping[str, Any], asked: Mapping[str, Any], told: Sequence[str] = ()) -> list[str]:
+    """What a scene changes that the training runs' scene fixes and neither path nor context can tell the network.
+
+    Args:
+        known: A training run's scene.
+        asked: The scene to be rolled out.
+        told: Keys that the network is told.
 
     Returns:
-        `key value (trained with value)` for every such key of blade, material and gravity.
+        `key value (trained with value)` for every such key of blade, wheel, material and gravity.
     """
     return [
         f"{key} {b} (trained with {a})"
         for key, (a, b) in differences(known, asked).items()
-        if key.split(".")[0] in ("blade", "material", "gravity") and a is not None and b is not None
+        if key.split(".")[0] in _FIXED and key.split(".")[-1] not in told and a is not None and b is not None
     ]
 
 
@@ -212,7 +236,7 @@ def rollout_scene(
 ) -> RolloutTiming:
     """Rolls a scene that was never simulated out, from the common start at rest, into a run file."""
     with single_thread():
-        rollout = simulator.rollout(scene.body_poses(), scene.body_points())
+        rollout = simulator.rollout(scene.body_poses(), scene.body_points(), values=scene.to_dict())
     began = time.perf_counter()
     write_rollout(path, simulator, scene.to_dict(), rollout, seed=seed, checkpoint=checkpoint)
     writing = time.perf_counter() - began
@@ -226,10 +250,10 @@ def main(cfg: DictConfig) -> float:
     from sgns.simulator import Simulator
 
     scene = scene_from_config(cfg)
-    require_prescribed_body(scene)
     simulator = Simulator.load(cfg.checkpoint, device=cfg.device)
+    require_same_freedom(simulator, scene, cfg.checkpoint)
     require_known_bed(simulator, scene, cfg.checkpoint)
-    ignored = unlearned(simulator.scene, scene.to_dict())
+    ignored = unlearned(simulator.scene, scene.to_dict(), simulator.context_keys)
     if ignored:
         log.warning("the network follows the tool's path only; it does not know of %s", ", ".join(ignored))
     output = Path(cfg.output)

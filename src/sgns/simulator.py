@@ -1,11 +1,14 @@
 """The trained thing a person holds: put a tool in, get soil, force and torque out.
 
-Letters: T frames, n particles, M body points, d history positions, r modes.
+Of a wheel, whose height follows from the soil, the pose that is put in says how it is driven, and the height comes out.
+
+Letters: T frames, n particles, M body points, N body nodes, d history positions, r modes.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,8 +19,9 @@ from torch import Tensor
 
 from sgns.errors import UserError
 from sgns.learning.body import BodyTrack, body_track
+from sgns.learning.context import context_of
 from sgns.learning.surrogate import Surrogate, load_surrogate
-from sgns.poses import check_poses, in_world_frame
+from sgns.poses import check_poses, fitted_poses, in_world_frame
 from sgns.reduction.basis import Basis
 
 __all__ = ["Rollout", "Simulator", "State"]
@@ -55,7 +59,7 @@ class Rollout:
         latent: Modes [m], shape (T, r, 3), float64.
         force: By the soil on the tool [N], shape (T, 3).
         torque: About its centre of mass [N m], shape (T, 3).
-        poses: Of the tool, shape (T, 7).
+        poses: Of the tool, shape (T, 7); predicted where the tool is free.
         body_points: World frame [m], shape (T, M, 3).
         wall_time_s: Time of the network's steps, force included, decoding not [s].
     """
@@ -116,6 +120,21 @@ class Simulator:
         return self._dynamics.num_modes
 
     @property
+    def mean_force(self) -> np.ndarray:
+        """Of the training runs [N], shape (3,): the simplest prediction of a force."""
+        return self._dynamics.force.mean.cpu().numpy()
+
+    @property
+    def context_keys(self) -> tuple[str, ...]:
+        """Numbers of the scene that the network is told."""
+        return self._dynamics.context_keys
+
+    @property
+    def predicts_body(self) -> bool:
+        """Whether the tool's height is predicted, as that of a wheel, not prescribed."""
+        return self._dynamics.predicts_body
+
+    @property
     def arrangement_hash(self) -> str:
         """Of the particle arrangement it knows."""
         return self.basis.arrangement_hash
@@ -135,7 +154,12 @@ class Simulator:
         """Steps taken since the last reset."""
         return self._frame
 
-    def reset(self, scene: Any = None, history: tuple[np.ndarray, np.ndarray] | None = None) -> State:
+    def reset(
+        self,
+        scene: Any = None,
+        history: tuple[np.ndarray, np.ndarray] | None = None,
+        values: Mapping[str, Any] | None = None,
+    ) -> State:
         """Start again.
 
         Args:
@@ -144,6 +168,8 @@ class Simulator:
                 puts it.
             history: Latent positions (d, r, 3) [m] and tool poses (d, 7) to go on from, oldest first; None:
                 the bed at rest at its common start.
+            values: The scene as plain data, where `scene` is none; a network that was trained with different loads,
+                soils or the like reads them there. None: those of `simulator.scene`.
 
         Returns:
             The state at frame 0.
@@ -159,9 +185,10 @@ class Simulator:
                     f"({self.arrangement_hash}); use the bed of simulator.scene"
                 )
             points, pose = np.asarray(scene.body_points()), scene.body_poses()[0]
+            values = scene.to_dict()
         elif scene is not None:
             pose = np.atleast_2d(np.asarray(scene, dtype=np.float64))[0]
-        self._frame, self._points = 0, points
+        self._frame, self._points, self._context = 0, points, self._context_of(values)
         self._poses: list[np.ndarray] = []
         if history is None:
             latent = self._start_latent.expand(self.history, -1, -1)
@@ -197,13 +224,15 @@ class Simulator:
         window = np.stack([*self._poses, pose])
         body = self._track(window, in_world_frame(window, self._points)).frames(slice(1, None))
         with torch.inference_mode():
-            following, force, torque = self._dynamics.advance(self._latent, body)
-            self._latent = torch.cat([self._latent[:, 1:], following[:, None]], dim=1)
+            step = self._dynamics.advance(self._latent, body, self._context)
+            self._latent = torch.cat([self._latent[:, 1:], step.latent[:, None]], dim=1)
+        if self.predicts_body:
+            there = body.position[0, -2] + step.displacement[0]
+            pose = self._predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
         self._poses = [*self._poses[1:], pose]
         self._frame += 1
-        return State(
-            self._frame, self._newest(), force[0].cpu().numpy(), torque[0].cpu().numpy(), pose, self.basis
-        )
+        force, torque = (part[0].cpu().numpy() for part in (step.force, step.torque))
+        return State(self._frame, self._newest(), force, torque, pose, self.basis)
 
     def rollout(
         self,
@@ -212,16 +241,18 @@ class Simulator:
         latent_history: np.ndarray | Tensor | None = None,
         force_history: np.ndarray | None = None,
         torque_history: np.ndarray | None = None,
+        values: Mapping[str, Any] | None = None,
     ) -> Rollout:
         """Follow a whole tool path; the same as stepping along it. Leaves `reset` and `step` alone.
 
         Args:
-            poses: Tool at every frame, shape (T, 7).
+            poses: Tool at every frame, shape (T, 7); what is predicted of it is read in the given frames only.
             body_points: In the body frame [m], shape (M, 3); None: those of the training runs.
             latent_history: The first d frames [m], shape (d, r, 3); frames d to T - 1 are predicted. None:
                 the soil is at rest at its common start in frame 0, and frames 1 to T - 1 are predicted.
             force_history: Force of the first d frames [N], shape (d, 3), copied; zero if None.
             torque_history: Torque of the first d frames [N m], likewise.
+            values: The scene as plain data, as for `reset`.
 
         Returns:
             The rollout.
@@ -243,16 +274,33 @@ class Simulator:
         world = in_world_frame(poses, points)
         track = self._track(np.concatenate([poses[:1].repeat(padding, 0), poses]),
                             np.concatenate([world[:1].repeat(padding, 0), world]))  # fmt: skip
+        context = self._context_of(values)
         began = time.perf_counter()
         with torch.inference_mode():
-            states, force, torque = self._dynamics.unroll(latent[None].to(self.device), track)
-            states, force, torque = (part[0, padding:].cpu().numpy() for part in (states, force, torque))
+            path = self._dynamics.unroll(latent[None].to(self.device), track, context)
+            states, force, torque = (
+                part[0, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque)
+            )
         wall_time = time.perf_counter() - began
         if latent_history is not None:
             for part, given in ((force, force_history), (torque, torque_history)):
                 if given is not None:
                     part[:d] = np.asarray(given)[:d]
+        if self.predicts_body:
+            nodes = path.body.position[0, padding:].cpu().numpy()
+            poses = self._predicted_poses(poses, nodes, points)
+            world = nodes if self._dynamics.settings.body_nodes == "points" else in_world_frame(poses, points)
         return Rollout(states, force, torque, poses, world, wall_time)
+
+    def _predicted_poses(self, poses: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Poses (T, 7) of body nodes (T, N, 3) [m]; the prescribed orientation of a pose node is kept."""
+        if self._dynamics.settings.body_nodes == "points":
+            return fitted_poses(points, nodes)
+        return np.concatenate([nodes[:, 0], poses[:, 3:]], axis=1)
+
+    def _context_of(self, values: Mapping[str, Any] | None) -> Tensor:
+        scene = self.scene if values is None else values
+        return torch.as_tensor(context_of(scene, self._dynamics.context_keys))[None].to(self.device)
 
     def _track(self, poses: np.ndarray, points: np.ndarray) -> BodyTrack:
         track = body_track(poses, points, self._dynamics.settings.body_nodes)

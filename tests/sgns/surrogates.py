@@ -67,7 +67,9 @@ class FakeSimulator:
                 self.scene = run.scene
                 self.known.append((run.pose, basis.transform(run.positions()).numpy(), run.force, run.torque))
 
-    def rollout(self, poses: np.ndarray, body_points: Any = None, latent_history: Any = None) -> FakeRollout:
+    def rollout(
+        self, poses: np.ndarray, body_points: Any = None, latent_history: Any = None, values: Any = None
+    ) -> FakeRollout:
         distance = [np.abs(known[0] - poses).sum() for known in self.known]
         _, latent, force, torque = self.known[int(np.argmin(distance))]
         latent = self.mistake(latent.copy(), self.history)

@@ -8,7 +8,14 @@ from scipy.spatial.transform import Rotation
 from synthetic import random_poses
 
 from sgns.errors import UserError
-from sgns.poses import check_poses, in_body_frame, in_world_frame, rotation_matrices, rotation_vectors
+from sgns.poses import (
+    check_poses,
+    fitted_poses,
+    in_body_frame,
+    in_world_frame,
+    rotation_matrices,
+    rotation_vectors,
+)
 
 
 def test_rotations_agree_with_scipy() -> None:
@@ -55,3 +62,20 @@ def test_a_quarter_turn_about_y_takes_z_to_x() -> None:
     pose = np.array([[0.0, 0.0, 0.0, 0.0, np.sin(half), 0.0, np.cos(half)]])
     turned = in_world_frame(pose, np.array([[0.0, 0.0, 1.0]]))
     np.testing.assert_allclose(turned, [[[1.0, 0.0, 0.0]]], atol=1e-15)
+
+
+def test_fitted_poses_find_the_poses_again() -> None:
+    rng = np.random.default_rng(0)
+    quaternion = rng.normal(size=(200, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    quaternion[:4] = np.eye(4)  # half turns about each axis, and none
+    poses = np.concatenate([rng.normal(size=(200, 3)), quaternion], axis=1)
+    points = rng.normal(size=(6, 3))
+    for _ in range(2):
+        found = fitted_poses(points, in_world_frame(poses, points))
+        np.testing.assert_allclose(found[:, :3], poses[:, :3], atol=1e-12)
+        np.testing.assert_allclose(
+            rotation_matrices(found[:, 3:]), rotation_matrices(poses[:, 3:]), atol=1e-12
+        )
+        # Points in a plane, as those of a plate: its mirror image is not taken for a rotation.
+        points[:, 0] = 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from hydra import compose, initialize_config_module
@@ -12,7 +13,7 @@ from omegaconf import OmegaConf
 from mpm_warp import Wheel
 from sgns.campaign import plan
 from sgns.errors import UserError
-from sgns.rollout import require_prescribed_body
+from sgns.rollout import require_same_freedom
 from sgns.runs import Run, check_run
 from sgns.scenes import scene_from_config
 
@@ -74,11 +75,19 @@ def test_a_wheel_run_says_what_a_wheel_does(tmp_path):
         assert run.pose[-1, 2] < run.pose[0, 2]
 
 
-def test_a_network_cannot_roll_a_free_body_out():
-    scene = scene_from_config(composed("scene=wheel"))
-    with pytest.raises(UserError, match=r"scene\.kind is wheel: its height follows from the soil"):
-        require_prescribed_body(scene)
-    require_prescribed_body(scene_from_config(composed("scene=excavation")))
+def test_a_network_of_prescribed_bodies_cannot_roll_a_wheel_out():
+    blades, wheels = SimpleNamespace(predicts_body=False), SimpleNamespace(predicts_body=True)
+    wheel, blade = (scene_from_config(composed(f"scene={name}")) for name in ("wheel", "excavation"))
+    with pytest.raises(
+        UserError, match=r"scene\.kind is wheel, whose height is free; a\.ckpt was trained on pre"
+    ):
+        require_same_freedom(blades, wheel, "a.ckpt")
+    with pytest.raises(
+        UserError, match=r"scene\.kind is excavation, whose height is prescribed; a\.ckpt was"
+    ):
+        require_same_freedom(wheels, blade, "a.ckpt")
+    require_same_freedom(blades, blade, "a.ckpt")
+    require_same_freedom(wheels, wheel, "a.ckpt")
 
 
 def test_a_body_from_the_command_line(tmp_path):

@@ -49,7 +49,7 @@ def roll_out(simulator: Simulator, run: Run) -> Rollout:
     """The network along a run's tool path, from the run's first d true frames."""
     points = in_body_frame(run.pose[0], run.body_points[0])
     given = simulator.basis.transform(run.positions(slice(0, simulator.history)))
-    return simulator.rollout(run.pose, points, latent_history=given)
+    return simulator.rollout(run.pose, points, latent_history=given, values=run.scene)
 
 
 def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTiming:
@@ -232,6 +232,11 @@ def main(cfg: DictConfig) -> float:
     if not isinstance(cfg.timing_repeats, int) or cfg.timing_repeats < 3:
         raise UserError(f"timing_repeats is {cfg.timing_repeats!r}; it must be a whole number, at least 3")
     checkpoint = Path(cfg.checkpoint)
+    if cfg.dataset.get("format") == "published":
+        from sgns.evaluation.published_scores import evaluate_published
+
+        simulator = Simulator.load(checkpoint, device=cfg.device)
+        return evaluate_published(simulator, cfg.dataset, cfg.split, Path(cfg.output), checkpoint)
     dataset = Dataset.open(cfg.dataset.path)
     simulator = Simulator.load(checkpoint, device=cfg.device)
     output = Path(cfg.output)

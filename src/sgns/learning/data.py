@@ -1,6 +1,7 @@
-"""Training windows: d positions of history and one target, all in memory, drawn from (seed, step) alone.
+"""Training windows: d positions of history and h targets, all in memory, drawn from (seed, step) alone.
 
-Shapes: B batch, d history positions, r modes, N body nodes, W windows, F stacked frames of all runs.
+Shapes: B batch, d history positions, h steps of the horizon, r modes, N body nodes, K context numbers, W windows,
+F stacked frames of all runs.
 """
 
 from __future__ import annotations
@@ -15,51 +16,74 @@ from torch import Tensor
 
 from sgns.errors import UserError
 from sgns.learning.body import BodyTrack, body_track
-from sgns.learning.dynamics import LatentDynamics
-from sgns.learning.normalisation import Standardiser
+from sgns.learning.context import context_of
 
 if TYPE_CHECKING:
     from sgns.reduction.reduced import ReducedRun
 
-__all__ = ["Batch", "TrainingWindows", "WindowDataModule", "fit_normalisation", "random_walk"]
+__all__ = ["Batch", "NoiseScales", "TrainingWindows", "WindowDataModule", "random_walk"]
 
 # Streams of random numbers that must not be the same.
-_SHUFFLE, _NOISE = 0, 1
+_SHUFFLE, _NOISE, _BODY_NOISE = 0, 1, 2
+
+
+class NoiseScales(NamedTuple):
+    """Deviations of the newest velocity's noise.
+
+    Attributes:
+        latent: Of the modes [m], shape (r, 3).
+        body: Of the body nodes [m], shape (3,); zero along axes that are prescribed.
+    """
+
+    latent: Tensor
+    body: Tensor
 
 
 class Batch(NamedTuple):
     """Windows of one optimisation step.
 
     Attributes:
-        latent: Clean latent positions, the target last [m], float64, shape (B, d + 1, r, 3).
+        latent: Clean latent positions, the targets last [m], float64, shape (B, d + h, r, 3).
         noise: Offset added to the history [m], float64, shape (B, d, r, 3).
-        body: The d frames that end with the target's, (B, d, N, ...).
-        force: At the target frame [N], shape (B, 3).
-        torque: At the target frame [N m], shape (B, 3).
+        body: The d - 1 + h frames that end with the last target's, clean, (B, d - 1 + h, N, ...).
+        body_noise: Offset added to the body in the history [m], float64, shape (B, d, N, 3).
+        force: At the target frames [N], shape (B, h, 3).
+        torque: At the target frames [N m], shape (B, h, 3).
+        context: Of the runs, shape (B, K).
     """
 
     latent: Tensor
     noise: Tensor
     body: BodyTrack
+    body_noise: Tensor
     force: Tensor
     torque: Tensor
+    context: Tensor
+
+    @property
+    def horizon(self) -> int:
+        """h, steps to be predicted."""
+        return self.force.shape[1]
 
     @property
     def history(self) -> Tensor:
         """What the network is shown: the noisy history [m], shape (B, d, r, 3)."""
-        return self.latent[:, :-1] + self.noise
+        return self.latent[:, : -self.horizon] + self.noise
 
     @property
-    def acceleration(self) -> Tensor:
-        """The target [m], shape (B, r, 3).
+    def shown_body(self) -> BodyTrack:
+        """The body with the noise of the history; later frames go on from its newest offset."""
+        later = self.body_noise[:, -1:].expand(-1, self.horizon, -1, -1)
+        return self.body.displaced(torch.cat([self.body_noise, later], dim=1))
 
-        Second difference from the noisy history to the clean next position moved by the newest noise: the
-        network learns to undo errors of the velocity and lets those of the position be, as in
-        Sanchez-Gonzalez et al. 2020 (arXiv:2002.09405, appendix B).
+    @property
+    def following(self) -> Tensor:
+        """Where the modes are to go [m], shape (B, h, r, 3).
+
+        The clean next positions moved by the newest noise: the network learns to undo errors of the velocity and lets
+        those of the position be, as in Sanchez-Gonzalez et al. 2020 (arXiv:2002.09405, appendix B).
         """
-        shown = self.history
-        following = self.latent[:, -1] + self.noise[:, -1]
-        return following - 2 * shown[:, -1] + shown[:, -2]
+        return self.latent[:, -self.horizon :] + self.noise[:, -1:]
 
 
 class TrainingWindows:
@@ -74,10 +98,19 @@ class TrainingWindows:
         history: d.
         body_nodes: "pose" or "points".
         seed: Of shuffle and noise.
+        horizon: h, targets of a window.
+        context: Keys of the scene whose numbers go with every window.
     """
 
     def __init__(
-        self, runs: Sequence[ReducedRun], num_modes: int, history: int, body_nodes: str, seed: int = 0
+        self,
+        runs: Sequence[ReducedRun],
+        num_modes: int,
+        history: int,
+        body_nodes: str,
+        seed: int = 0,
+        horizon: int = 1,
+        context: Sequence[str] = (),
     ) -> None:
         if not runs:
             raise UserError(
@@ -86,24 +119,31 @@ class TrainingWindows:
         if len({run.body_points.shape[1] for run in runs}) > 1 and body_nodes == "points":
             raise UserError("the runs have different numbers of body points; use model.body_nodes=pose")
         self.history = history
+        self.horizon = horizon
         self.seed = seed
-        latent, tracks, force, torque, targets = [], [], [], [], []
+        latent, tracks, force, torque, targets, of_run = [], [], [], [], [], []
         offset, pad = 0, history - 1
-        for run in runs:
+        for number, run in enumerate(runs):
             latent.append(pad_start(torch.as_tensor(run.latent[:, :num_modes]), pad))
             track = body_track(run.pose, run.body_points, body_nodes)
             tracks.append(BodyTrack(*(pad_start(part, pad) for part in track)))
             force.append(pad_start(torch.as_tensor(run.force), pad))
             torque.append(pad_start(torch.as_tensor(run.torque), pad))
-            targets.append(torch.arange(offset + history, offset + pad + len(run.latent)))
+            targets.append(torch.arange(offset + history, offset + pad + len(run.latent) - (horizon - 1)))
+            of_run.append(torch.full((pad + len(run.latent),), number))
             offset += pad + len(run.latent)
         self.latent = torch.cat(latent)
         self.body = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
         self.force = torch.cat(force)
         self.torque = torch.cat(torque)
         self.targets = torch.cat(targets)
+        self.of_run = torch.cat(of_run)
+        self.context = torch.as_tensor(np.stack([context_of(run.scene, context) for run in runs]))
         if len(self.targets) == 0:
-            raise UserError("the training runs hold one frame each; at least two are needed to learn a step")
+            raise UserError(
+                f"the training runs are too short: to learn {horizon} step{'s' * (horizon > 1)} at once they need at "
+                f"least {horizon + 1} frames"
+            )
         if not bool(torch.isfinite(self.latent).all()):
             raise UserError(
                 "a reduced training run holds values that are not finite; find it with: sgns check <run.h5>"
@@ -114,23 +154,33 @@ class TrainingWindows:
         """W, the number of windows."""
         return len(self.targets)
 
-    def windows(self, rows: Tensor, noise: Tensor | None = None) -> Batch:
-        """The windows whose targets are the given stacked frames, shape (B,)."""
-        d = self.history
-        frames = rows[:, None] + torch.arange(-d, 1)
+    def windows(self, rows: Tensor, noise: tuple[Tensor, Tensor] | None = None) -> Batch:
+        """The windows whose first targets are the given stacked frames, shape (B,); without noise unless the offsets of
+        modes and body are given."""
+        frames = rows[:, None] + torch.arange(-self.history, self.horizon)
         latent = self.latent[frames]
-        if noise is None:
-            noise = torch.zeros_like(latent[:, :-1])
         body = BodyTrack(*(part[frames[:, 1:]] for part in self.body))
-        return Batch(latent, noise, body, self.force[rows], self.torque[rows])
+        if noise is None:
+            shown = frames[:, : self.history]
+            noise = torch.zeros_like(self.latent[shown]), torch.zeros_like(self.body.position[shown])
+        last = frames[:, self.history :]
+        return Batch(
+            latent,
+            noise[0],
+            body,
+            noise[1],
+            self.force[last],
+            self.torque[last],
+            self.context[self.of_run[rows]],
+        )
 
-    def batch(self, step: int, size: int, noise_scale: Tensor) -> Batch:
+    def batch(self, step: int, size: int, noise: NoiseScales) -> Batch:
         """The batch of a step: a function of (seed, step) and nothing else, so that resuming changes nothing.
 
         Args:
             step: Optimisation step from 0.
             size: B.
-            noise_scale: Deviation of the newest velocity's noise [m], shape (r, 3).
+            noise: Its deviations.
         """
         place = torch.arange(step * size, (step + 1) * size)
         epoch = place // len(self)
@@ -140,14 +190,19 @@ class TrainingWindows:
                 for e in torch.unique_consecutive(epoch)
             ]
         )
-        noise = random_walk(noise_scale, (size, self.history), generator(self.seed, step, _NOISE))
-        return self.windows(self.targets[rows], noise)
+        shape = (size, self.history)
+        offsets = random_walk(noise.latent, shape, generator(self.seed, step, _NOISE))
+        nodes = self.body.position.shape[1]
+        body_offsets = random_walk(
+            noise.body.expand(nodes, 3), shape, generator(self.seed, step, _BODY_NOISE)
+        )
+        return self.windows(self.targets[rows], (offsets, body_offsets))
 
-    def batches(self, size: int, noise_scale: Tensor, first: int = 0) -> Iterator[Batch]:
+    def batches(self, size: int, noise: NoiseScales, first: int = 0) -> Iterator[Batch]:
         """Batches without end, from step `first`."""
         step = first
         while True:
-            yield self.batch(step, size, noise_scale)
+            yield self.batch(step, size, noise)
             step += 1
 
     def _epoch_order(self, epoch: int) -> Tensor:
@@ -173,58 +228,17 @@ def random_walk(scale: Tensor, shape: tuple[int, int], source: torch.Generator) 
     """Noise on a history whose velocity errors add up, as those of a rollout do.
 
     Args:
-        scale: Deviation of the newest velocity's noise [m], shape (r, 3).
+        scale: Deviation of the newest velocity's noise [m], shape (r, 3), or (N, 3).
         shape: (B, d).
         source: Generator.
 
     Returns:
-        Offsets [m], float64, shape (B, d, r, 3); zero at the oldest position.
+        Offsets [m], float64, shape (B, d, r, 3), or (B, d, N, 3); zero at the oldest position.
     """
     batch, d = shape
     steps = torch.randn((batch, d - 1, *scale.shape), generator=source, dtype=torch.float64)
     velocity = torch.cumsum(steps * scale / (d - 1) ** 0.5, dim=1)
     return torch.nn.functional.pad(torch.cumsum(velocity, dim=1), (0, 0, 0, 0, 1, 0))
-
-
-def fit_normalisation(
-    dynamics: LatentDynamics, windows: TrainingWindows, noise: float, floor: float
-) -> Tensor:
-    """Give the dynamics the statistics of the training windows.
-
-    Positions, velocities and accelerations are scaled per mode and axis: modes differ by more than an order
-    of magnitude. Velocities and accelerations keep their zero, which means rest.
-
-    Args:
-        dynamics: Filled in place.
-        windows: The training windows.
-        noise: Deviation of the velocity noise as a share of each mode's velocity scale.
-        floor: Smallest scale as a share of the quantity's largest.
-
-    Returns:
-        Deviation of the velocity noise [m], shape (r, 3).
-    """
-    rows = windows.targets
-    latent, body = windows.latent, windows.body
-    velocity = latent[rows] - latent[rows - 1]
-    acceleration = velocity - (latent[rows - 1] - latent[rows - 2])
-    dynamics.position = Standardiser.fit(latent[rows - 1], floor)
-    dynamics.velocity = Standardiser.fit(velocity, floor, centred=False)
-    noise_scale = noise * dynamics.velocity.scale
-    clean = Standardiser.fit(acceleration, floor, centred=False)
-    # The target contains the correction of the velocity's noise; without either it would be constant.
-    dynamics.acceleration = Standardiser(clean.mean, (clean.scale.square() + noise_scale.square()).sqrt())
-    dynamics.body_position = Standardiser.fit(body.position[rows - 1].flatten(0, 1), floor)
-    dynamics.body_orientation = Standardiser.fit(body.orientation[rows - 1].flatten(0, 1), floor)
-    dynamics.body_motion = fit_motion(body.motion[rows].flatten(0, 1), floor)
-    dynamics.force = Standardiser.fit(windows.force[rows], floor)
-    dynamics.torque = Standardiser.fit(windows.torque[rows], floor)
-    return noise_scale
-
-
-def fit_motion(motion: Tensor, floor: float) -> Standardiser:
-    """Displacement [m] and rotation [rad] have their own largest scale each."""
-    parts = [Standardiser.fit(part, floor, centred=False) for part in motion.split(3, dim=-1)]
-    return Standardiser(torch.cat([p.mean for p in parts]), torch.cat([p.scale for p in parts]))
 
 
 class WindowDataModule(L.LightningDataModule):
@@ -235,14 +249,14 @@ class WindowDataModule(L.LightningDataModule):
     Args:
         windows: The training windows.
         batch_size: B.
-        noise_scale: Deviation of the newest velocity's noise [m], shape (r, 3).
+        noise: Deviations of its noise.
     """
 
-    def __init__(self, windows: TrainingWindows, batch_size: int, noise_scale: Tensor) -> None:
+    def __init__(self, windows: TrainingWindows, batch_size: int, noise: NoiseScales) -> None:
         super().__init__()
         self.training_windows = windows
         self.batch_size = batch_size
-        self.noise_scale = noise_scale
+        self.noise = noise
 
     def train_dataloader(self) -> StepBatches:
         """Called by the trainer once its step is known, resumed or not."""
@@ -263,4 +277,4 @@ class StepBatches:
         """Endless."""
         trainer = self.module.trainer
         first = 0 if trainer is None else trainer.global_step
-        return self.module.training_windows.batches(self.module.batch_size, self.module.noise_scale, first)
+        return self.module.training_windows.batches(self.module.batch_size, self.module.noise, first)

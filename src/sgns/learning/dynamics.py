@@ -1,71 +1,72 @@
-"""The dynamics of the latent soil under a prescribed tool: history and next tool motion in, next state and
-force out.
+"""The dynamics of the latent soil around a body: history and next tool motion in, next state and force out.
 
-Shapes: B batch, d history positions, r modes, N body nodes, V = r + N nodes, T frames.
+Shapes: B batch, d history positions, r modes, N body nodes, V = r + N nodes, K context numbers, T frames.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+import copy
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from sgns.errors import UserError
-from sgns.learning.body import BODY_NODES, BodyTrack
-from sgns.learning.graph import build_graph, complete_graph
-from sgns.learning.network import ACTIVATIONS, EncodeProcessDecode
+from sgns.learning.body import BodyTrack, free_axes, nearest_rigid
+from sgns.learning.graph import build_graph, edge_indices
+from sgns.learning.model_settings import ModelSettings
+from sgns.learning.network import EncodeProcessDecode
 from sgns.learning.normalisation import Standardiser
 
-__all__ = ["LatentDynamics", "ModelSettings", "Prediction"]
-
-
-@dataclass(frozen=True)
-class ModelSettings:
-    """What `conf/model` says; see there for the meaning of each key."""
-
-    history: int
-    body_nodes: str
-    hidden_width: int
-    hidden_layers: int
-    message_passing_steps: int
-    layer_norm: bool
-    residual: bool
-    activation: str
-    identity_width: int
-
-    def __post_init__(self) -> None:
-        for key, low in (
-            ("history", 2),
-            ("hidden_width", 1),
-            ("hidden_layers", 1),
-            ("message_passing_steps", 1),
-            ("identity_width", 0),
-        ):
-            if getattr(self, key) < low:
-                raise UserError(f"model.{key} is {getattr(self, key)}; it must be at least {low}")
-        for key, allowed in (("body_nodes", BODY_NODES), ("activation", tuple(ACTIVATIONS))):
-            if getattr(self, key) not in allowed:
-                raise UserError(f"model.{key} is {getattr(self, key)!r}; allowed: {', '.join(allowed)}")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for a checkpoint."""
-        return asdict(self)
+__all__ = ["LatentDynamics", "Path", "Prediction", "Step"]
 
 
 class Prediction(NamedTuple):
     """What the network says of one step, normalised.
 
     Attributes:
-        acceleration: Second difference of each mode [1], shape (B, r, 3).
+        change: Of every node's position: its second difference, or with `model.predicts=velocity` its first [1], shape
+            (B, V, 3). Modes first; of a body node only what is free counts.
         force: Contribution of every node [1], shape (B, V, 3).
         torque: Contribution of every node [1], shape (B, V, 3).
     """
 
-    acceleration: Tensor
+    change: Tensor
     force: Tensor
     torque: Tensor
+
+
+class Step(NamedTuple):
+    """One step in physical units, float64.
+
+    Attributes:
+        latent: Next latent positions [m], shape (B, r, 3).
+        force: On the body [N], shape (B, 3).
+        torque: On the body [N m], shape (B, 3).
+        displacement: Of the body nodes [m], shape (B, N, 3): the prescribed one, with what the network predicts in
+            its place along the free axes.
+    """
+
+    latent: Tensor
+    force: Tensor
+    torque: Tensor
+    displacement: Tensor
+
+
+class Path(NamedTuple):
+    """A whole path, float64.
+
+    Attributes:
+        latent: Latent positions [m], shape (B, T, r, 3); the first d frames are the given ones.
+        force: [N], shape (B, T, 3), zero in the first d frames.
+        torque: [N m], shape (B, T, 3), zero in the first d frames.
+        body: The body at all frames, predicted where it is free.
+    """
+
+    latent: Tensor
+    force: Tensor
+    torque: Tensor
+    body: BodyTrack
 
 
 class LatentDynamics(nn.Module):
@@ -75,22 +76,37 @@ class LatentDynamics(nn.Module):
     Args:
         settings: What to build.
         num_modes: r.
+        context: Keys of the scene whose numbers every node is told, K of them.
+        predicts_body: Whether the body moves as the soil lets it (see `free_axes`).
     """
 
-    def __init__(self, settings: ModelSettings, num_modes: int) -> None:
+    free: Tensor
+
+    def __init__(
+        self,
+        settings: ModelSettings,
+        num_modes: int,
+        context: tuple[str, ...] = (),
+        predicts_body: bool = False,
+    ) -> None:
         super().__init__()
         self.settings = settings
         self.num_modes = num_modes
+        self.context_keys = tuple(context)
+        self.predicts_body = predicts_body
         pose = settings.body_nodes == "pose"
         motion = 6 if pose else 3
-        mode_width = 3 * settings.history
-        body_width = 3 + (6 if pose else 0) + motion * settings.history
-        # Every mode is somebody: a learned vector each, and one for the body's nodes.
-        self.identity = nn.Embedding(num_modes + 1, settings.identity_width)
+        place = 3 if settings.positions else 0
+        motions = settings.history if settings.next_motion else settings.history - 1
+        mode_width = place + 3 * (settings.history - 1)
+        body_width = place + (6 if pose else 0) + motion * motions
+        # A learned vector for each mode, or one for all of them, and one for the body's nodes.
+        kinds = num_modes if settings.identity == "mode" else 1
+        self.identity = nn.Embedding(kinds + 1, settings.identity_width)
         self.network = EncodeProcessDecode(
-            max(mode_width, body_width) + settings.identity_width,
-            4,
-            9,
+            max(mode_width, body_width) + settings.identity_width + len(context),
+            4 if settings.edge_length else 3,
+            9 if settings.torque else 6,
             settings.hidden_width,
             settings.hidden_layers,
             settings.message_passing_steps,
@@ -100,12 +116,15 @@ class LatentDynamics(nn.Module):
         )
         self.position = Standardiser.empty(num_modes, 3)
         self.velocity = Standardiser.empty(num_modes, 3)
-        self.acceleration = Standardiser.empty(num_modes, 3)
+        self.change = Standardiser.empty(num_modes, 3)
         self.body_position = Standardiser.empty(3)
         self.body_orientation = Standardiser.empty(6 if pose else 0)
         self.body_motion = Standardiser.empty(motion)
+        self.body_change = Standardiser.empty(3)
         self.force = Standardiser.empty(3)
         self.torque = Standardiser.empty(3)
+        self.context = Standardiser.empty(len(context))
+        self.register_buffer("free", free_axes(predicts_body, settings.body_nodes), persistent=False)
         self._edges: dict[tuple[int, torch.device], Tensor] = {}
 
     @property
@@ -113,36 +132,95 @@ class LatentDynamics(nn.Module):
         """d, positions of history."""
         return self.settings.history
 
-    def forward(self, latent: Tensor, body: BodyTrack) -> Prediction:
+    def with_modes(self, num_modes: int) -> LatentDynamics:
+        """The same network on the first modes only; the weights are shared.
+
+        Raises:
+            UserError: More modes than it was trained with.
+        """
+        if not 1 <= num_modes <= self.num_modes:
+            raise UserError(
+                f"the network was trained with {self.num_modes} modes and cannot have {num_modes}; allowed: 1 to "
+                f"{self.num_modes}"
+            )
+        fewer = copy.copy(self)
+        fewer._modules = dict(self._modules)
+        fewer.num_modes, fewer._edges = num_modes, {}
+        for name in ("position", "velocity", "change"):
+            whole = getattr(self, name)
+            setattr(fewer, name, Standardiser(whole.mean[:num_modes], whole.scale[:num_modes]))
+        if self.settings.identity == "mode":
+            weight = torch.cat([self.identity.weight[:num_modes], self.identity.weight[-1:]])
+            fewer.identity = nn.Embedding.from_pretrained(weight, freeze=False)
+        return fewer
+
+    def forward(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Prediction:
         """Predict one step of every window in a batch.
 
         Args:
             latent: The last d latent positions, oldest first [m], float64, shape (B, d, r, 3).
-            body: The d frames that end with the *next* one, the frame to be predicted; (B, d, N, ...).
+            body: The d frames that end with the *next* one, the frame to be predicted; (B, d, N, ...). Where it is
+                then, and how it gets there along the free axes, is not looked at.
+            context: Numbers of the runs, shape (B, K); not needed when K is 0.
         """
-        velocity = latent[:, 1:] - latent[:, :-1]
-        where, orientation, motion = body.position[:, -2], body.orientation[:, -2], body.motion
-        batch, nodes = where.shape[:2]
-        body_position = self.body_position.normalise(where)
-        body_features = torch.cat(
-            [
-                body_position,
-                self.body_orientation.normalise(orientation),
-                self.body_motion.normalise(motion).permute(0, 2, 1, 3).flatten(2),
-            ],
-            dim=-1,
-        )
+        modes, nodes = latent.shape[-2], body.position.shape[-2]
+        edge_index = self._edge_index(modes, nodes, latent.device)
         graph = build_graph(
-            self.position.normalise(latent[:, -1]),
-            self.velocity.normalise(velocity),
-            body_position,
-            body_features,
-            self._edge_index(self.num_modes + nodes, latent.device),
+            self._mode_features(latent),
+            self._body_features(body),
+            self._edge_positions(latent[:, -1], body.position[:, -2]),
+            edge_index,
+            self.settings.edge_length,
         )
-        identity = torch.cat([self.identity.weight[:-1], self.identity.weight[-1:].expand(nodes, -1)])
-        node_inputs = torch.cat([graph.nodes, identity.expand(batch, -1, -1)], dim=-1)
-        decoded = self.network(node_inputs, graph.edges, graph.edge_index)
-        return Prediction(decoded[:, : self.num_modes, :3], decoded[..., 3:6], decoded[..., 6:])
+        told = self._told(modes, nodes, latent.shape[0], context)
+        decoded = self.network(torch.cat([graph.nodes, told], dim=-1), graph.edges, edge_index)
+        force = decoded[..., 3:6]
+        torque = decoded[..., 6:] if self.settings.torque else torch.zeros_like(force)
+        if self.settings.force == "mean":
+            force, torque = force / (modes + nodes), torque / (modes + nodes)
+        return Prediction(decoded[..., :3], force, torque)
+
+    def _mode_features(self, latent: Tensor) -> Tensor:
+        """Past velocities of the modes, and where they are: the bed does not move with the tool, so that places
+        matter. Shape (B, r, any)."""
+        velocity = self.velocity.normalise(latent[:, 1:] - latent[:, :-1]).permute(0, 2, 1, 3).flatten(2)
+        if not self.settings.positions:
+            return velocity
+        return torch.cat([self.position.normalise(latent[:, -1]), velocity], dim=-1)
+
+    def _body_features(self, body: BodyTrack) -> Tensor:
+        """Place, past motions and what is prescribed of the next one, shape (B, N, any)."""
+        motion = self.body_motion.normalise(body.motion)
+        if not self.settings.next_motion:
+            motion = motion[:, :-1]
+        elif self.predicts_body:
+            known = torch.nn.functional.pad(1.0 - self.free, (0, motion.shape[-1] - 3), value=1.0)
+            motion = torch.cat([motion[:, :-1], motion[:, -1:] * known.float()], dim=1)
+        parts = [
+            self.body_orientation.normalise(body.orientation[:, -2]),
+            motion.permute(0, 2, 1, 3).flatten(2),
+        ]
+        if self.settings.positions:
+            parts.insert(0, self.body_position.normalise(body.position[:, -2]))
+        return torch.cat(parts, dim=-1)
+
+    def _edge_positions(self, modes: Tensor, body: Tensor) -> Tensor:
+        """Positions of all nodes in the unit of the edges' features, shape (B, V, 3)."""
+        if self.settings.edge_scale is not None:
+            return (torch.cat([modes, body], dim=-2) / self.settings.edge_scale).float()
+        return torch.cat([self.position.normalise(modes), self.body_position.normalise(body)], dim=-2)
+
+    def _told(self, modes: int, nodes: int, batch: int, context: Tensor | None) -> Tensor:
+        """What every node is told besides: who it is, and the context; shape (B, V, any)."""
+        weight = self.identity.weight
+        own = weight[:-1] if self.settings.identity == "mode" else weight[:1].expand(modes, -1)
+        told = torch.cat([own, weight[-1:].expand(nodes, -1)]).expand(batch, -1, -1)
+        if not self.context_keys:
+            return told
+        if context is None:
+            raise UserError(f"this network needs the scene's {', '.join(self.context_keys)}; give it a scene")
+        numbers = self.context.normalise(context)[:, None].expand(-1, modes + nodes, -1)
+        return torch.cat([told, numbers], dim=-1)
 
     def force_contributions(self, prediction: Prediction) -> tuple[Tensor, Tensor]:
         """Force [N] and torque [N m] that each node adds; their sums over nodes are the force and the torque.
@@ -158,31 +236,44 @@ class LatentDynamics(nn.Module):
             for part, standard in ((prediction.force, self.force), (prediction.torque, self.torque))
         )  # type: ignore[return-value]
 
-    def advance(self, latent: Tensor, body: BodyTrack) -> tuple[Tensor, Tensor, Tensor]:
-        """Take one step: z+ = z + (z - z-) + a.
+    def advance(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Step:
+        """Take one step: z+ = z + (z - z-) + a, or z + v. A predicted body of points stays rigid if it is to.
 
         Args:
             latent: As for `forward`.
             body: As for `forward`.
-
-        Returns:
-            Next latent positions [m] (B, r, 3), force [N] (B, 3) and torque [N m] (B, 3), float64.
+            context: As for `forward`.
         """
-        prediction = self(latent, body)
-        acceleration = self.acceleration.denormalise(prediction.acceleration)
-        force, torque = self.force_contributions(prediction)
-        return 2 * latent[:, -1] - latent[:, -2] + acceleration, force.sum(-2), torque.sum(-2)
+        step = self.taken(self(latent, body, context), latent, body)
+        if self.predicts_body and self.settings.rigid and self.settings.body_nodes == "points":
+            here = body.position[:, -2]
+            step = step._replace(displacement=nearest_rigid(here, here + step.displacement) - here)
+        return step
 
-    def unroll(self, latent: Tensor, body: BodyTrack) -> tuple[Tensor, Tensor, Tensor]:
+    def taken(self, prediction: Prediction, latent: Tensor, body: BodyTrack) -> Step:
+        """The step of a prediction, as it is."""
+        force, torque = self.force_contributions(prediction)
+        following = latent[:, -1] + self.change.denormalise(prediction.change[:, : self.num_modes])
+        if self.settings.predicts == "acceleration":
+            following = following + (latent[:, -1] - latent[:, -2])
+        displacement = body.motion[:, -1, :, :3]
+        if self.predicts_body:
+            displacement = torch.where(self.free > 0, self.body_displacement(prediction, body), displacement)
+        return Step(following, force.sum(-2), torque.sum(-2), displacement)
+
+    def body_displacement(self, prediction: Prediction, body: BodyTrack) -> Tensor:
+        """How the body nodes move in the network's eyes [m], on all axes, shape (B, N, 3)."""
+        change = self.body_change.denormalise(prediction.change[:, self.num_modes :])
+        return change + body.motion[:, -2, :, :3] if self.settings.predicts == "acceleration" else change
+
+    def unroll(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Path:
         """Follow whole tool paths from a given history, feeding predictions back.
 
         Args:
             latent: The first d latent positions of each path [m], shape (B, d, r, 3).
-            body: The tool at all T frames, (B, T, N, ...).
-
-        Returns:
-            Latent positions (B, T, r, 3) whose first d frames are the given ones, force [N] and torque [N m],
-            both (B, T, 3) and zero in the first d frames; float64.
+            body: The body at all T frames, (B, T, N, ...); what the network predicts of it is read in the first d
+                frames only.
+            context: As for `forward`.
         """
         d, frames = self.history, body.position.shape[1]
         states = torch.empty(
@@ -191,13 +282,21 @@ class LatentDynamics(nn.Module):
         states[:, :d] = latent
         force = torch.zeros((latent.shape[0], frames, 3), dtype=torch.float64, device=latent.device)
         torque = torch.zeros_like(force)
+        if self.predicts_body:
+            body = body._replace(position=body.position.clone(), motion=body.motion.clone())
         for t in range(d, frames):
             window = body.frames(slice(t - d + 1, t + 1))
-            states[:, t], force[:, t], torque[:, t] = self.advance(states[:, t - d : t], window)
-        return states, force, torque
+            step = self.advance(states[:, t - d : t], window, context)
+            states[:, t], force[:, t], torque[:, t] = step.latent, step.force, step.torque
+            if self.predicts_body:
+                body.motion[:, t, :, :3] = step.displacement
+                body.position[:, t] = body.position[:, t - 1] + step.displacement
+        return Path(states, force, torque, body)
 
-    def _edge_index(self, node_count: int, device: torch.device) -> Tensor:
-        key = (node_count, device)
+    def _edge_index(self, modes: int, body_nodes: int, device: torch.device) -> Tensor:
+        key = (body_nodes, device)
         if key not in self._edges:
-            self._edges[key] = complete_graph(node_count, device)
+            self._edges[key] = edge_indices(
+                modes, body_nodes, self.settings.edges, self.settings.self_loops, device
+            )
         return self._edges[key]

@@ -1,4 +1,4 @@
-"""The graph the network sees: one node per mode, one or more for the body, every ordered pair an edge.
+"""The graph the network sees: one node per mode, one or more for the body, and edges between them.
 
 Shapes: B batch, V nodes, E edges, d history positions, r modes.
 """
@@ -10,7 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Graph", "build_graph", "complete_graph"]
+__all__ = ["EDGES", "Graph", "build_graph", "edge_indices"]
+
+EDGES = ("complete", "star")
 
 
 class Graph(NamedTuple):
@@ -18,7 +20,7 @@ class Graph(NamedTuple):
 
     Attributes:
         nodes: Node features [1], shape (B, V, node features).
-        edges: Edge features [1], shape (B, E, 4).
+        edges: Edge features [1], shape (B, E, 3 or 4).
         edge_index: Sender and receiver of every edge, shape (2, E).
     """
 
@@ -27,47 +29,55 @@ class Graph(NamedTuple):
     edge_index: Tensor
 
 
-def complete_graph(node_count: int, device: torch.device | str = "cpu") -> Tensor:
-    """Every ordered pair of different nodes, receivers ascending.
+def edge_indices(
+    modes: int,
+    body_nodes: int,
+    edges: str = "complete",
+    self_loops: bool = False,
+    device: torch.device | str = "cpu",
+) -> Tensor:
+    """The edges between modes, which come first, and body nodes, receivers ascending.
 
     Args:
-        node_count: V.
+        modes: r.
+        body_nodes: N.
+        edges: "complete", every ordered pair of different nodes; "star", only those with one mode and one body node.
+        self_loops: Whether every node has an edge to itself.
         device: Where the indices live.
 
     Returns:
-        Senders in row 0 and receivers in row 1 (PyG's order), int64, shape (2, V (V - 1)).
+        Senders in row 0 and receivers in row 1 (PyG's order), int64, shape (2, E).
     """
-    index = torch.arange(node_count, device=device)
+    index = torch.arange(modes + body_nodes, device=device)
     receiver, sender = torch.meshgrid(index, index, indexing="ij")
-    keep = receiver != sender
+    keep = receiver != sender if edges == "complete" else (receiver < modes) != (sender < modes)
+    if self_loops:
+        keep = keep | (receiver == sender)
     return torch.stack([sender[keep], receiver[keep]])
 
 
 def build_graph(
-    mode_position: Tensor,
-    mode_velocity: Tensor,
-    body_position: Tensor,
+    mode_features: Tensor,
     body_features: Tensor,
+    position: Tensor,
     edge_index: Tensor,
+    edge_length: bool = True,
 ) -> Graph:
-    """Put normalised quantities on the nodes and edges.
+    """Put features on the nodes and edges.
 
-    A mode node holds its absolute position and its d - 1 past velocities. The bed does not move with the
-    tool, so positions are given as they are, not only as differences. A body node holds its own features
-    (place, past motion and the motion into the next frame). The narrower kind is padded with zeros so that
-    one encoder serves both. An edge holds the sender's position relative to the receiver's, and its length.
+    The narrower kind of node is padded with zeros so that one encoder serves both. An edge holds the sender's position
+    relative to the receiver's, and its length.
 
     Args:
-        mode_position: Newest normalised positions of the modes [1], shape (B, r, 3).
-        mode_velocity: Normalised velocities, oldest first [1], shape (B, d - 1, r, 3).
-        body_position: Normalised position of the body nodes [1], shape (B, body nodes, 3).
-        body_features: Normalised features of the body nodes [1], shape (B, body nodes, any).
+        mode_features: Of the modes [1], shape (B, r, any).
+        body_features: Of the body nodes [1], shape (B, N, any).
+        position: Of all nodes, modes first, in the unit of edges [1], shape (B, V, 3).
         edge_index: Senders and receivers, shape (2, E).
+        edge_length: Whether edges hold their length.
 
     Returns:
         The graph with modes first and body nodes last.
     """
-    mode_features = torch.cat([mode_position, mode_velocity.permute(0, 2, 1, 3).flatten(2)], dim=-1)
     width = max(mode_features.shape[-1], body_features.shape[-1])
     nodes = torch.cat(
         [
@@ -76,8 +86,8 @@ def build_graph(
         ],
         dim=-2,
     )
-    position = torch.cat([mode_position, body_position], dim=-2)
     sender, receiver = edge_index
-    relative = position.index_select(-2, sender) - position.index_select(-2, receiver)
-    length = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
-    return Graph(nodes, torch.cat([relative, length], dim=-1), edge_index)
+    edges = position.index_select(-2, sender) - position.index_select(-2, receiver)
+    if edge_length:
+        edges = torch.cat([edges, torch.linalg.vector_norm(edges, dim=-1, keepdim=True)], dim=-1)
+    return Graph(nodes, edges, edge_index)

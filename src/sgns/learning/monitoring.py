@@ -85,7 +85,7 @@ class RolloutValidation(L.Callback):
         )
         trainer.logger.experiment.add_figure("force/validation", force_figure(self.rollouts, score), step)
         losses = ", ".join(
-            f"{k} {float(trainer.callback_metrics[f'loss/{k}']):.3g}" for k in ("acceleration", "force")
+            f"{k} {float(trainer.callback_metrics[f'loss/{k}']):.3g}" for k in ("change", "force")
         )
         log.info(
             "step %d of %d: loss %s; validation skill %.3f (from rest %.3f), force NRMSE %.3f",

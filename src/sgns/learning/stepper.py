@@ -82,7 +82,11 @@ class GraphStepper:
     @staticmethod
     def covers(network: EncodeProcessDecode) -> bool:
         """Whether the network has one message-passing step, no layer normalisation and no residual."""
-        return len(network.process) == 1 and not network.process[0].residual and network.encode_nodes.norm is None
+        return (
+            len(network.process) == 1
+            and not network.process[0].residual
+            and network.encode_nodes.norm is None
+        )
 
     def prepare_nodes(self, network: EncodeProcessDecode, node_count: int) -> None:
         """Weights and memory of all that has V rows."""
@@ -93,7 +97,9 @@ class GraphStepper:
         self.encode_nodes = hidden_layers(encode, encode.linears[:-1], node_count)
         # What receivers and senders add to their edges, and nodes to their own update, side by side.
         stacked = torch.cat([receiver, sender, kept])
-        self.project = Layer(*merged(stacked, torch.zeros_like(stacked[:, 0]), encode.linears[-1]), node_count)
+        self.project = Layer(
+            *merged(stacked, torch.zeros_like(stacked[:, 0]), encode.linears[-1]), node_count
+        )
         # The last layer of the edge update, behind the sum: its bias counts once per edge.
         last = step.edge_mlp.linears[-1]
         weight, once = merged(summed, torch.zeros_like(update.first.bias), last)

@@ -15,13 +15,14 @@ import torch
 from torch import Tensor, nn
 
 from sgns.errors import UserError
-from sgns.learning.dynamics import LatentDynamics, ModelSettings
+from sgns.learning.dynamics import LatentDynamics
+from sgns.learning.model_settings import ModelSettings
 from sgns.reduction.basis import Basis
 
 __all__ = ["Surrogate", "load_surrogate", "read_checkpoint"]
 
 _FORMAT = "sgns-surrogate"
-_FORMAT_VERSION = 1
+_FORMAT_VERSION = 2
 _PREFIX = "surrogate."
 # Whatever the bytes are, reading them as a checkpoint may fail in any of these ways.
 _UNREADABLE = (
@@ -80,6 +81,8 @@ class Surrogate(nn.Module):
             "format_version": _FORMAT_VERSION,
             "model": dynamics.settings.to_dict(),
             "num_modes": dynamics.num_modes,
+            "context": list(dynamics.context_keys),
+            "predicts_body": dynamics.predicts_body,
             "basis": state,
         }
 
@@ -141,7 +144,12 @@ def load_surrogate(path: str | Path) -> Surrogate:
     try:
         tensors = {name: state[f"basis_{name}"] for name in ("mean", "modes", "eigenvalues")}
         basis = Basis.from_state(card["basis"] | tensors, where=str(path))
-        dynamics = LatentDynamics(ModelSettings(**card["model"]), int(card["num_modes"]))
+        dynamics = LatentDynamics(
+            ModelSettings(**card["model"]),
+            int(card["num_modes"]),
+            tuple(map(str, card["context"])),
+            bool(card["predicts_body"]),
+        )
         surrogate = Surrogate(dynamics, basis, state["start_positions"], state["body_points"], card)
         surrogate.load_state_dict(state)
         surrogate.frame_rate  # noqa: B018  (present and a number)

@@ -1,6 +1,6 @@
 """The loss, the optimiser and its schedule.
 
-Letters: B batch, V nodes, r modes.
+Letters: B batch, V nodes, r modes, h steps of the horizon.
 """
 
 from __future__ import annotations
@@ -11,18 +11,23 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
 from torch import Tensor
 
 from sgns.errors import UserError
+from sgns.learning.body import BodyTrack
 from sgns.learning.data import Batch
+from sgns.learning.dynamics import LatentDynamics
+from sgns.learning.statistics import NOISE_UNITS, SCALES
 from sgns.learning.surrogate import Surrogate
 from sgns.settings import check_fields
 
 __all__ = ["SurrogateTraining", "TrainingSettings"]
 
 SCHEDULES = ("cosine", "exponential")
-LOSSES = ("acceleration", "force", "torque")
+LOSSES = ("change", "force", "torque")
+CHANGE_OF = ("free", "all")
 
 
 @dataclass(frozen=True)
@@ -35,10 +40,16 @@ class TrainingSettings:
     final_learning_rate: float
     warmup_steps: int
     schedule: str
+    decades: float
     weight_decay: float
     gradient_clip: float | None
     noise: float
+    noise_unit: str
+    scales: str
     normalisation_floor: float
+    horizon: int
+    fewer_modes: float
+    change_of: str
     loss: dict[str, float]
     validate_every: int
     log_every: int
@@ -63,6 +74,9 @@ class TrainingSettings:
             ("weight_decay", 0),
             ("noise", 0),
             ("normalisation_floor", 0),
+            ("decades", 0),
+            ("horizon", 1),
+            ("fewer_modes", 0),
             ("validate_every", 1),
             ("log_every", 1),
             ("threads", 1),
@@ -77,8 +91,20 @@ class TrainingSettings:
         for key, weight in settings.loss.items():
             if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not 0 <= weight < math.inf:
                 raise UserError(f"training.loss.{key} is {weight!r}; it must be a number, 0 or more")
-        if settings.schedule not in SCHEDULES:
-            raise UserError(f"training.schedule is {settings.schedule!r}; allowed: {', '.join(SCHEDULES)}")
+        if settings.fewer_modes > 1:
+            raise UserError(
+                f"training.fewer_modes is {settings.fewer_modes}; allowed: 0 to 1, a share of the steps"
+            )
+        for key, allowed in (
+            ("schedule", SCHEDULES),
+            ("noise_unit", NOISE_UNITS),
+            ("scales", SCALES),
+            ("change_of", CHANGE_OF),
+        ):
+            if getattr(settings, key) not in allowed:
+                raise UserError(
+                    f"training.{key} is {getattr(settings, key)!r}; allowed: {', '.join(allowed)}"
+                )
         if settings.resume not in ("auto", False):
             raise UserError(f"training.resume is {settings.resume!r}; allowed: auto, false")
         return settings
@@ -95,7 +121,7 @@ class TrainingSettings:
         done = min(1.0, (step - self.warmup_steps) / max(1, self.max_steps - self.warmup_steps))
         end = self.final_learning_rate / self.learning_rate
         if self.schedule == "exponential":
-            return end**done
+            return max(end, 10.0 ** (-self.decades * done))
         return end + (1 - end) * 0.5 * (1 + math.cos(math.pi * done))
 
 
@@ -113,21 +139,56 @@ class SurrogateTraining(L.LightningModule):
         self.settings = settings
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Squared errors of the normalised quantities, unweighted.
+        """Squared errors of the normalised quantities, unweighted: summed over axes, averaged over the nodes that
+        count, the steps of the horizon and the batch.
 
-        The acceleration's is summed over axes and averaged over the modes; the prescribed body's is no part
-        of it.
+        After one step the error of a position is the error of its predicted change. After k steps with the same error
+        it has grown k (k + 1) / 2 times, by which it is divided, or k times for predicted velocities.
         """
+        dynamics = self.dynamics_of(batch)
+        modes = dynamics.num_modes
+        latent, track, following = (
+            batch.history[:, :, :modes],
+            batch.shown_body,
+            batch.following[:, :, :modes],
+        )
+        seen = track.frames(slice(0, dynamics.history))
+        found: dict[str, list[Tensor]] = {name: [] for name in LOSSES}
+        for k in range(batch.horizon):
+            prediction = dynamics(latent, seen, batch.context)
+            step = dynamics.taken(prediction, latent, seen)
+            grown = (k + 1) * (k + 2) / 2 if dynamics.settings.predicts == "acceleration" else k + 1
+            error = (step.latent - following[:, k]) / dynamics.change.scale
+            if dynamics.predicts_body or self.settings.change_of == "all":
+                moved = dynamics.body_displacement(prediction, seen)
+                there = track.position[:, dynamics.history - 1 + k]
+                missed = (seen.position[:, -2] + moved - there) / dynamics.body_change.scale
+                if self.settings.change_of == "free":
+                    missed = missed * dynamics.free
+                error = torch.cat([error, missed], dim=-2)
+            found["change"].append((error / grown).float().square().sum(-1).mean())
+            for name in ("force", "torque"):
+                # The mean's share of every node cancels the mean in the target.
+                target = getattr(dynamics, name).normalise(getattr(batch, name)[:, k])
+                found[name].append((getattr(prediction, name).sum(-2) - target).square().sum(-1).mean())
+            if k + 1 < batch.horizon:
+                latent = torch.cat([latent[:, 1:], step.latent[:, None]], dim=1)
+                seen = seen.moved_last(step.displacement) if dynamics.predicts_body else seen
+                coming = track.frames(slice(dynamics.history + k, dynamics.history + k + 1))
+                seen = BodyTrack(
+                    *(torch.cat([a[:, 1:], b], dim=1) for a, b in zip(seen, coming, strict=True))
+                )
+        return {name: torch.stack(values).mean() for name, values in found.items()}
+
+    def dynamics_of(self, batch: Batch) -> LatentDynamics:
+        """The network, in some steps with a part of its modes only, so that it learns to do without the last ones."""
         dynamics = self.surrogate.dynamics
-        prediction = dynamics(batch.history, batch.body)
-        found = {
-            "acceleration": prediction.acceleration - dynamics.acceleration.normalise(batch.acceleration)
-        }
-        for name in ("force", "torque"):
-            # The mean's share of every node cancels the mean in the target.
-            target = getattr(dynamics, name).normalise(getattr(batch, name))
-            found[name] = getattr(prediction, name).sum(-2) - target
-        return {name: error.square().sum(-1).mean() for name, error in found.items()}
+        if self.settings.fewer_modes == 0 or not self.training:
+            return dynamics
+        draw = np.random.default_rng([self.global_step, dynamics.num_modes])
+        if draw.random() >= self.settings.fewer_modes:
+            return dynamics
+        return dynamics.with_modes(int(draw.integers(1, dynamics.num_modes + 1)))
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         """The weighted loss; stops the training when it is not finite."""

@@ -14,7 +14,7 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,14 +26,17 @@ from omegaconf import OmegaConf
 
 import sgns
 from sgns.errors import UserError
-from sgns.learning.data import TrainingWindows, WindowDataModule, fit_normalisation
-from sgns.learning.dynamics import LatentDynamics, ModelSettings
+from sgns.learning.context import varying_context
+from sgns.learning.data import TrainingWindows, WindowDataModule
+from sgns.learning.dynamics import LatentDynamics
+from sgns.learning.model_settings import ModelSettings
 from sgns.learning.monitoring import RolloutValidation, StepProgress
+from sgns.learning.statistics import fit_normalisation
 from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.validation import ValidationRollouts
 from sgns.poses import in_body_frame
-from sgns.reduction.reduced import ReducedDataset, reduce_dataset
+from sgns.reduction.reduced import ReducedDataset, ReducedRun, reduce_dataset
 from sgns.settings import check_fields, differences, flattened
 from sgns.wholefile import write_whole
 
@@ -51,12 +54,16 @@ _NO_MATTER = ("threads", "log_every", "resume")
 def main(cfg: DictConfig) -> float:
     """The `sgns train` command; returns the rollout skill on the validation runs."""
     from sgns.campaign import Dataset
+    from sgns.published_dataset import published_dataset
 
     plain = OmegaConf.to_container(cfg, resolve=True)
     threads = TrainingSettings.from_dict(plain["training"]).threads
     if threads is not None:
         torch.set_num_threads(threads)  # for the reduction, too
-    reduced = reduce_dataset(Dataset.open(cfg.dataset.path), cfg.reduction)
+    if cfg.dataset.get("format") == "published":
+        reduced = published_dataset(plain["dataset"], cfg.reduction.num_modes)
+    else:
+        reduced = reduce_dataset(Dataset.open(cfg.dataset.path), cfg.reduction)
     return train(
         reduced,
         num_modes=cfg.reduction.num_modes,
@@ -136,7 +143,11 @@ def train(
     torch.manual_seed(seed)
     surrogate, data = prepared(reduced, num_modes, model_settings, settings, seed, card, start_from)
     rollouts = ValidationRollouts(
-        validation_runs, num_modes, model_settings.history, model_settings.body_nodes
+        validation_runs,
+        num_modes,
+        model_settings.history,
+        model_settings.body_nodes,
+        surrogate.dynamics.context_keys,
     )
     callbacks = [RolloutValidation(rollouts, output, settings), StepProgress(settings.max_steps)]
     module = SurrogateTraining(surrogate, settings)
@@ -148,6 +159,8 @@ def train(
 
     score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
     metrics = {"skill": score.skill, "skill_at_rest": score.skill_at_rest, "force_nrmse": score.force_nrmse}
+    if surrogate.dynamics.predicts_body:
+        metrics["body_rmse"] = score.body_rmse
     trainer.logger.log_hyperparams(
         hyperparameters(card["settings"]), {f"final/{key}": value for key, value in metrics.items()}
     )
@@ -187,12 +200,19 @@ def prepared(
 ) -> tuple[Surrogate, WindowDataModule]:
     """The untrained surrogate with its statistics, and its data."""
     runs = reduced.runs("train")
-    windows = TrainingWindows(runs, num_modes, model.history, model.body_nodes, seed)
-    dynamics = LatentDynamics(model, num_modes)
-    noise_scale = fit_normalisation(dynamics, windows, settings.noise, settings.normalisation_floor)
+    context = tuple(varying_context(runs, model.context))
+    windows = TrainingWindows(
+        runs, num_modes, model.history, model.body_nodes, seed, settings.horizon, context
+    )
+    dynamics = LatentDynamics(model, num_modes, context, moves_freely(runs))
+    noise = fit_normalisation(
+        dynamics, windows, settings.noise, settings.noise_unit, settings.scales, settings.normalisation_floor
+    )
     if start_from is not None:
         given = load_surrogate(start_from)
-        if given.dynamics.settings != model or given.basis.arrangement_hash != reduced.arrangement_hash:
+        other = given.dynamics
+        known = (other.settings, other.context_keys, other.predicts_body, given.basis.arrangement_hash)
+        if known != (model, context, dynamics.predicts_body, reduced.arrangement_hash):
             raise UserError(
                 f"{start_from} has another model or another bed; use the same model.* and "
                 "dataset, or checkpoint=null"
@@ -207,7 +227,18 @@ def prepared(
     surrogate = Surrogate(
         dynamics, reduced.basis.sliced(num_modes), torch.as_tensor(reduced.start_positions), points, card
     )
-    return surrogate, WindowDataModule(windows, settings.batch_size, noise_scale)
+    return surrogate, WindowDataModule(windows, settings.batch_size, noise)
+
+
+def moves_freely(runs: Sequence[ReducedRun]) -> bool:
+    """Whether the body moves as the soil lets it, which only a wheel's axle does; refuses a mixture."""
+    free = {run.scene.get("kind") == "wheel" for run in runs}
+    if len(free) > 1:
+        raise UserError(
+            "the training runs mix wheels, whose height is predicted, with bodies whose motion is prescribed; keep one "
+            "dataset for each"
+        )
+    return free.pop()
 
 
 def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> str:

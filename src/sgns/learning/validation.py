@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from sgns.learning.body import BodyTrack, body_track
+from sgns.learning.context import context_of
 from sgns.learning.data import pad_start
 from sgns.learning.dynamics import LatentDynamics
 
@@ -31,6 +32,7 @@ class RolloutScore(NamedTuple):
         skill_at_rest: The same when only the start at rest is given [1].
         force_nrmse: RMS of the force error's length / RMS of the force's length [1].
         force_nrmse_at_rest: The same when only the start at rest is given [1].
+        body_rmse: RMS distance between predicted and true body nodes [m]; 0 for a prescribed body.
         force: Predicted from d true frames [N], shape (B, T, 3), zero in the history.
     """
 
@@ -38,6 +40,7 @@ class RolloutScore(NamedTuple):
     skill_at_rest: float
     force_nrmse: float
     force_nrmse_at_rest: float
+    body_rmse: float
     force: Tensor
 
 
@@ -49,9 +52,17 @@ class ValidationRollouts:
         num_modes: r.
         history: d.
         body_nodes: "pose" or "points".
+        context: Keys of the scene whose numbers the network is told.
     """
 
-    def __init__(self, runs: Sequence[ReducedRun], num_modes: int, history: int, body_nodes: str) -> None:
+    def __init__(
+        self,
+        runs: Sequence[ReducedRun],
+        num_modes: int,
+        history: int,
+        body_nodes: str,
+        context: Sequence[str] = (),
+    ) -> None:
         self.names = [run.name for run in runs]
         self.lengths = [len(run.latent) for run in runs]
         longest = max(self.lengths)
@@ -64,6 +75,7 @@ class ValidationRollouts:
         self.force = stacked([run.force for run in runs])
         tracks = [body_track(run.pose, run.body_points, body_nodes) for run in runs]
         self.body = BodyTrack(*(stacked(parts) for parts in zip(*tracks, strict=True)))
+        self.context = torch.as_tensor(np.stack([context_of(run.scene, context) for run in runs]))
         self.history = history
         frame = torch.arange(longest)
         self.counted = (frame < torch.tensor(self.lengths)[:, None]) & (frame >= history)
@@ -78,8 +90,8 @@ class ValidationRollouts:
         device = next(dynamics.parameters()).device
         given, start = self.latent[:, : self.history], self.latent[:, :1].expand(-1, self.history, -1, -1)
         with torch.inference_mode():
-            latent, force = rolled(dynamics, given, self.body, device)
-            at_rest, force_at_rest = rolled(dynamics, start, self.body_at_rest, device)
+            latent, force, body = self.rolled(dynamics, given, self.body, device)
+            at_rest, force_at_rest, _ = self.rolled(dynamics, start, self.body_at_rest, device)
             at_rest, force_at_rest = at_rest[:, self.padding :], force_at_rest[:, self.padding :]
             frozen = self.squares(given[:, -1:] - self.latent)
             return RolloutScore(
@@ -87,6 +99,7 @@ class ValidationRollouts:
                 1 - self.squares(at_rest - self.latent) / frozen,
                 self.force_error(force),
                 self.force_error(force_at_rest),
+                self.body_error(body) if dynamics.predicts_body else 0.0,
                 force,
             )
 
@@ -106,10 +119,16 @@ class ValidationRollouts:
         )
         return (error / max(truth, 1e-30)) ** 0.5 if np.isfinite(error) else float("inf")
 
+    def body_error(self, body: BodyTrack) -> float:
+        """RMS distance of body nodes from where they are in truth, over all counted frames [m]."""
+        squares = (body.position - self.body.position).square().sum(-1).mean(-1)
+        error = float(torch.where(self.counted, squares, 0.0).sum() / self.counted.sum())
+        return error**0.5 if np.isfinite(error) else float("inf")
 
-def rolled(
-    dynamics: LatentDynamics, latent: Tensor, body: BodyTrack, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Latent positions [m] and force [N] of an unrolling, computed on `device`, returned on the CPU."""
-    states, force, _ = dynamics.unroll(latent.to(device), BodyTrack(*(part.to(device) for part in body)))
-    return states.cpu(), force.cpu()
+    def rolled(
+        self, dynamics: LatentDynamics, latent: Tensor, body: BodyTrack, device: torch.device
+    ) -> tuple[Tensor, Tensor, BodyTrack]:
+        """Latent positions [m], force [N] and body of an unrolling, computed on `device`, returned on the CPU."""
+        track = BodyTrack(*(part.to(device) for part in body))
+        path = dynamics.unroll(latent.to(device), track, self.context.to(device))
+        return path.latent.cpu(), path.force.cpu(), BodyTrack(*(part.cpu() for part in path.body))

@@ -7,8 +7,10 @@ import pytest
 import torch
 from tiny import MODEL, reduced
 
-from sgns.learning.data import TrainingWindows, fit_normalisation, generator, random_walk
-from sgns.learning.dynamics import LatentDynamics, ModelSettings
+from sgns.learning.data import NoiseScales, TrainingWindows, generator, random_walk
+from sgns.learning.dynamics import LatentDynamics
+from sgns.learning.model_settings import ModelSettings
+from sgns.learning.statistics import fit_normalisation
 
 
 @pytest.fixture(scope="module")
@@ -20,6 +22,11 @@ def windows_of(data, history: int = 3, seed: int = 0) -> TrainingWindows:
     return TrainingWindows(data.runs("train"), 4, history, "pose", seed)
 
 
+def still(scale: float | torch.Tensor = 0.0) -> NoiseScales:
+    """Noise on the modes only."""
+    return NoiseScales(scale * torch.ones(4, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+
+
 def test_every_frame_but_the_first_is_a_target(data) -> None:
     windows = windows_of(data)
     assert len(windows) == 4 * 13
@@ -27,7 +34,7 @@ def test_every_frame_but_the_first_is_a_target(data) -> None:
     for i, run in enumerate(data.runs("train")):
         rows = slice(13 * i, 13 * (i + 1))
         np.testing.assert_array_equal(batch.latent[rows, -1], run.latent[1:, :4])
-        np.testing.assert_array_equal(batch.force[rows], run.force[1:])
+        np.testing.assert_array_equal(batch.force[rows, 0], run.force[1:])
         np.testing.assert_array_equal(batch.body.position[rows, -1, 0], run.pose[1:, :3])
 
 
@@ -49,7 +56,7 @@ def test_windows_do_not_reach_across_runs(data) -> None:
 
 
 def test_batches_depend_on_seed_and_step_only(data) -> None:
-    scale = torch.rand(4, 3, dtype=torch.float64)
+    scale = still(torch.rand(4, 3, dtype=torch.float64))
     stream = windows_of(data).batches(8, scale)
     for _ in range(9):
         drawn = next(stream)
@@ -62,7 +69,7 @@ def test_batches_depend_on_seed_and_step_only(data) -> None:
 def test_an_epoch_shows_every_window_once(data) -> None:
     windows = windows_of(data)
     # 52 windows in batches of 8: batches straddle epochs; two epochs are 13 batches.
-    seen = torch.cat([windows.batch(step, 8, torch.zeros(4, 3)).latent[:, -1] for step in range(13)])
+    seen = torch.cat([windows.batch(step, 8, still()).latent[:, -1] for step in range(13)])
     counts = torch.unique(seen.flatten(1), dim=0, return_counts=True)[1]
     assert counts.tolist() == [2] * 52
 
@@ -82,24 +89,54 @@ def test_noise_is_a_walk_of_the_stated_size() -> None:
 
 
 def test_the_target_undoes_the_noise_of_the_velocity(data) -> None:
-    windows = windows_of(data)
-    batch = windows.batch(0, 8, 1e-3 * torch.ones(4, 3, dtype=torch.float64))
-    shown = batch.history
-    following = 2 * shown[:, -1] - shown[:, -2] + batch.acceleration
+    batch = windows_of(data).batch(0, 8, still(1e-3))
     clean_velocity = batch.latent[:, -1] - batch.latent[:, -2]
-    torch.testing.assert_close(following - shown[:, -1], clean_velocity, rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        batch.following[:, 0] - batch.history[:, -1], clean_velocity, rtol=0, atol=1e-12
+    )
 
 
-def test_without_noise_the_target_is_the_second_difference(data) -> None:
-    batch = windows_of(data).batch(0, 8, torch.zeros(4, 3))
-    torch.testing.assert_close(batch.acceleration, batch.latent.diff(n=2, dim=1)[:, -1], rtol=0, atol=1e-12)
+def test_noise_of_the_body_moves_its_motion_along(data) -> None:
+    noise = NoiseScales(
+        torch.zeros(4, 3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1e-3], dtype=torch.float64)
+    )
+    batch = windows_of(data).batch(0, 8, noise)
+    shown, clean = batch.shown_body, batch.body
+    assert torch.equal(shown.position[..., :2], clean.position[..., :2])
+    torch.testing.assert_close(
+        shown.position[:, :2, 0, 2] - clean.position[:, :2, 0, 2], batch.body_noise[:, 1:, 0, 2]
+    )
+    torch.testing.assert_close(
+        shown.motion[:, 1, :, :3], shown.position[:, 1] - shown.position[:, 0], rtol=0, atol=1e-12
+    )
+    # The motion into the target is the true one: the position error of the history stays.
+    torch.testing.assert_close(shown.motion[:, -1], clean.motion[:, -1], rtol=0, atol=1e-12)
+
+
+def test_a_horizon_gives_as_many_targets(data) -> None:
+    windows = TrainingWindows(data.runs("train"), 4, 3, "pose", horizon=4)
+    assert len(windows) == 4 * 10
+    batch = windows.windows(windows.targets)
+    run = data.runs("train")[1]
+    np.testing.assert_array_equal(batch.following[10], run.latent[1:5, :4])
+    np.testing.assert_array_equal(batch.force[19], run.force[10:14])
+    assert batch.body.position.shape[1] == 2 + 4
+    np.testing.assert_array_equal(batch.body.position[19, -1, 0], run.pose[13, :3])
+
+
+def test_context_is_that_of_the_run(data) -> None:
+    windows = TrainingWindows(data.runs("train"), 4, 3, "pose", context=["depth", "blade.width"])
+    batch = windows.windows(windows.targets[[0, 13, 26]])
+    for row, run in zip(batch.context, data.runs("train"), strict=False):
+        assert row.tolist() == [run.scene["depth"], run.scene["blade"]["width"]]
 
 
 def test_normalised_training_quantities_are_of_order_one(data) -> None:
     windows = windows_of(data)
     dynamics = LatentDynamics(ModelSettings(**MODEL), 4)
-    noise_scale = fit_normalisation(dynamics, windows, noise=0.1, floor=0.01)
-    torch.testing.assert_close(noise_scale, 0.1 * dynamics.velocity.scale)
+    noise = fit_normalisation(dynamics, windows, 0.1, "velocity", "per_mode", 0.01)
+    torch.testing.assert_close(noise.latent, 0.1 * dynamics.velocity.scale)
+    assert not noise.body.any()
     batch = windows.windows(windows.targets)
     velocity = dynamics.velocity.normalise(batch.latent.diff(dim=1)[:, -1])
     assert 0.9 < float(velocity[:, 0, 0].square().mean()) < 1.1

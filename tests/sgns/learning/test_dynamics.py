@@ -8,8 +8,10 @@ from tiny import MODEL, reduced
 
 from sgns.errors import UserError
 from sgns.learning.body import BodyTrack
-from sgns.learning.data import TrainingWindows, fit_normalisation
-from sgns.learning.dynamics import LatentDynamics, ModelSettings
+from sgns.learning.data import TrainingWindows
+from sgns.learning.dynamics import LatentDynamics
+from sgns.learning.model_settings import ModelSettings
+from sgns.learning.statistics import fit_normalisation
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +24,7 @@ def fitted(data, body_nodes: str = "pose") -> tuple[LatentDynamics, TrainingWind
     settings = ModelSettings(**(MODEL | {"body_nodes": body_nodes}))
     windows = TrainingWindows(data.runs("train"), 4, settings.history, body_nodes)
     dynamics = LatentDynamics(settings, 4)
-    fit_normalisation(dynamics, windows, 0.1, 0.01)
+    fit_normalisation(dynamics, windows, 0.1, "velocity", "per_mode", 0.01)
     return dynamics.requires_grad_(False), windows
 
 
@@ -34,7 +36,7 @@ def test_force_is_the_sum_of_contributions(data, body_nodes) -> None:
     nodes = 4 + (1 if body_nodes == "pose" else 15)
     contributions, turning = dynamics.force_contributions(prediction)
     assert contributions.shape == turning.shape == (4, nodes, 3)
-    _, force, torque = dynamics.advance(batch.history, batch.body)
+    _, force, torque, _ = dynamics.advance(batch.history, batch.body)
     torch.testing.assert_close(contributions.sum(1), force)
     torch.testing.assert_close(turning.sum(1), torque)
     # The mean is in the sum once, however many nodes share it.
@@ -46,8 +48,8 @@ def test_force_is_the_sum_of_contributions(data, body_nodes) -> None:
 def test_position_update(data) -> None:
     dynamics, windows = fitted(data)
     batch = windows.windows(windows.targets[5:9])
-    following, _, _ = dynamics.advance(batch.history, batch.body)
-    acceleration = dynamics.acceleration.denormalise(dynamics(batch.history, batch.body).acceleration)
+    following, *_ = dynamics.advance(batch.history, batch.body)
+    acceleration = dynamics.change.denormalise(dynamics(batch.history, batch.body).change[:, :4])
     z = batch.history
     torch.testing.assert_close(following, z[:, -1] + (z[:, -1] - z[:, -2]) + acceleration)
 
@@ -56,10 +58,10 @@ def test_unrolling_is_stepping(data) -> None:
     dynamics, windows = fitted(data)
     frames = torch.arange(10)
     body = BodyTrack(*(part[frames][None] for part in windows.body))
-    latent, force, _ = dynamics.unroll(windows.latent[None, :3], body)
+    latent, force, *_ = dynamics.unroll(windows.latent[None, :3], body)
     states = [windows.latent[i] for i in range(3)]
     for t in range(3, 10):
-        z, f, _ = dynamics.advance(torch.stack(states[-3:])[None], body.frames(slice(t - 2, t + 1)))
+        z, f, *_ = dynamics.advance(torch.stack(states[-3:])[None], body.frames(slice(t - 2, t + 1)))
         states.append(z[0])
         assert torch.equal(f[0], force[0, t])
     assert torch.equal(torch.stack(states), latent[0])
@@ -84,13 +86,13 @@ def test_modes_are_told_apart(data) -> None:
     for standard in (dynamics.position, dynamics.velocity):
         standard.mean.zero_(), standard.scale.fill_(1.0)
     order = torch.tensor([1, 0, 2, 3])
-    swapped = dynamics(batch.history[:, :, order], batch.body).acceleration[:, order]
-    plain = dynamics(batch.history, batch.body).acceleration
+    swapped = dynamics(batch.history[:, :, order], batch.body).change[:, order]
+    plain = dynamics(batch.history, batch.body).change[:, :4]
     assert not torch.allclose(swapped, plain)
     # With their identities exchanged as well, only names have changed.
     weight = dynamics.identity.weight
     weight[:2] = weight[[1, 0]].clone()
-    swapped = dynamics(batch.history[:, :, order], batch.body).acceleration[:, order]
+    swapped = dynamics(batch.history[:, :, order], batch.body).change[:, order]
     torch.testing.assert_close(swapped, plain)
 
 

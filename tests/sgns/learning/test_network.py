@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sgns.learning.graph import complete_graph
+from sgns.learning.graph import edge_indices
 from sgns.learning.network import MLP, EncodeProcessDecode, InteractionNetwork
 
 
@@ -25,7 +25,7 @@ def by_hand(mlp: MLP, x: np.ndarray) -> np.ndarray:
 def test_one_step_by_hand(residual: bool) -> None:
     torch.manual_seed(1)
     step = InteractionNetwork(5, 7, 2, residual=residual).double()
-    nodes, edges, index = torch.randn(4, 5).double(), torch.randn(12, 5).double(), complete_graph(4)
+    nodes, edges, index = torch.randn(4, 5).double(), torch.randn(12, 5).double(), edge_indices(3, 1)
     found_nodes, found_edges = step(nodes, edges, index)
 
     v, e = nodes.numpy(), edges.numpy()
@@ -39,10 +39,11 @@ def test_one_step_by_hand(residual: bool) -> None:
 
 
 EDGES = {
-    "complete": complete_graph,
-    "self_loops": with_self_loops,
-    # In no order, with a node that receives nothing.
-    "sparse": lambda v: complete_graph(v)[:, torch.randperm(v * (v - 1))][:, : 2 * v].clamp(max=v - 2),
+    "complete": edge_indices(3, 2),
+    "self_loops": edge_indices(3, 2, self_loops=True),
+    "star": edge_indices(3, 2, "star"),
+    # In no order, some twice, with a node that receives nothing.
+    "any": torch.tensor([[4, 0, 2, 2, 3, 0, 1], [1, 2, 0, 0, 3, 1, 2]]),
 }
 
 
@@ -62,7 +63,7 @@ def outcome(form, network: EncodeProcessDecode, nodes, edges, index) -> list[tor
 def test_the_algebra_changes_nothing(residual, layer_norm, steps, activation, edges) -> None:
     torch.manual_seed(2)
     network = EncodeProcessDecode(6, 4, 9, 16, 2, steps, layer_norm, residual, activation).double()
-    index = EDGES[edges](5)
+    index = EDGES[edges]
     inputs = torch.randn(3, 5, 6).double(), torch.randn(3, index.shape[1], 4).double()
     expected = outcome(network.plain, network, *inputs, index)
     for a, b in zip(outcome(network, network, *inputs, index), expected, strict=True):
@@ -73,7 +74,7 @@ def test_the_algebra_changes_nothing(residual, layer_norm, steps, activation, ed
 def test_the_algebra_changes_nothing_in_float32_at_the_papers_size(hidden_layers) -> None:
     torch.manual_seed(3)
     network = EncodeProcessDecode(20, 4, 9, hidden_layers=hidden_layers)
-    index = complete_graph(23)
+    index = edge_indices(8, 15)
     inputs = torch.randn(9, 23, 20), torch.randn(9, 506, 4)
     expected = outcome(network.plain, network, *inputs, index)
     for a, b in zip(outcome(network, network, *inputs, index), expected, strict=True):
@@ -83,7 +84,7 @@ def test_the_algebra_changes_nothing_in_float32_at_the_papers_size(hidden_layers
 def test_a_batch_is_its_graphs_one_by_one() -> None:
     torch.manual_seed(3)
     network = EncodeProcessDecode(6, 4, 9, hidden=16, steps=2, layer_norm=True, residual=True).double()
-    nodes, edges, index = torch.randn(3, 5, 6).double(), torch.randn(3, 20, 4).double(), complete_graph(5)
+    nodes, edges, index = torch.randn(3, 5, 6).double(), torch.randn(3, 20, 4).double(), edge_indices(4, 1)
     together = network(nodes, edges, index)
     alone = torch.stack([network(n, e, index) for n, e in zip(nodes, edges, strict=True)])
     torch.testing.assert_close(together, alone)
@@ -92,7 +93,7 @@ def test_a_batch_is_its_graphs_one_by_one() -> None:
 def test_renaming_nodes_renames_the_answer() -> None:
     torch.manual_seed(4)
     network = EncodeProcessDecode(6, 4, 9, hidden=16, steps=2).double()
-    nodes, index = torch.randn(1, 5, 6).double(), complete_graph(5)
+    nodes, index = torch.randn(1, 5, 6).double(), edge_indices(4, 1)
     pair = torch.randn(5, 5, 4).double()
     order = torch.randperm(5)
     first = network(nodes, pair[index[0], index[1]][None], index)
@@ -104,7 +105,7 @@ def test_renaming_nodes_renames_the_answer() -> None:
 def test_the_order_of_edges_does_not_matter() -> None:
     torch.manual_seed(5)
     network = EncodeProcessDecode(6, 4, 9, hidden=16).double()
-    nodes, edges, index = torch.randn(1, 5, 6).double(), torch.randn(1, 20, 4).double(), complete_graph(5)
+    nodes, edges, index = torch.randn(1, 5, 6).double(), torch.randn(1, 20, 4).double(), edge_indices(4, 1)
     order = torch.randperm(20)
     torch.testing.assert_close(network(nodes, edges, index), network(nodes, edges[:, order], index[:, order]))
 
@@ -115,7 +116,7 @@ def test_leading_dimensions_and_blocks_are_free(monkeypatch) -> None:
     nodes, edges, index = (
         torch.randn(2, 3, 5, 6).double(),
         torch.randn(2, 3, 20, 4).double(),
-        complete_graph(5),
+        edge_indices(4, 1),
     )
     together = network(nodes, edges, index)
     assert together.shape == (2, 3, 5, 9)
@@ -129,7 +130,7 @@ def test_the_inputs_are_left_as_they_are() -> None:
     network = EncodeProcessDecode(6, 4, 9, hidden=16, steps=2, layer_norm=True, residual=True)
     nodes, edges = torch.randn(2, 5, 6), torch.randn(2, 20, 4)
     before = nodes.clone(), edges.clone()
-    network(nodes, edges, complete_graph(5))
+    network(nodes, edges, edge_indices(4, 1))
     assert torch.equal(nodes, before[0]) and torch.equal(edges, before[1])
 
 

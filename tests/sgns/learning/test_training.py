@@ -15,6 +15,7 @@ from tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
 
 import sgns.learning.training as module
 from sgns.errors import UserError
+from sgns.learning.dynamics import Path
 from sgns.learning.trainee import TrainingSettings
 from sgns.learning.training import main, train
 from sgns.learning.validation import ValidationRollouts
@@ -99,7 +100,7 @@ def test_what_tensorboard_shows(data, tmp_path) -> None:
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     scalars = set(events.Tags()["scalars"])
-    assert {"loss/acceleration", "loss/force", "loss/torque", "loss/total"} <= scalars
+    assert {"loss/change", "loss/force", "loss/torque", "loss/total"} <= scalars
     assert {"skill/validation", "skill/validation_at_rest", "force_nrmse/validation"} <= scalars
     assert {"learning_rate", "samples_per_s", "final/skill", "final/force_nrmse"} <= scalars
     assert events.Tags()["images"] == ["force/validation"]
@@ -155,11 +156,13 @@ def test_skill_of_truth_and_of_a_frozen_bed(data) -> None:
             self.weight = torch.nn.Parameter(torch.zeros(1))
             self.answers = latent, force
 
-        def unroll(self, latent, body):
+        predicts_body = False
+
+        def unroll(self, latent, body, context):
             frames = body.position.shape[1]
             pad = frames - self.answers[0].shape[1]
             answers = [torch.cat([a[:, :1].expand(-1, pad, *a.shape[2:]), a], 1) for a in self.answers]
-            return answers[0], answers[1], None
+            return Path(*answers, None, body)
 
     perfect = rollouts.measure(Known(rollouts.latent, rollouts.force))
     assert perfect.skill == pytest.approx(1.0) and perfect.force_nrmse == 0.0
@@ -194,7 +197,7 @@ def test_schedule() -> None:
         ("max_steps", True),
         ("threads", 0),
         ("gradient_clip", 0.0),
-        ("loss", {"acceleration": 1.0, "force": "x", "torque": 1.0}),
+        ("loss", {"change": 1.0, "force": "x", "torque": 1.0}),
         ("loss", None),
         ("x", 1),
     ],
