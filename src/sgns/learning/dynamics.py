@@ -226,6 +226,15 @@ class LatentDynamics(nn.Module):
         change = self.body_change.denormalise(prediction.change[:, self.num_modes :])
         return change + body.motion[:, -2, :, :3] if self.settings.predicts == "acceleration" else change
 
+    def stepper(self, body_points: int, context: Tensor | None = None) -> PathStepper:
+        """Takes the steps of one path without gradients, much faster than `advance`, with the weights as they are now.
+
+        Args:
+            body_points: M.
+            context: Numbers of the run, shape (1, K); not needed when K is 0.
+        """
+        return PathStepper(self, 1 if self.settings.body_nodes == "pose" else body_points, context)
+
     def unroll(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Path:
         """Follow whole tool paths from a given history, feeding predictions back.
 
@@ -243,7 +252,7 @@ class LatentDynamics(nn.Module):
         force = torch.zeros((latent.shape[0], frames, 3), dtype=torch.float64, device=latent.device)
         torque = torch.zeros_like(force)
         alone = latent.shape[0] == 1 and not torch.is_grad_enabled()
-        stepper = PathStepper(self, body.position.shape[-2], context) if alone else None
+        stepper = self.stepper(body.position.shape[-2], context) if alone else None
         if stepper is not None and not self.predicts_body:
             loads = stepper.follow(states[0], body)
             force[0, d:] = loads[:, :3]
