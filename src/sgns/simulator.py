@@ -2,7 +2,7 @@
 
 Of a wheel, whose height follows from the soil, the pose that is put in says how it is driven, and the height comes out.
 
-Letters: T frames, n particles, M body points, N body nodes, d history positions, r modes.
+Letters: B paths, T frames, n particles, M body points, N body nodes, d history positions, r modes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from sgns.learning.surrogate import Surrogate, load_surrogate
 from sgns.poses import check_poses, fitted_poses, in_world_frame
 from sgns.reduction.basis import Basis
 
-__all__ = ["Rollout", "Simulator", "State"]
+__all__ = ["Rollout", "Rollouts", "Simulator", "State"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +69,25 @@ class Rollout:
     torque: np.ndarray
     poses: np.ndarray
     body_points: np.ndarray
+    wall_time_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Rollouts:
+    """Many tool paths, B of them.
+
+    Attributes:
+        latent: Modes [m], shape (B, T, r, 3), float64.
+        force: By the soil on the tool [N], shape (B, T, 3); zero in frame 0.
+        torque: About its centre of mass [N m], shape (B, T, 3); zero in frame 0.
+        poses: Of the tool, shape (B, T, 7); predicted where the tool is free.
+        wall_time_s: Time of all steps, force included, decoding not [s].
+    """
+
+    latent: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    poses: np.ndarray
     wall_time_s: float
 
 
@@ -188,7 +207,8 @@ class Simulator:
             values = scene.to_dict()
         elif scene is not None:
             pose = np.atleast_2d(np.asarray(scene, dtype=np.float64))[0]
-        self._frame, self._points, self._context = 0, points, self._context_of(values)
+        self._frame, self._points = 0, points
+        self._stepper = self._dynamics.stepper(len(points), self._context_of(values))
         self._poses: list[np.ndarray] = []
         if history is None:
             latent = self._start_latent.expand(self.history, -1, -1)
@@ -224,7 +244,7 @@ class Simulator:
         window = np.stack([*self._poses, pose])
         body = self._track(window, in_world_frame(window, self._points)).frames(slice(1, None))
         with torch.inference_mode():
-            step = self._dynamics.advance(self._latent, body, self._context)
+            step = self._stepper.advance(self._latent, body)
             self._latent = torch.cat([self._latent[:, 1:], step.latent[:, None]], dim=1)
         if self.predicts_body:
             there = body.position[0, -2] + step.displacement[0]
@@ -272,8 +292,7 @@ class Simulator:
                     f"the path has {len(poses)} frames; with a given history it needs at least {d}"
                 )
         world = in_world_frame(poses, points)
-        track = self._track(np.concatenate([poses[:1].repeat(padding, 0), poses]),
-                            np.concatenate([world[:1].repeat(padding, 0), world]))  # fmt: skip
+        track = self._track(pad_start(poses, padding), pad_start(world, padding))
         context = self._context_of(values)
         began = time.perf_counter()
         with torch.inference_mode():
@@ -291,6 +310,63 @@ class Simulator:
             poses = self._predicted_poses(poses, nodes, points)
             world = nodes if self._dynamics.settings.body_nodes == "points" else in_world_frame(poses, points)
         return Rollout(states, force, torque, poses, world, wall_time)
+
+    def rollouts(
+        self,
+        poses: np.ndarray,
+        body_points: np.ndarray | None = None,
+        values: Mapping[str, Any] | None = None,
+        paths_at_once: int = 256,
+    ) -> Rollouts:
+        """Follow many tool paths side by side, each from the bed at rest; one by one they give the same to rounding.
+
+        Args:
+            poses: Tool on every path at every frame, shape (B, T, 7).
+            body_points: In the body frame [m], shape (M, 3), for all; None: those of the training runs.
+            values: The scene as plain data, as for `reset`, for all.
+            paths_at_once: Paths stepped together: bounds the memory beside the result.
+
+        Returns:
+            The rollouts.
+
+        Raises:
+            UserError: A pose is bad, or `poses` is no array of paths.
+        """
+        poses = np.asarray(poses, dtype=np.float64)
+        if poses.ndim != 3 or poses.shape[2] != 7 or 0 in poses.shape:
+            raise UserError(f"the paths have shape {poses.shape}; they need (paths, frames, 7)")
+        if paths_at_once < 1:
+            raise UserError(f"paths_at_once is {paths_at_once}; it must be at least 1")
+        points = self.body_points if body_points is None else np.asarray(body_points, dtype=np.float64)
+        poses = np.stack([check_poses(path, f"path {i}") for i, path in enumerate(poses)])
+        began = time.perf_counter()
+        with torch.inference_mode():
+            parts = [
+                self._from_rest(poses[first : first + paths_at_once], points, self._context_of(values))
+                for first in range(0, len(poses), paths_at_once)
+            ]
+        latent, force, torque, poses = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return Rollouts(latent, force, torque, poses, time.perf_counter() - began)
+
+    def _from_rest(
+        self, poses: np.ndarray, points: np.ndarray, context: Tensor
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Latent positions, force, torque and poses of some paths (B, T, 7) that begin with the bed at rest."""
+        padding = self.history - 1
+        tracks = [
+            self._track(pad_start(path, padding), pad_start(in_world_frame(path, points), padding))
+            for path in poses
+        ]
+        track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
+        latent = self._start_latent.to(self.device).expand(len(poses), self.history, -1, -1)
+        path = self._dynamics.unroll(latent, track, context.expand(len(poses), -1))
+        found = (part[:, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque))
+        if self.predicts_body:
+            nodes = path.body.position[:, padding:].cpu().numpy()
+            poses = np.stack(
+                [self._predicted_poses(*pair, points) for pair in zip(poses, nodes, strict=True)]
+            )
+        return (*found, poses)  # type: ignore[return-value]
 
     def _predicted_poses(self, poses: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Poses (T, 7) of body nodes (T, N, 3) [m]; the prescribed orientation of a pose node is kept."""
@@ -322,3 +398,8 @@ class Simulator:
 
     def _pose_now(self) -> np.ndarray:
         return self._poses[-1] if self._poses else np.full(7, np.nan)
+
+
+def pad_start(values: np.ndarray, count: int) -> np.ndarray:
+    """`count` copies of the first frame put before all frames."""
+    return np.concatenate([values[:1].repeat(count, 0), values])

@@ -6,7 +6,6 @@ Shapes: B batch, d history positions, r modes, N body nodes, V = r + N nodes, K 
 from __future__ import annotations
 
 import copy
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,56 +16,10 @@ from sgns.learning.graph import build_graph, edge_indices
 from sgns.learning.model_settings import ModelSettings
 from sgns.learning.network import EncodeProcessDecode
 from sgns.learning.normalisation import Standardiser
+from sgns.learning.path_stepper import PathStepper
+from sgns.learning.prediction import Path, Prediction, Step
 
 __all__ = ["LatentDynamics", "Path", "Prediction", "Step"]
-
-
-class Prediction(NamedTuple):
-    """What the network says of one step, normalised.
-
-    Attributes:
-        change: Of every node's position: its second difference, or with `model.predicts=velocity` its first [1], shape
-            (B, V, 3). Modes first; of a body node only what is free counts.
-        force: Contribution of every node [1], shape (B, V, 3).
-        torque: Contribution of every node [1], shape (B, V, 3).
-    """
-
-    change: Tensor
-    force: Tensor
-    torque: Tensor
-
-
-class Step(NamedTuple):
-    """One step in physical units, float64.
-
-    Attributes:
-        latent: Next latent positions [m], shape (B, r, 3).
-        force: On the body [N], shape (B, 3).
-        torque: On the body [N m], shape (B, 3).
-        displacement: Of the body nodes [m], shape (B, N, 3): the prescribed one, with what the network predicts in
-            its place along the free axes.
-    """
-
-    latent: Tensor
-    force: Tensor
-    torque: Tensor
-    displacement: Tensor
-
-
-class Path(NamedTuple):
-    """A whole path, float64.
-
-    Attributes:
-        latent: Latent positions [m], shape (B, T, r, 3); the first d frames are the given ones.
-        force: [N], shape (B, T, 3), zero in the first d frames.
-        torque: [N m], shape (B, T, 3), zero in the first d frames.
-        body: The body at all frames, predicted where it is free.
-    """
-
-    latent: Tensor
-    force: Tensor
-    torque: Tensor
-    body: BodyTrack
 
 
 class LatentDynamics(nn.Module):
@@ -164,20 +117,23 @@ class LatentDynamics(nn.Module):
             context: Numbers of the runs, shape (B, K); not needed when K is 0.
         """
         modes, nodes = latent.shape[-2], body.position.shape[-2]
-        edge_index = self._edge_index(modes, nodes, latent.device)
+        edge_index = self.edge_index(modes, nodes, latent.device)
         graph = build_graph(
             self._mode_features(latent),
-            self._body_features(body),
+            self.body_features(body),
             self._edge_positions(latent[:, -1], body.position[:, -2]),
             edge_index,
             self.settings.edge_length,
         )
-        told = self._told(modes, nodes, latent.shape[0], context)
-        decoded = self.network(torch.cat([graph.nodes, told], dim=-1), graph.edges, edge_index)
+        told = self.told(modes, nodes, latent.shape[0], context)
+        return self.read(self.network(torch.cat([graph.nodes, told], dim=-1), graph.edges, edge_index))
+
+    def read(self, decoded: Tensor) -> Prediction:
+        """The prediction in what the network decodes, shape (B, V, 6 or 9)."""
         force = decoded[..., 3:6]
         torque = decoded[..., 6:] if self.settings.torque else torch.zeros_like(force)
         if self.settings.force == "mean":
-            force, torque = force / (modes + nodes), torque / (modes + nodes)
+            force, torque = force / decoded.shape[-2], torque / decoded.shape[-2]
         return Prediction(decoded[..., :3], force, torque)
 
     def _mode_features(self, latent: Tensor) -> Tensor:
@@ -188,7 +144,7 @@ class LatentDynamics(nn.Module):
             return velocity
         return torch.cat([self.position.normalise(latent[:, -1]), velocity], dim=-1)
 
-    def _body_features(self, body: BodyTrack) -> Tensor:
+    def body_features(self, body: BodyTrack) -> Tensor:
         """Place, past motions and what is prescribed of the next one, shape (B, N, any)."""
         motion = self.body_motion.normalise(body.motion)
         if not self.settings.next_motion:
@@ -210,7 +166,7 @@ class LatentDynamics(nn.Module):
             return (torch.cat([modes, body], dim=-2) / self.settings.edge_scale).float()
         return torch.cat([self.position.normalise(modes), self.body_position.normalise(body)], dim=-2)
 
-    def _told(self, modes: int, nodes: int, batch: int, context: Tensor | None) -> Tensor:
+    def told(self, modes: int, nodes: int, batch: int, context: Tensor | None) -> Tensor:
         """What every node is told besides: who it is, and the context; shape (B, V, any)."""
         weight = self.identity.weight
         own = weight[:-1] if self.settings.identity == "mode" else weight[:1].expand(modes, -1)
@@ -244,7 +200,11 @@ class LatentDynamics(nn.Module):
             body: As for `forward`.
             context: As for `forward`.
         """
-        step = self.taken(self(latent, body, context), latent, body)
+        return self.stepped(self(latent, body, context), latent, body)
+
+    def stepped(self, prediction: Prediction, latent: Tensor, body: BodyTrack) -> Step:
+        """The step of a prediction, a predicted body of points kept rigid if it is to be."""
+        step = self.taken(prediction, latent, body)
         if self.predicts_body and self.settings.rigid and self.settings.body_nodes == "points":
             here = body.position[:, -2]
             step = step._replace(displacement=nearest_rigid(here, here + step.displacement) - here)
@@ -266,6 +226,15 @@ class LatentDynamics(nn.Module):
         change = self.body_change.denormalise(prediction.change[:, self.num_modes :])
         return change + body.motion[:, -2, :, :3] if self.settings.predicts == "acceleration" else change
 
+    def stepper(self, body_points: int, context: Tensor | None = None) -> PathStepper:
+        """Takes the steps of one path without gradients, much faster than `advance`, with the weights as they are now.
+
+        Args:
+            body_points: M.
+            context: Numbers of the run, shape (1, K); not needed when K is 0.
+        """
+        return PathStepper(self, 1 if self.settings.body_nodes == "pose" else body_points, context)
+
     def unroll(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Path:
         """Follow whole tool paths from a given history, feeding predictions back.
 
@@ -282,18 +251,30 @@ class LatentDynamics(nn.Module):
         states[:, :d] = latent
         force = torch.zeros((latent.shape[0], frames, 3), dtype=torch.float64, device=latent.device)
         torque = torch.zeros_like(force)
+        alone = latent.shape[0] == 1 and not torch.is_grad_enabled()
+        stepper = self.stepper(body.position.shape[-2], context) if alone else None
+        if stepper is not None and not self.predicts_body:
+            loads = stepper.follow(states[0], body)
+            force[0, d:] = loads[:, :3]
+            torque[0, d:] = loads[:, 3:] if self.settings.torque else self.torque.mean
+            return Path(states, force, torque, body)
         if self.predicts_body:
             body = body._replace(position=body.position.clone(), motion=body.motion.clone())
         for t in range(d, frames):
             window = body.frames(slice(t - d + 1, t + 1))
-            step = self.advance(states[:, t - d : t], window, context)
+            history = states[:, t - d : t]
+            step = (
+                self.advance(history, window, context)
+                if stepper is None
+                else stepper.advance(history, window)
+            )
             states[:, t], force[:, t], torque[:, t] = step.latent, step.force, step.torque
             if self.predicts_body:
                 body.motion[:, t, :, :3] = step.displacement
                 body.position[:, t] = body.position[:, t - 1] + step.displacement
         return Path(states, force, torque, body)
 
-    def _edge_index(self, modes: int, body_nodes: int, device: torch.device) -> Tensor:
+    def edge_index(self, modes: int, body_nodes: int, device: torch.device) -> Tensor:
         key = (body_nodes, device)
         if key not in self._edges:
             self._edges[key] = edge_indices(

@@ -1,4 +1,5 @@
-"""The network against a message-passing step written out by hand, and its symmetries."""
+"""The network against a message-passing step written out by hand, its fast form against its definition, and its
+symmetries."""
 
 from __future__ import annotations
 
@@ -37,19 +38,47 @@ def test_one_step_by_hand(residual: bool) -> None:
     np.testing.assert_allclose(found_edges.detach().numpy(), new_e + residual * e, atol=1e-12)
 
 
-def test_gradients_are_those_of_the_plain_concatenation() -> None:
+EDGES = {
+    "complete": edge_indices(3, 2),
+    "self_loops": edge_indices(3, 2, self_loops=True),
+    "star": edge_indices(3, 2, "star"),
+    # In no order, some twice, with a node that receives nothing.
+    "any": torch.tensor([[4, 0, 2, 2, 3, 0, 1], [1, 2, 0, 0, 3, 1, 2]]),
+}
+
+
+def outcome(form, network: EncodeProcessDecode, nodes, edges, index) -> list[torch.Tensor]:
+    """Output, then gradients of a loss that weighs all outputs differently, for inputs and parameters."""
+    nodes, edges = nodes.clone().requires_grad_(), edges.clone().requires_grad_()
+    output = form(nodes, edges, index)
+    loss = (output * torch.linspace(-1, 2, output.numel()).to(output).view_as(output)).sum()
+    return [output.detach(), *torch.autograd.grad(loss, [nodes, edges, *network.parameters()])]
+
+
+@pytest.mark.parametrize("edges", EDGES)
+@pytest.mark.parametrize("activation", ["relu", "silu"])
+@pytest.mark.parametrize("steps", [1, 3])
+@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize("residual", [False, True])
+def test_the_algebra_changes_nothing(residual, layer_norm, steps, activation, edges) -> None:
     torch.manual_seed(2)
-    step = InteractionNetwork(5, 7, 2).double()
-    nodes, edges, index = torch.randn(3, 4, 5).double(), torch.randn(3, 12, 5).double(), edge_indices(3, 1)
-    step(nodes, edges, index)[0].square().sum().backward()
-    split = [p.grad.clone() for p in step.parameters()]
-    step.zero_grad()
-    sender, receiver = index
-    updated = step.edge_mlp(torch.cat([edges, nodes[:, receiver], nodes[:, sender]], dim=-1))
-    summed = torch.zeros_like(nodes).index_add_(1, receiver, updated)
-    step.node_mlp(torch.cat([nodes, summed], dim=-1)).square().sum().backward()
-    for a, p in zip(split, step.parameters(), strict=True):
-        torch.testing.assert_close(a, p.grad, rtol=1e-9, atol=1e-12)
+    network = EncodeProcessDecode(6, 4, 9, 16, 2, steps, layer_norm, residual, activation).double()
+    index = EDGES[edges]
+    inputs = torch.randn(3, 5, 6).double(), torch.randn(3, index.shape[1], 4).double()
+    expected = outcome(network.plain, network, *inputs, index)
+    for a, b in zip(outcome(network, network, *inputs, index), expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10 * float(b.abs().max()))
+
+
+@pytest.mark.parametrize("hidden_layers", [1, 2, 3])
+def test_the_algebra_changes_nothing_in_float32_at_the_papers_size(hidden_layers) -> None:
+    torch.manual_seed(3)
+    network = EncodeProcessDecode(20, 4, 9, hidden_layers=hidden_layers)
+    index = edge_indices(8, 15)
+    inputs = torch.randn(9, 23, 20), torch.randn(9, 506, 4)
+    expected = outcome(network.plain, network, *inputs, index)
+    for a, b in zip(outcome(network, network, *inputs, index), expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5 * float(b.abs().max()))
 
 
 def test_a_batch_is_its_graphs_one_by_one() -> None:
@@ -79,6 +108,30 @@ def test_the_order_of_edges_does_not_matter() -> None:
     nodes, edges, index = torch.randn(1, 5, 6).double(), torch.randn(1, 20, 4).double(), edge_indices(4, 1)
     order = torch.randperm(20)
     torch.testing.assert_close(network(nodes, edges, index), network(nodes, edges[:, order], index[:, order]))
+
+
+def test_leading_dimensions_and_blocks_are_free(monkeypatch) -> None:
+    torch.manual_seed(6)
+    network = EncodeProcessDecode(6, 4, 9, hidden=16).double()
+    nodes, edges, index = (
+        torch.randn(2, 3, 5, 6).double(),
+        torch.randn(2, 3, 20, 4).double(),
+        edge_indices(4, 1),
+    )
+    together = network(nodes, edges, index)
+    assert together.shape == (2, 3, 5, 9)
+    monkeypatch.setattr("sgns.learning.network.EDGES_AT_ONCE", 40)
+    torch.testing.assert_close(network(nodes, edges, index), together)
+    torch.testing.assert_close(network(nodes[0, 0], edges[0, 0], index), together[0, 0])
+
+
+def test_the_inputs_are_left_as_they_are() -> None:
+    torch.manual_seed(7)
+    network = EncodeProcessDecode(6, 4, 9, hidden=16, steps=2, layer_norm=True, residual=True)
+    nodes, edges = torch.randn(2, 5, 6), torch.randn(2, 20, 4)
+    before = nodes.clone(), edges.clone()
+    network(nodes, edges, edge_indices(4, 1))
+    assert torch.equal(nodes, before[0]) and torch.equal(edges, before[1])
 
 
 def test_parameter_count_is_that_of_five_mlps() -> None:

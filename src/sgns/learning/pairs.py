@@ -1,0 +1,143 @@
+"""Sums along the edges of a graph: nodes to their edges, edges to their receivers.
+
+Shapes: B batch, V nodes, E edges, H width.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+__all__ = ["CompletePairs", "IndexedPairs", "Pairs", "pairs_of"]
+
+
+class Pairs(Protocol):
+    """The edges of a graph, as two linear maps."""
+
+    @property
+    def degree(self) -> int | Tensor:
+        """Edges that each node receives: a number, or one per node, shape (V, 1)."""
+
+    def spread(self, edges: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
+        """Each edge's own value plus that of its receiver and that of its sender.
+
+        Args:
+            edges: Shape (B, E, H); may be overwritten.
+            receiver: Shape (B, V, H).
+            sender: Shape (B, V, H).
+
+        Returns:
+            Shape (B, E, H).
+        """
+
+    def gather(self, edges: Tensor) -> Tensor:
+        """Sum of the edges at their receivers, (B, E, H) to (B, V, H)."""
+
+
+class CompletePairs:
+    """Every ordered pair of nodes, receivers ascending: no index is needed.
+
+    Args:
+        node_count: V.
+        self_loops: Whether a node is its own neighbour, too.
+    """
+
+    def __init__(self, node_count: int, self_loops: bool) -> None:
+        self.node_count = node_count
+        self.self_loops = self_loops
+
+    @property
+    def degree(self) -> int:
+        """V, or V - 1 without self loops."""
+        return self.node_count - (not self.self_loops)
+
+    def spread(self, edges: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
+        """As `Pairs.spread`, in place."""
+        return _Spread.apply(edges, receiver, sender, self)
+
+    def gather(self, edges: Tensor) -> Tensor:
+        """As `Pairs.gather`."""
+        return self.by_receiver(edges).sum(-2)
+
+    def by_receiver(self, edges: Tensor) -> Tensor:
+        """A view (B, V, degree, H) of (B, E, H)."""
+        return edges.unflatten(1, (self.node_count, self.degree))
+
+    def by_turn(self, edges: Tensor) -> Tensor:
+        """A view (B, degree, V, H) of (B, E, H) in whose block k the senders are k + 1, k + 2, ... modulo V
+        (k = 0 and senders 0, 1, ... with self loops).
+
+        Without its diagonal a V × V matrix read row by row is V - 1 blocks of V values: each block begins one
+        column further.
+        """
+        return edges.unflatten(1, (self.degree, self.node_count))
+
+    def senders(self, sender: Tensor) -> Tensor:
+        """What `by_turn` finds at the edges' senders: a view of the nodes written twice, (B, V - 1, V, H)."""
+        if self.self_loops:
+            return sender[:, None]
+        return torch.cat([sender, sender], 1)[:, 1:-1].unfold(1, self.node_count, 1).transpose(-1, -2)
+
+    def sum_at_senders(self, edges: Tensor) -> Tensor:
+        """Sum of the edges at their senders, (B, E, H) to (B, V, H)."""
+        if self.self_loops:
+            return self.by_receiver(edges).sum(1)
+        batch, v, width = len(edges), self.node_count, edges.shape[-1]
+        square = edges.new_zeros(batch, v * v, width)
+        square[:, 1:].unflatten(1, (v - 1, v + 1))[:, :, :v] = self.by_turn(edges)
+        return square.unflatten(1, (v, v)).sum(1)
+
+
+class _Spread(torch.autograd.Function):
+    """`CompletePairs.spread`: written by hand because it overwrites the edges instead of copying them twice."""
+
+    @staticmethod
+    def forward(ctx: Any, edges: Tensor, receiver: Tensor, sender: Tensor, pairs: CompletePairs) -> Tensor:
+        ctx.pairs = pairs
+        ctx.mark_dirty(edges)
+        pairs.by_receiver(edges).add_(receiver[:, :, None])
+        pairs.by_turn(edges).add_(pairs.senders(sender))
+        return edges
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
+        gradient = gradient.contiguous()
+        return gradient, ctx.pairs.gather(gradient), ctx.pairs.sum_at_senders(gradient), None
+
+
+class IndexedPairs:
+    """Any set of edges.
+
+    Args:
+        edge_index: Senders and receivers, shape (2, E).
+        node_count: V.
+    """
+
+    def __init__(self, edge_index: Tensor, node_count: int) -> None:
+        self.sender, self.receiver = edge_index
+        self.node_count = node_count
+        self.degree = torch.bincount(self.receiver, minlength=node_count)[:, None]
+
+    def spread(self, edges: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
+        """As `Pairs.spread`."""
+        return edges + receiver.index_select(1, self.receiver) + sender.index_select(1, self.sender)
+
+    def gather(self, edges: Tensor) -> Tensor:
+        """As `Pairs.gather`."""
+        empty = edges.new_zeros(len(edges), self.node_count, edges.shape[-1])
+        return empty.index_add(1, self.receiver, edges)
+
+
+def pairs_of(edge_index: Tensor, node_count: int) -> Pairs:
+    """The quickest form of these edges; they are those of a complete graph only in its order."""
+    index = torch.arange(node_count, device=edge_index.device)
+    receiver, sender = torch.meshgrid(index, index, indexing="ij")
+    for self_loops in (False, True):
+        keep = (receiver != sender) | self_loops
+        if node_count > 1 and torch.equal(edge_index, torch.stack([sender[keep], receiver[keep]])):
+            return CompletePairs(node_count, self_loops)
+    return IndexedPairs(edge_index, node_count)
