@@ -235,10 +235,10 @@ def main(cfg: DictConfig) -> float:
     if cfg.dataset.get("format") == "published":
         from sgns.evaluation.published_scores import evaluate_published
 
-        simulator = Simulator.load(checkpoint, device=cfg.device)
+        simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
         return evaluate_published(simulator, cfg.dataset, cfg.split, Path(cfg.output), checkpoint)
-    dataset = Dataset.open(cfg.dataset.path)
-    simulator = Simulator.load(checkpoint, device=cfg.device)
+    dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
+    simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
     output = Path(cfg.output)
     evaluation = evaluate(
         simulator,
