@@ -40,6 +40,34 @@ def test_rollout_is_stepping(trained, kind) -> None:
     assert simulator.step_count == 13
 
 
+@pytest.mark.parametrize("kind", ["pose", "points"])
+def test_many_paths_are_the_paths_one_by_one(trained, kind) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    paths = np.stack([run.pose for run in data.runs("train")[:3]])
+    many = simulator.rollouts(paths, paths_at_once=2)
+    assert many.latent.shape == (3, 14, 4, 3) and many.wall_time_s > 0
+    np.testing.assert_array_equal(many.poses, paths)
+    for i, path in enumerate(paths):
+        one = simulator.rollout(path)
+        for name in ("latent", "force", "torque"):
+            found, expected = getattr(many, name)[i], getattr(one, name)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+
+
+def test_bad_paths_are_named(trained) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / "pose" / "best.ckpt")
+    paths = np.stack([run.pose for run in data.runs("train")[:2]])
+    with pytest.raises(UserError, match="paths, frames, 7"):
+        simulator.rollouts(paths[0])
+    with pytest.raises(UserError, match="paths_at_once"):
+        simulator.rollouts(paths, paths_at_once=0)
+    paths[1, 3, 0] = np.nan
+    with pytest.raises(UserError, match="path 1"):
+        simulator.rollouts(paths)
+
+
 def test_rollout_from_true_frames_is_stepping_from_them(trained) -> None:
     data, folder = trained
     run = data.runs("test")[0]

@@ -22,19 +22,21 @@ class Layer:
 
     Args:
         weight: Shape (outputs, inputs).
-        bias: Shape (outputs,), or an array of the output's shape that the caller fills.
+        bias: Shape (outputs,).
         rows: Number of rows.
         activation: What follows; None for nothing.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor, rows: int, activation: nn.Module | None = None) -> None:
-        self.bias = bias
+        self.bias = bias.clone()
         self.relu = isinstance(activation, nn.ReLU)
         self.activation = None if self.relu else activation
         self.output = weight.new_empty(rows, len(weight))
-        self.onednn = bias.dim() == 1 and prefers_onednn(weight.new_empty(rows, weight.shape[1]), weight)
-        # Each library multiplies the layout given to it here without turning it round.
-        self.weight = weight.contiguous() if self.onednn else weight.t().contiguous()
+        self.onednn = prefers_onednn(weight.new_empty(rows, weight.shape[1]), weight)
+        # A copy in the layout that the library needs not turn round.
+        self.weight = (
+            weight.clone() if self.onednn else weight.t().clone(memory_format=torch.contiguous_format)
+        )
 
     def __call__(self, x: Tensor) -> Tensor:
         """Shape (rows, inputs) to (rows, outputs); what the last call returned may be overwritten."""
@@ -104,7 +106,7 @@ class GraphStepper:
         last = step.edge_mlp.linears[-1]
         weight, once = merged(summed, torch.zeros_like(update.first.bias), last)
         self.summed_weight = weight.t().contiguous()
-        self.update_bias = update.first.bias + self.pairs.degree * once
+        self.update_bias = update.first.bias + self.pairs.degree * once  # shape (H,) or (V, H)
         self.activation = update.rest[0]
         joined = merged(decode.first.weight, decode.first.bias, update.linears[-1])
         self.rest_of_nodes = [
