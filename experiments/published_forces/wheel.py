@@ -3,7 +3,7 @@
     python experiments/published_forces/wheel.py <folder of the authors' wheel files>
 
 Makes one run file per case (about 80 MB each, in data/published_wheel; finished ones are kept), then wheel.csv and
-wheel.png beside this script.
+wheel.png beside this script. With `--scene wheel` the same wheels at the reference setting, into wheel_reference.*.
 """
 
 from __future__ import annotations
@@ -14,16 +14,11 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
-from run import FIRST, HERE, WINDOW, compared, plt, smoothed
+from run import FIRST, HERE, WINDOW, campaign_of, compared, plt, smoothed
 
 from mpm_warp import Wheel
-from sgns.campaign import Campaign
-from sgns.published import read_published, wheel_case
+from sgns.published import wheel_case
 from sgns.runs import Run
-from sgns.scene_effects import asked_effects
-from sgns.scenes import scene_from_config
 from sgns.simulate import simulate_campaign
 
 SERIES = (("pull", "drawbar pull", "C0"), ("vertical", "vertical force", "C1"), ("sinkage", "sinkage", "C2"))
@@ -40,41 +35,30 @@ def ours(file: Path, scene: Wheel, count: int) -> dict[str, np.ndarray]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("published", help="folder with valid.tfrecord and metadata.json")
-    parser.add_argument("--runs", default="data/published_wheel", help="folder for the run files")
-    parser.add_argument("--results", default=HERE, type=Path, help="folder for wheel.csv and wheel.png")
+    parser.add_argument("--runs", default=None, help="folder for the run files (default: data/<scene>)")
+    parser.add_argument("--results", default=HERE, type=Path, help="folder for the table and the figure")
+    parser.add_argument(
+        "--scene",
+        default="published_wheel",
+        choices=("published_wheel", "wheel"),
+        help="wheel: the reference setting",
+    )
     parser.add_argument("--workers", type=int, default=None, help="runs at once (default: one per core)")
     parser.add_argument("--cases", type=int, nargs="*", help="only these case numbers")
     parser.add_argument("overrides", nargs="*", help="changes of the scene, for example scene.friction=0.5")
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        config = compose("simulate", ["scene=published_wheel", *options.overrides])
-    published = read_published(options.published, scene_from_config(config).bed.size)
-    published = [r for r in published if not options.cases or r.case in options.cases]
-    published.sort(key=lambda run: run.case)
-    scenes = {}
-    for run in published:
-        for key, value in wheel_case(run.case).items():
-            OmegaConf.update(config, f"scene.{key}", value)
-        scenes[f"case_{run.case:03d}"] = scene_from_config(config)
-    campaign = Campaign(
-        "published_wheel",
-        Path(options.runs),
-        scenes,
-        dict.fromkeys(scenes, "test"),
-        asked_effects(config),
-        config.solver.precision,
-        seed=0,
-    )
+    published, campaign = campaign_of(options, wheel_case, options.cases)
     simulate_campaign(campaign, device="cpu", workers=options.workers)
+    stem = "wheel" if options.scene == "published_wheel" else "wheel_reference"
 
     rows = []
     figure = plt.figure(figsize=(14, 2.4 * len(published) + 1), layout="constrained")
     axes = figure.subplots(len(published), 3, sharex=True, squeeze=False)
     for line, theirs in zip(axes, published, strict=True):
         name = f"case_{theirs.case:03d}"
-        scene = scenes[name]
+        scene = campaign.scenes[name]
         height = theirs.body_points[..., 2].mean(axis=1)
         there = {
             "pull": theirs.force[:, 0],
@@ -102,8 +86,8 @@ def main() -> None:
     axes[0, 0].legend(fontsize=8)
     figure.supxlabel("time since the wheel began to drive [s]")
     options.results.mkdir(parents=True, exist_ok=True)
-    figure.savefig(options.results / "wheel.png", dpi=80)
-    with (options.results / "wheel.csv").open("w", newline="") as stream:
+    figure.savefig(options.results / f"{stem}.png", dpi=80)
+    with (options.results / f"{stem}.csv").open("w", newline="") as stream:
         writer = csv.DictWriter(stream, rows[0])
         writer.writeheader()
         writer.writerows(rows)
