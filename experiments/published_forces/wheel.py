@@ -22,6 +22,7 @@ from sgns.runs import Run
 from sgns.simulate import simulate_campaign
 
 SERIES = (("pull", "drawbar pull", "C0"), ("vertical", "vertical force", "C1"), ("sinkage", "sinkage", "C2"))
+PUBLISHED_DAMPING = 500.0  # of the published wheels' height [1/s]
 
 
 def ours(file: Path, scene: Wheel, count: int) -> dict[str, np.ndarray]:
@@ -30,6 +31,17 @@ def ours(file: Path, scene: Wheel, count: int) -> dict[str, np.ndarray]:
     with Run(file) as run:
         force, pose = (values[first : first + count] for values in (run.force, run.pose))
     return {"pull": force[:, 0], "vertical": force[:, 2], "sinkage": 1e3 * scene.sinkage(pose)}
+
+
+def needed(sinkage: np.ndarray, scene: Wheel, damping: float) -> np.ndarray:
+    """The vertical force [N] that carries the wheel on its way down, without its inertia: weight minus damper.
+
+    Args:
+        sinkage: at the frames [mm].
+    """
+    return scene.load - scene.load / scene.gravity * damping * 1e-3 * np.gradient(
+        sinkage, 1.0 / scene.frame_rate
+    )
 
 
 def main() -> None:
@@ -49,7 +61,7 @@ def main() -> None:
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
-    published, campaign = campaign_of(options, wheel_case, options.cases)
+    published, campaign = campaign_of(options, wheel_case, "published_wheel", options.cases)
     simulate_campaign(campaign, device="cpu", workers=options.workers)
     stem = "wheel" if options.scene == "published_wheel" else "wheel_reference"
 
@@ -82,7 +94,17 @@ def main() -> None:
             f"{100 * scene.diameter:g} cm, {scene.friction_angle:g}°, slip {scene.slip:.2f})",
             fontsize=9,
         )
-        rows.append(row)
+        carried = {
+            "published": needed(there["sinkage"], scene, PUBLISHED_DAMPING)[: len(here["sinkage"])],
+            "sgns": needed(here["sinkage"], scene, scene.damping),
+        }
+        line[1].plot(time, smoothed(carried["published"]), "k:", lw=1, label="needed by the published motion")
+        row["published_over_needed"] = row["vertical_published"] / smoothed(carried["published"]).mean()
+        row["over_needed"] = row["vertical_mean"] / smoothed(carried["sgns"]).mean()
+        # What the published force would be if it carried the published wheel, against ours.
+        row["needed_nrmse"] = compared(here["vertical"], carried["published"])["nrmse"]
+        rows.append({key: round(value, 3) for key, value in row.items()})
+    axes[0, 1].legend(fontsize=8)
     axes[0, 0].legend(fontsize=8)
     figure.supxlabel("time since the wheel began to drive [s]")
     options.results.mkdir(parents=True, exist_ok=True)
@@ -91,7 +113,8 @@ def main() -> None:
         writer = csv.DictWriter(stream, rows[0])
         writer.writeheader()
         writer.writerows(rows)
-    for key, label, _ in SERIES:
+    labels = {key: label for key, label, _ in SERIES} | {"needed": "vertical force against the needed one"}
+    for key, label in labels.items():
         errors = [row[f"{key}_nrmse"] for row in rows]
         logging.info(
             "%s: median NRMSE %.3f, %.3f to %.3f", label, np.median(errors), min(errors), max(errors)
