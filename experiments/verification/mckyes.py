@@ -94,25 +94,32 @@ class BuriedBlade(Scene):
         return poses
 
 
-def level_blade(rake: float, width: float) -> MeshBody:
-    """A blade as thick as the plate but cut off level below, so that only its front meets soil."""
-    back, lean = THICKNESS / math.cos(math.radians(rake)), HEIGHT * math.tan(math.radians(rake))
-    section = [(0.0, 0.0), (-lean, HEIGHT), (-lean - back, HEIGHT), (-back, 0.0)]
+def level_blade(file: Path, rake: float, size: tuple[float, float, float], friction: float) -> MeshBody:
+    """A blade like the plate of the excavations but cut off level below, so that only its front meets soil.
+
+    Args:
+        file: OBJ file to write; the blade's axes are those of the bin.
+        rake: of the front from vertical, tip leading [degrees].
+        size: height, width, and thickness across the front [m].
+        friction: between soil and blade [-].
+    """
+    height, width, thickness = size
+    back, lean = thickness / math.cos(math.radians(rake)), height * math.tan(math.radians(rake))
+    section = [(0.0, 0.0), (-lean, height), (-lean - back, height), (-back, 0.0)]
     vertices = [(x, y, z) for y in (-0.5 * width, 0.5 * width) for x, z in section]
     faces = ["4 3 2 1", "5 6 7 8", "1 2 6 5", "2 3 7 6", "3 4 8 7", "4 1 5 8"]
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {face}" for face in faces]
+    file.write_text("\n".join(lines) + "\n")
+    return MeshBody(file=str(file), friction=friction)
+
+
+def blade_of(end: str, rake: float, width: float) -> Body:
+    """A blade with a level end, or the plate, the back edge of whose square end is lower than the front edge."""
+    friction = math.tan(WALL_ANGLE)
+    if end == "square":
+        return Plate(HEIGHT, width, THICKNESS, friction)
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "blade.obj"
-        lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {face}" for face in faces]
-        file.write_text("\n".join(lines) + "\n")
-        return MeshBody(file=str(file), friction=math.tan(WALL_ANGLE))
-
-
-def square_blade(rake: float, width: float) -> Plate:
-    """The plate of the excavations: the back edge of its end is lower than the front edge."""
-    return Plate(HEIGHT, width, THICKNESS, math.tan(WALL_ANGLE))
-
-
-BLADES = {"level": level_blade, "square": square_blade}
+        return level_blade(Path(folder) / "blade.obj", rake, (HEIGHT, width, THICKNESS), friction)
 
 
 def buried_blade(
@@ -134,7 +141,7 @@ def buried_blade(
     return BuriedBlade(
         bed=bed,
         material=Material(friction_angle=ANGLE, friction_map=friction_map),
-        blade=BLADES[end](rake, WIDTH if bin_width else 1.0),
+        blade=blade_of(end, rake, WIDTH if bin_width else 1.0),
         rake=rake,
         depth=depth,
         duration=MEASURED[1] / BuriedBlade.speed,
