@@ -4,7 +4,8 @@
 
 A raked plate's end is square: its back edge is lower than the front edge and is dragged through the soil. Here the same
 motions are made by a blade with the same front and a level end, at the height of the middle of the plate's end. Makes
-run files as run.py does and writes level.csv, with `--scene excavation` level_excavation.csv.
+run files as run.py does and writes level.csv, with `--scene excavation` level_excavation.csv. Beside the drafts stands
+what the earth-moving equation says, moment by moment, of a full bed.
 """
 
 from __future__ import annotations
@@ -12,12 +13,13 @@ from __future__ import annotations
 import argparse
 import csv
 import logging
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from run import HERE, campaign_of, compared
+from run import HERE, campaign_of, compared, smoothed
 
 from mpm_warp import Excavation
 from mpm_warp.push import Push
@@ -27,7 +29,7 @@ from sgns.runs import Run
 from sgns.simulate import simulate_campaign
 
 sys.path.append(str(HERE.parent / "verification"))
-from mckyes import level_blade
+from mckyes import ANGLE, level_blade, wedge
 
 
 def level(cut: Excavation, file: Path) -> Push:
@@ -44,6 +46,26 @@ def level(cut: Excavation, file: Path) -> Push:
     path = np.column_stack([times, poses])
     return Push(
         **shared | {"name": f"{cut.name}_level", "kind": Push.kind, "tool": tool, "path": path.tolist()}
+    )
+
+
+def theory(cut: Excavation, angle: float) -> np.ndarray:
+    """Draft by the earth-moving equation at the frames after the first [N]: the blade at the depth of the moment, with
+    all the soil swept up so far before it.
+
+    Args:
+        angle: of friction in the soil [degrees].
+    """
+    poses = cut.body_poses()
+    tip = poses[:, :3] + rotate(poses[:, 3:], cut.blade.tip)
+    depth = np.maximum(-tip[:, 2], 0.0)
+    swept = np.cumsum(depth[1:] * np.diff(tip[:, 0]))
+    width = cut.blade.width
+    return np.array(
+        [
+            width * wedge(angle, cut.rake, d, width, area)[0] if d > 0.0 else 0.0
+            for d, area in zip(depth[1:], swept, strict=True)
+        ]
     )
 
 
@@ -65,9 +87,8 @@ def main() -> None:
     options.runs = options.runs or f"data/{options.scene}_level"
     published, campaign = campaign_of(options, excavation_case, "published_excavation", options.cases)
     campaign.path.mkdir(parents=True, exist_ok=True)
-    scenes = {
-        name: level(cut, campaign.path / f"blade_{cut.rake:g}.obj") for name, cut in campaign.scenes.items()
-    }
+    cuts = campaign.scenes
+    scenes = {name: level(cut, campaign.path / f"blade_{cut.rake:g}.obj") for name, cut in cuts.items()}
     campaign = replace(campaign, scenes=scenes)
     simulate_campaign(campaign, device="cpu", workers=options.workers)
 
@@ -83,6 +104,10 @@ def main() -> None:
             found = compared(sign * ours[:, component], sign * theirs.force[: len(ours), component])
             row[f"{name}_square"] = float(square[theirs.case][f"{name}_mean"])
             row |= {f"{name}_{key}": round(float(value), 3) for key, value in found.items()}
+        cut = cuts[f"case_{theirs.case:03d}"]
+        own = math.degrees(math.asin(cut.material.static_friction))
+        for name, angle in (("nominal", ANGLE), ("own", own)):
+            row[f"mckyes_{name}"] = round(float(smoothed(theory(cut, angle)[: len(ours)]).mean()), 3)
         rows.append(row)
     with (HERE / f"level{suffix}.csv").open("w", newline="") as stream:
         writer = csv.DictWriter(stream, rows[0])

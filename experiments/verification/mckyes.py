@@ -158,18 +158,22 @@ def force_per_width(scene: BuriedBlade) -> tuple[float, float]:
     return -force[:, 0].mean() / width, -force[:, 2].mean() / width
 
 
-def wedge(angle: float, rake: float, depth: float, width: float = math.inf) -> tuple[float, float]:
+def wedge(
+    angle: float, rake: float, depth: float, width: float = math.inf, swept: float | None = None
+) -> tuple[float, float]:
     """Force on the blade per metre, against the motion and downwards [N/m], by McKyes and Ali (1977).
 
     A wedge in front of the blade and a piece of a cone at each side rest on the blade and slide on a plane through the
-    tip: that plane which needs the least force. Their surcharge is the soil swept up before the force is measured.
+    tip: that plane which needs the least force. Their surcharge is the soil swept up before.
 
     Args:
         angle: of friction in the soil [degrees].
         rake: of the blade from vertical [degrees].
         depth: [m].
         width: of the blade [m]; infinite: the wedge alone.
+        swept: soil swept up per metre of blade [m^2]; None: that of the travel before the force is measured.
     """
+    swept = depth * float(np.mean(MEASURED)) if swept is None else swept
     soil = Material()
     phi, lean = math.radians(angle), math.radians(90.0 - rake)
     turned = lean + WALL_ANGLE  # of the blade's force from the vertical
@@ -177,7 +181,7 @@ def wedge(angle: float, rake: float, depth: float, width: float = math.inf) -> t
     plane = plane[turned + plane + phi < math.pi - 0.05]
     ahead = 1.0 / math.tan(lean) + 1.0 / np.tan(plane)  # length of the wedge at the surface, in depths
     aside = np.sqrt(ahead**2 - 1.0 / math.tan(lean) ** 2)  # reach of the cones to the side, in depths
-    weight = 0.5 * ahead * (1.0 + 2.0 * aside * depth / (3.0 * width)) + np.mean(MEASURED) / depth
+    weight = 0.5 * ahead * (1.0 + 2.0 * aside * depth / (3.0 * width)) + swept / depth**2
     least = np.min(weight / (math.cos(turned) + math.sin(turned) / np.tan(plane + phi)))
     force = soil.bulk_density * Scene().gravity * depth**2 * least
     return force * math.sin(turned), force * math.cos(turned)
@@ -252,7 +256,8 @@ def draw(figure, rows: list[dict]) -> None:
                 label=f"solver, dx {1e3 * spacing:.1f} mm",
             )
         rakes = np.linspace(0.0, 35.0, 36)
-        for angle, style in sorted({(r["angle_own"], "k-") for r in found} | {(ANGLE, "k--")}, reverse=True):
+        angles = {round(found[0]["angle_own"], 2): "k-", round(ANGLE, 2): "k--"}
+        for angle, style in angles.items():
             theory = [wedge(angle, rake, 0.08)[0] for rake in rakes]
             axis.plot(rakes, theory, style, lw=1, label=f"McKyes, φ = {angle:.1f}°")
         axis.set_title(f"μs = {friction_map} {ANGLE:.1f}°, {end} end", fontsize=10)

@@ -2,7 +2,7 @@
 
     python experiments/verification/run.py [bagnold mckyes passive runout silo slope stopping waves]
 
-Writes NAME.csv and NAME.png beside this script; all of them take about a quarter of an hour on one core.
+Writes NAME.csv and NAME.png beside this script; all of them take about 25 minutes on one core.
 """
 
 from __future__ import annotations
