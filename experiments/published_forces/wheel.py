@@ -3,7 +3,8 @@
     python experiments/published_forces/wheel.py <folder of the authors' wheel files>
 
 Makes one run file per case (about 80 MB each, in data/published_wheel; finished ones are kept), then wheel.csv and
-wheel.png beside this script. With `--scene wheel` the same wheels at the reference setting, into wheel_reference.*.
+wheel.png beside this script. With `--scene wheel` the same wheels on the bed, grid and numerics of that scene, the
+reference setting, into wheel_reference.*.
 """
 
 from __future__ import annotations
@@ -23,6 +24,14 @@ from sgns.simulate import simulate_campaign
 
 SERIES = (("pull", "drawbar pull", "C0"), ("vertical", "vertical force", "C1"), ("sinkage", "sinkage", "C2"))
 PUBLISHED_DAMPING = 500.0  # of the published wheels' height [1/s]
+THEIR_WHEEL = (  # what scene=published_wheel has of the wheel and its motion, beside what differs between the cases
+    "scene.friction=3",
+    "scene.bilateral=true",
+    f"scene.damping={PUBLISHED_DAMPING}",
+    "scene.settle=4",
+    "scene.clearance=0.0132890365",
+    "scene.duration=9.3333333333",
+)
 
 
 def ours(file: Path, scene: Wheel, count: int) -> dict[str, np.ndarray]:
@@ -61,6 +70,8 @@ def main() -> None:
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
+    if options.scene == "wheel":
+        options.overrides = [*THEIR_WHEEL, *options.overrides]
     published, campaign = campaign_of(options, wheel_case, "published_wheel", options.cases)
     simulate_campaign(campaign, device="cpu", workers=options.workers)
     stem = "wheel" if options.scene == "published_wheel" else "wheel_reference"
