@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from beds import cut
-from test_nonlocal_fluidity import compiled_source, launches
+from test_nonlocal_solver import compiled_source, launches
 
 from mpm_warp import (
     Bed,
@@ -224,7 +224,7 @@ def test_no_instruction_of_a_free_height_in_a_prescribed_body():
 
 def test_no_array_of_what_is_off():
     """Sizes of what the solver allocates for each effect, on and off. Fluidity and nonlocality:
-    test_nonlocal_fluidity.py."""
+    test_nonlocal_solver.py."""
     plain, halved, driven = Solver(SHEARED), Solver(SHEARED, Effects(symmetry=True)), Solver(WHEEL)
     silent = Solver(SHEARED, Effects(torque=False))
     assert (len(plain._body.data.impulse), len(silent._body.data.impulse)) == (2, 1)
