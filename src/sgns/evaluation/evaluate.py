@@ -20,7 +20,10 @@ import torch
 from tqdm import tqdm
 
 from sgns.errors import UserError
+from sgns.evaluation.bodies import is_wheel
+from sgns.evaluation.costs import forget_peak, network_costs, peak_memory
 from sgns.evaluation.metrics import mean_prediction, position_errors
+from sgns.evaluation.overlap import overlap_warning, seen_before
 from sgns.evaluation.provenance import provenance
 from sgns.evaluation.report import write_report
 from sgns.evaluation.report_words import describe, short_names
@@ -58,15 +61,24 @@ def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTimin
     with Run(path) as run, single_thread():
         simulated = (run.frame_count - simulator.history) / run.frame_rate
         for repeat in range(repeats + 1):
+            forget_peak()
             rollout = roll_out(simulator, run)
+            stepping_bytes = peak_memory()
+            forget_peak()
             began = time.perf_counter()
             for latent in torch.as_tensor(rollout.latent):
                 simulator.basis.inverse(latent)
             if repeat:
                 stepping.append(float(rollout.wall_time_s) / simulated)
                 decoding.append(stepping[-1] + (time.perf_counter() - began) / simulated)
+            decoding_bytes = peak_memory()
         return NetworkTiming(
-            statistics.median(stepping), statistics.median(decoding), len(stepping), path.stem
+            statistics.median(stepping),
+            statistics.median(decoding),
+            len(stepping),
+            path.stem,
+            stepping_bytes,
+            decoding_bytes,
         )
 
 
@@ -171,18 +183,24 @@ def evaluate(
             )
             prediction = stack.enter_context(Run(target))
             errors = position_errors(truth, prediction, simulator.basis, history, grid)
-            words = describe(truth.scene)
+            words, wheel = describe(truth.scene), is_wheel(truth.scene)
             scores = run_scores(path.stem, errors, truth, prediction, history, mean_force, mean_torque)
-        runs.append(EvaluatedRun(path.stem, label, words, path, target, errors, scores))
+        runs.append(EvaluatedRun(path.stem, label, words, path, target, errors, scores, wheel))
 
+    trained_on, chosen_by = seen_before(simulator, [run.name for run in runs])
     evaluation = Evaluation(
         dataset=str(dataset.name),
         split=split,
         runs=runs,
         total=aggregate([run.scores for run in runs]),
         timing=time_network(simulator, paths[0], repeats),
+        costs=network_costs(checkpoint, simulator.card),
         mean_force=mean_force,
+        mean_torque=mean_torque,
+        trained_on=trained_on,
+        chosen_by=chosen_by,
         curves=reduction_curves(full_basis(dataset, simulator.basis), paths),
+        basis=simulator.basis,
         num_modes=int(simulator.num_modes),
         history=history,
         particle_count=len(start),
@@ -197,6 +215,8 @@ def evaluate(
 def log_summary(evaluation: Evaluation, report: Path) -> None:
     """The main numbers on the terminal."""
     total, timing = evaluation.total, evaluation.timing
+    if warning := overlap_warning(evaluation):
+        log.warning("%s", warning)
     log.info("%d %s runs of %s", len(evaluation.runs), evaluation.split, evaluation.dataset)
     log.info(
         "position: RMSE %.3g mm (reduction alone %.3g, frozen %.3g); skill %.3f against frozen, %.3f "
