@@ -46,13 +46,13 @@ def trained(checkpoint: Path, card: dict[str, Any]) -> dict[str, float]:
         return {}
     try:
         summary = json.loads(file.read_text(encoding="utf-8"))
-        found = {"training_steps": float(summary["steps"]), "training_seconds": float(summary["seconds"])}
+        found = {"training_steps": int(summary["steps"]), "training_seconds": float(summary["seconds"])}
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{file} is not the summary of a training ({type(error).__name__}: {error}); remove it or train again"
         ) from error
     batch = card.get("settings", {}).get("training", {}).get("batch_size")
-    return found | ({"batch_size": float(batch)} if batch else {})
+    return found | ({"batch_size": int(batch)} if batch else {})
 
 
 # --- memory of this process, as Linux counts it -----------------------------------------------------------

@@ -26,7 +26,7 @@ from sgns.evaluation.metrics import mean_prediction, position_errors
 from sgns.evaluation.overlap import overlap_warning, seen_before
 from sgns.evaluation.provenance import provenance
 from sgns.evaluation.report import write_report
-from sgns.evaluation.report_words import describe, short_names
+from sgns.evaluation.report_words import describe, forward_name, short_names
 from sgns.evaluation.results import EvaluatedRun, Evaluation, NetworkTiming
 from sgns.evaluation.scores import aggregate, run_scores
 from sgns.evaluation.surface import surface_grid
@@ -228,9 +228,10 @@ def log_summary(evaluation: Evaluation, report: Path) -> None:
         total.skill("constant_velocity"),
     )
     log.info(
-        "force: NRMSE %.3f (mean force of the training split: %.3f); draft MAE %.3g N, vertical MAE %.3g N",
+        "force: NRMSE %.3f (mean force of the training split: %.3f); %s MAE %.3g N, vertical MAE %.3g N",
         total.force.overall_nrmse,
         total.mean_force.overall_nrmse,
+        forward_name(evaluation),
         total.force.mae[0],
         total.force.mae[2],
     )

@@ -50,7 +50,8 @@ th { font-weight: 600; }
 th.group { text-align: center; border-bottom: none; padding-bottom: 0; }
 th.text, td.text { text-align: left; }
 .wide td.text:first-child { position: sticky; left: 0; background: #fff; min-width: 4rem; }
-.wide td.text:last-child { min-width: 16rem; }
+.wide td.text:last-child { white-space: nowrap; }
+.costs td.text { min-width: 8.5rem; }
 tr.total td { font-weight: 600; border-top: 2px solid #1a1a1a; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(20rem, 100%), 1fr)); gap: 1rem; }
 figure { margin: 0; break-inside: avoid; }
@@ -61,7 +62,7 @@ figcaption, .note { font-size: 0.88rem; color: #444; }
 @media print {
   html { font-size: 9pt; } body { max-width: none; padding: 0; font-size: 9pt; } nav { display: none; }
   p, .note, figcaption { max-width: none; } .wide { overflow: visible; } table { font-size: 6.5pt; }
-  th, td { padding: 0.1rem 0.2rem; } .wide td.text:last-child { min-width: 0; }
+  th, td { padding: 0.1rem 0.2rem; } .wide td.text:last-child { white-space: normal; }
   .numbers div { flex-basis: 8rem; } .pictures { grid-template-columns: repeat(3, 1fr); gap: 4mm; }
   tr { break-inside: avoid; } h2, h2 + .note { break-after: avoid; } }
 """

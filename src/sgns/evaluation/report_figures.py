@@ -252,8 +252,8 @@ def spread(evaluation: Evaluation) -> FigureGroup:
     return FigureGroup(
         "Error by particle",
         "Mean square over time of every particle's position error, on a logarithmic axis: what the reduction "
-        "leaves out, and what the network adds within the subspace. Most particles hardly move; the bars far to the right are "
-        "the soil that the tool carries.",
+        "leaves out, and what the network adds within the subspace. Most particles hardly move; the bars far to "
+        "the right are the soil that the tool carries.",
         figures if particles else [],
     )
 

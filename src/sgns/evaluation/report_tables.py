@@ -10,7 +10,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from sgns.evaluation.metrics import FORCE_COMPONENTS
-from sgns.evaluation.report_words import fixed, number
+from sgns.evaluation.report_words import fixed, forward_name, number
 from sgns.evaluation.scores import Scores
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ class Column:
     group: str = ""
 
 
-def table(columns: Sequence[Column], total_row: bool = True) -> str:
-    """An HTML table; the last row is set apart as the total."""
+def table(columns: Sequence[Column], total_row: bool = True, style: str = "") -> str:
+    """An HTML table; the last row is set apart as the total, `style` is a class of the page's style sheet."""
     rows = list(zip(*(column.values for column in columns), strict=True))
     body = []
     for index, row in enumerate(rows):
@@ -47,7 +47,7 @@ def table(columns: Sequence[Column], total_row: bool = True) -> str:
         )
         body.append(f"<tr{mark}>{cells}</tr>")
     return (
-        f'<div class="wide"><table><thead>{heading_rows(columns)}</thead>'
+        f'<div class="wide"><table class="{style}"><thead>{heading_rows(columns)}</thead>'
         f"<tbody>{''.join(body)}</tbody></table></div>"
     )
 
@@ -77,11 +77,6 @@ def all_scores(evaluation: Evaluation) -> list[Scores]:
 def run_column(evaluation: Evaluation) -> Column:
     """Names of the runs and of all of them together."""
     return Column("run", [*(run.label for run in evaluation.runs), evaluation.total.name], text=True)
-
-
-def forward_name(evaluation: Evaluation) -> str:
-    """What the forward force is called: wheels pull, other bodies draw."""
-    return "drawbar pull" if all(run.wheel for run in evaluation.runs) else "draft"
 
 
 def soil_table(evaluation: Evaluation) -> str:
@@ -140,7 +135,7 @@ def force_table(evaluation: Evaluation) -> str:
         columns.append(Column("sinkage MAE [mm]", [number(1e3 * s.sinkage_mae) for s in scores]))
     if any(s.body_mse > 0.0 for s in scores):
         misplaced = [number(1e3 * math.sqrt(s.body_mse)) for s in scores]
-        columns.append(Column("body's place RMSE [mm]", misplaced))
+        columns.append(Column("body misplaced, RMS [mm]", misplaced))
     return table(columns)
 
 
@@ -181,7 +176,8 @@ def percentages(evaluation: Evaluation, component: str, errors: str, sizes: str)
     """Signed MPE of every run, and the mean of its size over all of them between bars."""
     axis = FORCE_COMPONENTS[component]
     signed = [fixed(float(getattr(run.scores, errors).mpe[axis]), 1, sign=True) for run in evaluation.runs]
-    return [*signed, f"|{fixed(getattr(evaluation.total, sizes)[component], 1)}|"]
+    size = getattr(evaluation.total, sizes)[component]
+    return [*signed, f"|{fixed(size, 1)}|" if math.isfinite(size) else fixed(size)]
 
 
 def cost_table(evaluation: Evaluation) -> str:
@@ -203,7 +199,7 @@ def cost_table(evaluation: Evaluation) -> str:
             1e-6 * timing.decoding_bytes,
         ),
     )
-    headings = ("material point solver", "network, in the subspace", "network, all particles decoded")
+    headings = ("solver (MPM)", "network", "network, particles decoded")
     return table(
         [
             Column("", [row[0] for row in rows], text=True),
@@ -213,6 +209,7 @@ def cost_table(evaluation: Evaluation) -> str:
             ),
         ],
         total_row=False,
+        style="costs",
     )
 
 

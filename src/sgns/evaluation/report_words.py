@@ -17,6 +17,7 @@ __all__ = [
     "example_note",
     "fixed",
     "force_note",
+    "forward_name",
     "number",
     "short_names",
     "soil_note",
@@ -73,6 +74,11 @@ def short_names(names: Sequence[str]) -> list[str]:
     """The part of every name before its first underscore, if that still tells the names apart."""
     short = [name.partition("_")[0] or name for name in names]
     return short if len(set(short)) == len(set(names)) else list(names)
+
+
+def forward_name(evaluation: Evaluation) -> str:
+    """What the forward force is called: wheels pull, other bodies draw."""
+    return "drawbar pull" if all(run.wheel for run in evaluation.runs) else "draft"
 
 
 def soil_words(total: Scores) -> str:
@@ -199,8 +205,9 @@ def force_note(evaluation: Evaluation) -> str:
 def cost_note(evaluation: Evaluation) -> str:
     """Under the table of time and memory."""
     costs, timing = evaluation.costs, evaluation.timing
+    samples = f" of {costs.batch_size} samples" if costs.batch_size > 0 else ""
     training = (
-        f"Training: {number(costs.training_steps)} steps of {number(costs.batch_size)} samples, their validation "
+        f"Training: {costs.training_steps} steps{samples}, their validation "
         "included, as training.json beside the checkpoint says. "
         if costs.training_steps > 0.0
         else "Training: there is no training.json beside the checkpoint. "

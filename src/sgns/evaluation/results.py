@@ -77,9 +77,9 @@ class Costs:
 
     parameters: int | float = math.nan
     checkpoint_bytes: float = math.nan
-    training_steps: float = math.nan
+    training_steps: int | float = math.nan
     training_seconds: float = math.nan
-    batch_size: float = math.nan
+    batch_size: int | float = math.nan
 
     @property
     def seconds_per_step(self) -> float:

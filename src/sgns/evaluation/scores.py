@@ -33,7 +33,7 @@ class Scores:
         solver_rate: wall seconds per simulated second of the solver; NaN if not recorded.
         absolute_mpe: mean over runs of |MPE| [%] by component of the force.
         mean_force_absolute_mpe: the same of the mean force of the training split [%].
-        body_mse: mean-square error of the body's centre of mass [m²]; 0 where its path was given.
+        body_mse: mean-square distance of the body from its true place [m²]; 0 where its path was given.
         sinkage_mae: mean absolute error of a wheel's sinkage [m]; NaN for other bodies.
     """
 
@@ -127,7 +127,7 @@ def run_scores(
         solver_rate=float(wall) / simulated if wall else math.nan,
         absolute_mpe=absolute_mpe(force),
         mean_force_absolute_mpe=absolute_mpe(mean),
-        body_mse=float(np.mean(misplaced**2)),
+        body_mse=float(np.mean((misplaced**2).sum(axis=1))),
         sinkage_mae=float(np.mean(np.abs(misplaced[:, 2]))) if is_wheel(truth.scene) else math.nan,
     )
 

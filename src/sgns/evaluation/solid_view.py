@@ -106,7 +106,8 @@ def solid_figure(
     """
     camera, spacing = Camera(), particle_spacing(start)
     low, high = start.min(axis=0) - spacing, start.max(axis=0) + spacing
-    high[2] += TOOL_ABOVE
+    corners = body_corners(run, frame)
+    high[2] = np.clip(corners[:, 2].max() + spacing, high[2], high[2] + TOOL_ABOVE)
     box = camera.project(
         np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(-1, 3)
     )
@@ -115,7 +116,7 @@ def solid_figure(
     buffer = DepthBuffer(left_bottom, right_top, width=round(DPI * (PICTURE_WIDTH - 0.2)))
     colours = colouring.colours(colouring.scale(colouring.values))[:, :3]
     buffer.spheres(camera.project(positions), 0.55 * spacing, colours)
-    buffer.triangles(camera.project(hull_triangles(body_corners(run, frame))), np.array(to_rgb(STEEL)))
+    buffer.triangles(camera.project(hull_triangles(corners)), np.array(to_rgb(STEEL)))
 
     height, width = buffer.nearness.shape
     figure = new_figure(PICTURE_WIDTH, PICTURE_WIDTH * height / width + 0.95)
@@ -138,15 +139,21 @@ def solid_figure(
 
 
 def draw_directions(axis: Axes, camera: Camera, low: np.ndarray, high: np.ndarray) -> None:
-    """The three axes as lines of 10 cm, in the lower left corner."""
-    length = 0.1
+    """The three axes in the lower left corner, as lines about a tenth of the picture's width long."""
+    length = nice(0.07 * (high[0] - low[0]))
     ends = camera.project(length * np.eye(3))[:, :2]
     origin = low + np.array([0.02, 0.03]) * (high - low) - ends.min(axis=0, initial=0.0)
     for name, end in zip("xyz", ends, strict=True):
         axis.plot(*zip(origin, origin + end, strict=True), color=TRUTH, linewidth=1.2)
         axis.annotate(name, origin + 1.25 * end, fontsize=9, ha="center", va="center", annotation_clip=False)
     axis.annotate(
-        "10 cm", origin, xytext=(0, -4), textcoords="offset points", fontsize=8, ha="center", va="top"
+        f"{100.0 * length:g} cm",
+        origin,
+        xytext=(0, -4),
+        textcoords="offset points",
+        fontsize=8,
+        ha="center",
+        va="top",
     )
 
 
