@@ -154,6 +154,7 @@ def evaluate(
     for path in (*paths, *new_rollouts):  # all of them before anything is written
         with Run(path) as run:
             require_known_run(simulator, run, checkpoint)
+    costs = network_costs(checkpoint, simulator.card)
     try:
         (output / "rollouts").mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -194,7 +195,7 @@ def evaluate(
         runs=runs,
         total=aggregate([run.scores for run in runs]),
         timing=time_network(simulator, paths[0], repeats),
-        costs=network_costs(checkpoint, simulator.card),
+        costs=costs,
         mean_force=mean_force,
         mean_torque=mean_torque,
         trained_on=trained_on,

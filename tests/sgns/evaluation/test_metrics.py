@@ -109,6 +109,29 @@ def test_chunks_of_frames_do_not_change_anything(monkeypatch):
     pieces = compared(truth, prediction)
     for name in ("reduction", "network", "total", "frozen", "constant_velocity", "surface"):
         assert getattr(pieces, name) == pytest.approx(getattr(whole, name), rel=1e-12)
+    assert pieces.particles.reduction == pytest.approx(whole.particles.reduction, rel=1e-12)
+    assert pieces.particles.network == pytest.approx(whole.particles.network, rel=1e-12)
+
+
+def test_errors_by_particle_have_the_same_mean_as_those_by_frame():
+    basis = make_basis()
+    truth, walk = random_walk(), random_walk(seed=2)
+    prediction = basis.inverse(basis.transform(torch.from_numpy(walk))).numpy()
+    errors = compared(truth, prediction, basis)
+    assert errors.particles.reduction.shape == errors.particles.network.shape == (7,)
+    assert errors.particles.reduction.mean() == pytest.approx(errors.mse("reduction"))
+    assert errors.particles.network.mean() == pytest.approx(errors.mse("network"), rel=1e-5)
+
+
+def test_error_of_one_particle_by_hand():
+    basis = make_basis()
+    inside = basis.inverse(basis.transform(torch.from_numpy(random_walk()))).numpy()
+    off = inside.copy()
+    off[2:, 3, 1] += 0.3
+    particles = compared(inside, off, basis).particles
+    assert particles.network[3] == pytest.approx(0.3**2 / 3, rel=1e-4)
+    assert np.delete(particles.network, 3) == pytest.approx(0.0, abs=1e-12)
+    assert particles.reduction == pytest.approx(0.0, abs=1e-12)
 
 
 def test_surface_error_of_a_raised_bed():
