@@ -22,7 +22,7 @@ from tqdm import tqdm
 from sgns.errors import UserError
 from sgns.evaluation.bodies import is_wheel
 from sgns.evaluation.costs import forget_peak, network_costs, peak_memory
-from sgns.evaluation.metrics import mean_prediction, position_errors
+from sgns.evaluation.metrics import body_errors, mean_prediction, position_errors
 from sgns.evaluation.overlap import overlap_warning, seen_before
 from sgns.evaluation.provenance import provenance
 from sgns.evaluation.report import write_report
@@ -185,7 +185,8 @@ def evaluate(
             prediction = stack.enter_context(Run(target))
             errors = position_errors(truth, prediction, simulator.basis, history, grid)
             words, wheel = describe(truth.scene), is_wheel(truth.scene)
-            scores = run_scores(path.stem, errors, truth, prediction, history, mean_force, mean_torque)
+            body = body_errors(truth, prediction, history)
+            scores = run_scores(path.stem, errors, truth, prediction, history, mean_force, mean_torque, body)
         runs.append(EvaluatedRun(path.stem, label, words, path, target, errors, scores, wheel))
 
     trained_on, chosen_by = seen_before(simulator, [run.name for run in runs])

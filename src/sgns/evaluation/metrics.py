@@ -15,15 +15,19 @@ import numpy as np
 import torch
 
 from sgns.errors import UserError
+from sgns.evaluation.bodies import is_wheel
 from sgns.evaluation.surface import SurfaceGrid, height_map
 from sgns.runs import frame_chunks
 
 __all__ = [
     "FORCE_COMPONENTS",
+    "PRESCRIBED",
     "TORQUE_COMPONENTS",
+    "BodyErrors",
     "ParticleErrors",
     "PositionErrors",
     "VectorErrors",
+    "body_errors",
     "mean_prediction",
     "position_errors",
     "skill",
@@ -88,6 +92,23 @@ class PositionErrors:
     def skill(self, baseline: str = "frozen") -> float:
         """1 − total MSE / MSE of a baseline (`frozen` or `constant_velocity`)."""
         return skill([self.mse("total")], [self.mse(baseline)])
+
+
+@dataclass(frozen=True)
+class BodyErrors:
+    """How far a predicted body is from its true place, over the frames after the history.
+
+    Attributes:
+        mse: mean-square distance of the centres of mass [m²].
+        sinkage_mae: mean absolute error of a wheel's sinkage [m]; NaN for other bodies.
+    """
+
+    mse: float
+    sinkage_mae: float
+
+
+PRESCRIBED = BodyErrors(0.0, math.nan)
+"""Of a body whose path was given."""
 
 
 @dataclass(frozen=True)
@@ -263,6 +284,21 @@ def position_errors(
     entries = 3 * (truth.frame_count - history)
     particles = ParticleErrors(**{name: total / entries for name, total in by_particle.items()})
     return PositionErrors(time=np.asarray(truth.time)[history:], **values, particles=particles)
+
+
+def body_errors(truth: Any, prediction: Any, history: int) -> BodyErrors:
+    """Errors of the body's place in a predicted run.
+
+    Args:
+        truth: the simulated `Run`.
+        prediction: the predicted `Run` of the same scene.
+        history: frames at the start that count in no metric.
+    """
+    misplaced = prediction.pose[history:, :3] - truth.pose[history:, :3]
+    return BodyErrors(
+        mse=float(np.mean((misplaced**2).sum(axis=1))),
+        sinkage_mae=float(np.mean(np.abs(misplaced[:, 2]))) if is_wheel(truth.scene) else math.nan,
+    )
 
 
 def mean_square(difference: np.ndarray) -> np.ndarray:

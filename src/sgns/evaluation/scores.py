@@ -9,8 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from sgns.evaluation.bodies import is_wheel
-from sgns.evaluation.metrics import FORCE_COMPONENTS, TORQUE_COMPONENTS, PositionErrors, VectorErrors, skill
+from sgns.evaluation.metrics import (
+    FORCE_COMPONENTS,
+    PRESCRIBED,
+    TORQUE_COMPONENTS,
+    BodyErrors,
+    PositionErrors,
+    VectorErrors,
+    skill,
+)
 
 __all__ = ["Scores", "aggregate", "run_scores"]
 
@@ -99,6 +106,7 @@ def run_scores(
     history: int,
     mean_force: np.ndarray,
     mean_torque: np.ndarray,
+    body: BodyErrors = PRESCRIBED,
 ) -> Scores:
     """Scores of one run.
 
@@ -110,12 +118,12 @@ def run_scores(
         history: frames at the start that count in no metric.
         mean_force: mean force of the training split [N], shape (3,).
         mean_torque: mean torque of the training split [N m], shape (3,).
+        body: how far the body is from its true place; by default its path was given.
     """
     force = VectorErrors.compare(truth.force[history:], prediction.force[history:])
     mean = VectorErrors.compare(truth.force[history:], mean_force)
     simulated = float(truth.time[-1] - truth.time[0])
     wall = truth.wall_time_s
-    misplaced = prediction.pose[history:, :3] - truth.pose[history:, :3]
     return Scores(
         name=name,
         frames=len(positions.time),
@@ -127,8 +135,8 @@ def run_scores(
         solver_rate=float(wall) / simulated if wall else math.nan,
         absolute_mpe=absolute_mpe(force),
         mean_force_absolute_mpe=absolute_mpe(mean),
-        body_mse=float(np.mean((misplaced**2).sum(axis=1))),
-        sinkage_mae=float(np.mean(np.abs(misplaced[:, 2]))) if is_wheel(truth.scene) else math.nan,
+        body_mse=body.mse,
+        sinkage_mae=body.sinkage_mae,
     )
 
 

@@ -26,8 +26,8 @@ def write_tables(evaluation: Evaluation, output: Path) -> None:
     examples with the baselines beside; `metrics.json`: the first and everything around it.
     """
     scores = [run.scores for run in evaluation.runs]
-    write_csv(output / "metrics.csv", [score.row() for score in (*scores, evaluation.total)])
-    write_csv(output / "examples.csv", [example_row(score) for score in (*scores, evaluation.total)])
+    write_csv(output / "metrics.csv", [*scores, evaluation.total])
+    write_rows(output / "examples.csv", [example_row(score) for score in (*scores, evaluation.total)])
     timing, costs = evaluation.timing, evaluation.costs
     write_json(
         output / "metrics.json",
@@ -88,7 +88,12 @@ def example_row(scores: Scores) -> dict[str, Any]:
     return row
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def write_csv(path: Path, scores: Sequence[Scores]) -> None:
+    """All metrics: one line per `Scores`."""
+    write_rows(path, [score.row() for score in scores])
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """One line per row under a line of column names; a metric without meaning is left empty."""
     with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))

@@ -1,4 +1,5 @@
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from sgns.errors import UserError
 from sgns.evaluation.metrics import (
     PositionErrors,
     VectorErrors,
+    body_errors,
     mean_prediction,
     position_errors,
     skill,
@@ -183,6 +185,20 @@ def test_sign_of_mpe_does_not_depend_on_the_sign_of_the_force():
     truth = np.full((5, 3), [-10.0, 8.0, 10.0])
     assert VectorErrors.compare(truth, 1.2 * truth).mpe == pytest.approx([20.0, 20.0, 20.0])
     assert VectorErrors.compare(truth, 0.9 * truth).mpe == pytest.approx([-10.0, -10.0, -10.0])
+
+
+def test_body_errors_by_hand():
+    poses = np.zeros((5, 7))
+    moved = poses.copy()
+    moved[0, 0] = 9.0  # within the history: does not count
+    moved[2:, 2] = [-0.003, 0.003, -0.003]
+    moved[2:, 1] = 0.004
+    wheel = {"diameter": 0.15}
+    errors = body_errors(SimpleNamespace(pose=poses, scene=wheel), SimpleNamespace(pose=moved), 2)
+    assert errors.mse == pytest.approx(0.005**2)
+    assert errors.sinkage_mae == pytest.approx(0.003)
+    blade = body_errors(SimpleNamespace(pose=poses, scene={}), SimpleNamespace(pose=poses), 2)
+    assert blade.mse == 0.0 and math.isnan(blade.sinkage_mae)
 
 
 def test_sums_of_runs_equal_the_runs_joined():
