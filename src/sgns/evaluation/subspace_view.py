@@ -85,8 +85,8 @@ def decorate(axis: Axes3D, low: np.ndarray, high: np.ndarray) -> None:
     low, high = low - room, high + room
     for name, start, end in zip("xyz", low, high, strict=True):
         getattr(axis, f"set_{name}lim")(start, end)
-        getattr(axis, f"set_{name}label")(f"{name} [m]", fontsize=9)
-    axis.set_box_aspect(np.maximum(high - low, 0.6 * float((high - low).max())), zoom=1.02)
+        getattr(axis, f"set_{name}label")(f"{name} [m]", fontsize=9, labelpad=-1.0)
+    axis.set_box_aspect(np.maximum(high - low, 0.6 * float((high - low).max())), zoom=0.95)
     for part in (axis.xaxis, axis.yaxis, axis.zaxis):
         part.set_major_locator(MaxNLocator(4))
     axis.tick_params(labelsize=8, pad=0)
