@@ -31,6 +31,7 @@ from sgns.evaluation.results import EvaluatedRun, Evaluation, NetworkTiming
 from sgns.evaluation.scores import aggregate, run_scores
 from sgns.evaluation.surface import surface_grid
 from sgns.evaluation.tables import write_tables
+from sgns.evaluation.training_curves import read_log
 from sgns.poses import in_body_frame
 from sgns.reduction import Basis
 from sgns.reduction.reconstruction import reduction_curves
@@ -199,6 +200,7 @@ def evaluate(
         costs=costs,
         mean_force=mean_force,
         mean_torque=mean_torque,
+        training_log=read_log(checkpoint.parent / "tensorboard"),
         trained_on=trained_on,
         chosen_by=chosen_by,
         curves=reduction_curves(full_basis(dataset, simulator.basis), paths),

@@ -18,6 +18,7 @@ from sgns.evaluation.sideview import common_scales, side_view, view_times
 from sgns.evaluation.solid_view import solid_views
 from sgns.evaluation.subspace_view import latent_path, subspace_view
 from sgns.evaluation.surface import surface_grid
+from sgns.evaluation.training_curves import training_figure
 from sgns.runs import Run
 
 if TYPE_CHECKING:
@@ -87,6 +88,7 @@ def report_figures(evaluation: Evaluation) -> list[FigureGroup]:
         spread(evaluation),
         in_subspace(evaluation, typical),
         reduction(evaluation),
+        *([training(evaluation)] if evaluation.training_log else []),
     ]
     for path in evaluation.new_rollouts:
         with Run(path) as run:
@@ -304,6 +306,23 @@ def reduction(evaluation: Evaluation) -> FigureGroup:
                 f"rollout's error with {evaluation.num_modes} modes.",
                 reconstruction_figure(curves.held_out, curves.training, evaluation.num_modes, network),
             ),
+        ],
+    )
+
+
+def training(evaluation: Evaluation) -> FigureGroup:
+    """How the losses fell and the rollouts got better."""
+    return FigureGroup(
+        "How it was trained",
+        "The loss is of single steps, the skill of whole rollouts of the validation runs, within the subspace: low "
+        "losses alone are no proof. The checkpoint with the highest skill is kept.",
+        [
+            picture(
+                "training",
+                "Training",
+                "Losses of the training batches on a logarithmic axis; skill and force NRMSE of the validation runs.",
+                training_figure(evaluation.training_log),
+            )
         ],
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -106,6 +106,7 @@ class Evaluation:
         start: common start of the particles [m], shape (n, 3).
         costs: of the network.
         mean_torque: mean torque of the training split [N m], shape (3,).
+        training_log: losses and validation scores by step, as `training_curves.read_log` gives them.
         trained_on: names of the evaluated runs that the basis and the network were fitted on.
         chosen_by: names of those that chose the checkpoint.
         new_rollouts: run files without truth that are shown too.
@@ -126,6 +127,7 @@ class Evaluation:
     start: np.ndarray
     costs: Costs = field(default_factory=Costs)
     mean_torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    training_log: Mapping[str, np.ndarray] = field(default_factory=dict)
     trained_on: Sequence[str] = ()
     chosen_by: Sequence[str] = ()
     new_rollouts: Sequence[Path] = ()
