@@ -53,7 +53,7 @@ th.text, td.text { text-align: left; }
 .wide td.text:last-child { white-space: nowrap; }
 .costs td.text { min-width: 8.5rem; }
 tr.total td { font-weight: 600; border-top: 2px solid #1a1a1a; }
-.pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(20rem, 100%), 1fr)); gap: 1rem; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(17rem, 100%), 1fr)); gap: 1rem; }
 figure { margin: 0; break-inside: avoid; }
 figure img { width: 100%; height: auto; }
 figcaption, .note { font-size: 0.88rem; color: #444; }

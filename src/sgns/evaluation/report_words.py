@@ -128,6 +128,14 @@ def force_words(total: Scores) -> str:
     )
 
 
+def body_words(total: Scores) -> str:
+    """How far a predicted body is from its true place."""
+    sentence = f"The tool itself, which it moves, is {number(1e3 * math.sqrt(total.body_mse))} mm (RMS) from its place"
+    if math.isnan(total.sinkage_mae):
+        return sentence + "."
+    return f"{sentence}; the sinkage is off by {number(1e3 * total.sinkage_mae)} mm on average."
+
+
 def time_words(evaluation: Evaluation) -> str:
     """How fast the network is beside the solver."""
     own, solver = evaluation.timing.stepping, evaluation.total.solver_rate
@@ -153,14 +161,17 @@ def seen_words(evaluation: Evaluation) -> str:
 
 def summary(evaluation: Evaluation) -> str:
     """The result in one paragraph of plain words."""
-    count = len(evaluation.runs)
-    seen = seen_words(evaluation)
+    count, free = len(evaluation.runs), evaluation.total.body_mse > 0.0
+    given = "what is prescribed of the tool's motion" if free else "the tool's path"
+    sentences = [soil_words(evaluation.total), force_words(evaluation.total)]
+    if free:
+        sentences.append(body_words(evaluation.total))
     return (
         "A graph network learned the soil's motion and the force on the tool from material point "
         f"simulations, in a subspace of {evaluation.num_modes} modes instead of "
-        f"{evaluation.particle_count} particles. It was given the tool's path and the first "
-        f"{evaluation.history} frames of {count} run{'s' if count != 1 else ''} {seen}, and predicted the "
-        f"rest. {soil_words(evaluation.total)} {force_words(evaluation.total)} {time_words(evaluation)}"
+        f"{evaluation.particle_count} particles. It was given {given} and the first "
+        f"{evaluation.history} frames of {count} run{'s' if count != 1 else ''} {seen_words(evaluation)}, and "
+        f"predicted the rest. {' '.join(sentences)} {time_words(evaluation)}"
     )
 
 

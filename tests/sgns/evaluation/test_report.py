@@ -165,6 +165,16 @@ def test_words_about_time_and_split():
     assert "1 run that" in summary(evaluation(names=("one",)))
 
 
+def test_words_about_a_tool_whose_place_is_predicted():
+    result = evaluation(wheel=True)
+    assert "was given the tool's path" in summary(result) and "from its place" not in summary(result)
+    free = replace(result, total=replace(result.total, body_mse=4e-6, sinkage_mae=1.5e-3))
+    assert "was given what is prescribed of the tool's motion" in summary(free)
+    assert "is 2.00 mm (RMS) from its place; the sinkage is off by 1.50 mm" in summary(free)
+    free = replace(result, total=replace(result.total, body_mse=4e-6))
+    assert "from its place." in summary(free)
+
+
 def test_words_name_the_subspace_where_it_is_to_blame():
     assert "is the subspace's" in summary(evaluation(reduction=0.7))
     assert "is the subspace's" not in summary(evaluation(reduction=0.2))
