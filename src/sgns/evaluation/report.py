@@ -61,9 +61,10 @@ figcaption, .note { font-size: 0.88rem; color: #444; }
 @page { margin: 14mm; }
 @media print {
   html { font-size: 9pt; } body { max-width: none; padding: 0; font-size: 9pt; } nav { display: none; }
-  p, .note, figcaption { max-width: none; } .wide { overflow: visible; } table { font-size: 6.5pt; }
+  p, .note, figcaption { max-width: none; } table { font-size: 6.5pt; }
+  .wide { overflow: visible; break-inside: avoid; }
   th, td { padding: 0.1rem 0.2rem; } .wide td.text:last-child { white-space: normal; }
-  .numbers div { flex-basis: 8rem; } .pictures { grid-template-columns: repeat(3, 1fr); gap: 4mm; }
+  .numbers div { flex-basis: 8rem; } .pictures { grid-template-columns: repeat(2, 1fr); gap: 5mm; }
   tr { break-inside: avoid; } h2, h2 + .note { break-after: avoid; } }
 """
 

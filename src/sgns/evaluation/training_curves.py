@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sgns.evaluation.figures import ACCENT, BASELINE, NETWORK, PICTURE_WIDTH, TRUTH, new_figure, styled
@@ -44,6 +45,9 @@ def training_figure(log: Mapping[str, np.ndarray]) -> Figure:
         label = name.removeprefix("loss/")
         losses.plot(*log[name].T, color=COLOURS.get(label, NETWORK), label=label, linewidth=1.2)
         losses.set_yscale("log")
+        losses.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
+        losses.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        losses.yaxis.set_minor_formatter(NullFormatter())
     for name, (label, colour) in VALIDATION.items():
         if name in log:
             rollouts.plot(*log[name].T, color=colour, label=label, marker=".")
