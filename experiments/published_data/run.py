@@ -60,7 +60,9 @@ def settings(preset: str, folder: Path, fold: int, overrides: list[str]) -> dict
     return plain
 
 
-def trained(preset: str, folder: Path, fold: int, seconds: float, output: Path, overrides: list[str]) -> float:
+def trained(
+    preset: str, folder: Path, fold: int, seconds: float, output: Path, overrides: list[str]
+) -> float:
     """Train for about so many seconds; returns the seconds it took."""
     record = output / "training.json"
     if record.exists():
@@ -149,15 +151,23 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     figure, axes = plt.subplots(2, 2, figsize=(10, 6.4), layout="constrained")
     for line, kind in zip(axes, KINDS, strict=True):
         for shift, preset in enumerate(PRESETS):
-            found = [r for r in rows if r["kind"] == kind and r["preset"] == preset and r["run"] != "all runs"]
+            found = [
+                r for r in rows if r["kind"] == kind and r["preset"] == preset and r["run"] != "all runs"
+            ]
             at = np.arange(len(found)) + 0.26 * (shift - 1)
             skill = [max(r["skill_frozen"], -1.0) for r in found]
             line[0].bar(at, skill, 0.24, label=preset)
             line[1].bar(at, [min(r["force_nrmse"], 2.0) for r in found], 0.24, label=preset)
         line[1].plot(
-            np.arange(len(found)), [min(r["mean_force_nrmse"], 2.0) for r in found], "k_", ms=14, label="mean force"
+            np.arange(len(found)),
+            [min(r["mean_force_nrmse"], 2.0) for r in found],
+            "k_",
+            ms=14,
+            label="mean force",
         )
-        for axis, what in zip(line, ("skill against frozen (cut at -1)", "force NRMSE (cut at 2)"), strict=True):
+        for axis, what in zip(
+            line, ("skill against frozen (cut at -1)", "force NRMSE (cut at 2)"), strict=True
+        ):
             axis.set_xticks(np.arange(len(found)), [r["run"].split("_")[-1] for r in found], fontsize=8)
             axis.set_title(f"{kind}: {what}", fontsize=10)
             axis.axhline(0.0, color="0.3", lw=0.8)
