@@ -56,10 +56,10 @@ def main(cfg: DictConfig) -> float:
     threads = TrainingSettings.from_dict(plain["training"]).threads
     if threads is not None:
         torch.set_num_threads(threads)  # for the reduction, too
-    reduced = reduce_dataset(Dataset.open(cfg.dataset.path), cfg.reduction)
+    reduced = reduce_dataset(Dataset.open(cfg.dataset.path), cfg.reduction, device=cfg.device)
     return train(
         reduced,
-        num_modes=cfg.reduction.num_modes,
+        num_modes=reduced.num_modes,
         model=plain["model"],
         training=plain["training"],
         output=Path(cfg.output),

@@ -21,7 +21,7 @@ from torch import Tensor
 from sgns.errors import UserError
 from sgns.reduction.basis import Basis, check_centring, orthonormality_error
 
-__all__ = ["IncrementalPCA"]
+__all__ = ["IncrementalPCA", "checked_device"]
 
 _EPS = torch.finfo(torch.float64).eps
 # A Gram matrix squares the singular values, so eigenvectors under this fraction of the largest eigenvalue
@@ -74,8 +74,8 @@ class IncrementalPCA:
 
     Frames that follow each other are alike. Once the stream has had to drop directions, a block is therefore
     turned by its own eigenvectors first, and rows weaker than the block's share of the weakest tracked
-    direction are left out; several such blocks are merged at once. What is left out sums to no more than
-    that weakest direction holds, along any direction.
+    direction are left out; several such blocks are merged at once. Over a steady stream, what is left out
+    along any one direction sums to no more than that weakest direction holds.
 
     All centrings share the stream, which is centred per particle and axis: another mean c adds exactly
     the rows sqrt(N) (mean_axis - c).
@@ -101,14 +101,7 @@ class IncrementalPCA:
             oversampling = max(16, num_modes // 8)
         if oversampling < 0:
             raise UserError(f"oversampling is {oversampling}; it must be at least 0")
-        try:
-            self.device = torch.device(device)
-            torch.zeros(1, dtype=torch.float64, device=self.device)
-        except (RuntimeError, AssertionError, TypeError) as error:
-            reason = str(error).splitlines()[0]
-            raise UserError(
-                f"cannot compute in float64 on device {device!r}: {reason}; use device=cpu"
-            ) from error
+        self.device = checked_device(device)
         self.num_modes = num_modes
         self.oversampling = oversampling
         self._tracked = num_modes + oversampling
@@ -338,6 +331,18 @@ class IncrementalPCA:
                 "positions must be finite lengths in metres; check the run with `sgns check`"
             )
         return x, float(torch.linalg.vector_norm(x, dtype=torch.float64))
+
+
+def checked_device(device: str | torch.device) -> torch.device:
+    """The torch device of that name; a UserError if it is not here or does not know float64."""
+    try:
+        torch.zeros(1, dtype=torch.float64, device=device)
+        return torch.device(device)
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(
+            f"cannot compute in float64 on device {device!r}: {reason}; use device=cpu"
+        ) from error
 
 
 def _centred(frames: Tensor, old: _Moments) -> tuple[Tensor, _Moments]:
