@@ -1,9 +1,9 @@
-"""What r modes cost on runs that the basis has not seen, for the three centrings; and whether an autoencoder does better.
+"""What r modes cost on runs that the basis has not seen, for the three centrings.
 
     python experiments/reduction/run.py data/quick
 
-One stream over the training runs gives the bases of all three centrings. Writes curves.csv, curves.png and
-autoencoder.csv beside this script. "Held out" are the validation and the test runs.
+One stream over the training runs gives the bases of all three centrings. Writes curves.csv and curves.png beside
+this script. "Held out" are the validation and the test runs.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import torch
-from autoencoder import compare
 
 from sgns.campaign import SPLITS, Dataset
 from sgns.evaluation.provenance import cpu_model
-from sgns.reduction import CENTRINGS, Basis, IncrementalPCA
+from sgns.reduction import CENTRINGS, IncrementalPCA
 from sgns.reduction.reconstruction import ReductionCurves, reduction_curves
 from sgns.runs import Run, frame_chunks
 
@@ -40,20 +39,7 @@ def fit(paths: list[Path]) -> IncrementalPCA:
     return pca
 
 
-def reduced(paths: list[Path], basis: Basis) -> tuple[np.ndarray, float]:
-    """Coordinates of all frames (T, r, 3) [m], and the variance outside the basis per entry [m²]."""
-    latent, outside, count = [], 0.0, 0
-    for path in paths:
-        with Run(path) as run:
-            for frames in frame_chunks(run.particle_count, run.frame_count):
-                positions = torch.from_numpy(run.positions(frames)).double()
-                latent.append(basis.transform(positions))
-                outside += float((positions - basis.mean).square().sum() - latent[-1].square().sum())
-                count += positions.numel()
-    return torch.cat(latent).numpy(), outside / count
-
-
-def rows_of(centring: str, curves: ReductionCurves, rank: int) -> list[dict[str, str]]:
+def rows_of(centring: str, curves: ReductionCurves) -> list[dict[str, str]]:
     """Lines of curves.csv."""
     return [
         {
@@ -63,7 +49,6 @@ def rows_of(centring: str, curves: ReductionCurves, rank: int) -> list[dict[str,
             "displacement_energy": f"{curves.displacement_energy[r - 1]:.6f}",
             "rmse_training_mm": f"{1e3 * curves.training[r - 1] ** 0.5:.4f}",
             "rmse_held_out_mm": f"{1e3 * curves.held_out[r] ** 0.5:.4f}",
-            "modes_found": str(rank),
         }
         for r in POWERS
     ]
@@ -94,7 +79,7 @@ def write(path: Path, rows: list[dict[str, str]]) -> None:
         writer = csv.DictWriter(stream, rows[0])
         writer.writeheader()
         writer.writerows(rows)
-    print(*rows[0], *("  ".join(row.values()) for row in rows), sep="\n")
+    print("  ".join(rows[0]), *("  ".join(row.values()) for row in rows), sep="\n")
 
 
 def main() -> None:
@@ -108,17 +93,11 @@ def main() -> None:
     pca = fit(paths["train"])
     curves, rows = {}, []
     for centring in CENTRINGS:
-        rank = pca.rank(centring)
-        basis = pca.basis(centring, min(rank, POWERS[-1]))
+        basis = pca.basis(centring)
         curves[centring] = reduction_curves(basis, paths["validation"] + paths["test"])
-        rows += rows_of(centring, curves[centring], rank)
+        rows += rows_of(centring, curves[centring])
     write(HERE / "curves.csv", rows)
     draw(curves, HERE / "curves.png")
-    basis = pca.basis("particle_axis", 64)
-    write(
-        HERE / "autoencoder.csv",
-        compare({split: reduced(runs, basis) for split, runs in paths.items()}, basis.num_particles),
-    )
 
 
 if __name__ == "__main__":

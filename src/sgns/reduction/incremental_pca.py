@@ -80,7 +80,7 @@ class IncrementalPCA:
     All centrings share the stream, which is centred per particle and axis: another mean c adds exactly
     the rows sqrt(N) (mean_axis - c).
 
-    Memory: about 7 (num_modes + oversampling) n numbers of 8 bytes at most, beside the batch.
+    Memory: about 9 (num_modes + oversampling) n numbers of 8 bytes at most, beside the batch.
 
     Args:
         num_modes: The largest number of modes that will be asked for.
@@ -289,9 +289,11 @@ class IncrementalPCA:
         if self._pending_count:
             rows, found = _centred(self._pending[: self._pending_count + 1].clone(), found)
             waiting.append(rows)
+        room = self._rooms[1]  # empty between merges
         for rows in waiting:
             if len(rows):
-                found, _ = _merged(found, rows, torch.empty_like(self._rooms[1]))
+                found, _ = _merged(found, rows, room)
+                room = torch.empty_like(room)
         return found
 
     def _checked(self, positions: Tensor | np.ndarray) -> tuple[Tensor, float]:
