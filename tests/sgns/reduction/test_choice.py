@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tiny import REDUCTION, make_dataset
+from omegaconf import OmegaConf
+from tiny import MODEL, REDUCTION, TRAINING, make_dataset
 
 from sgns.errors import UserError
+from sgns.learning.surrogate import load_surrogate
+from sgns.learning.training import main
 from sgns.reduction.choice import choose_modes
 from sgns.reduction.reconstruction import reconstruction_curve
 from sgns.reduction.reduced import reduce_dataset
@@ -55,3 +58,20 @@ def test_a_tolerance_out_of_reach_names_what_is_reached(case) -> None:
     with pytest.raises(UserError, match=r"lower reduction\.share") as caught:
         choose_modes(basis, settings | {"choose": "energy", "share": 1.0, "max_modes": 9}, validation)
     assert "max_modes" not in str(caught.value)
+
+
+def test_training_uses_what_was_chosen(tmp_path) -> None:
+    three = reduce_dataset(make_dataset(tmp_path / "data"), REDUCTION).basis.energy(3)
+    cfg = {
+        "dataset": {"path": str(tmp_path / "data"), "name": "tiny"},
+        "reduction": REDUCTION | {"num_modes": "auto", "choose": "energy", "share": three},
+        "model": MODEL,
+        "training": TRAINING | {"max_steps": 2, "validate_every": 2},
+        "preset": {"name": "default"},
+        "checkpoint": None,
+        "output": str(tmp_path / "out"),
+        "seed": 0,
+        "device": "cpu",
+    }
+    main(OmegaConf.create(cfg))
+    assert load_surrogate(tmp_path / "out" / "best.ckpt").dynamics.num_modes == 3
