@@ -37,7 +37,7 @@ _RIM = 0.974  # the published rim's points lie at this share of the diameter
 _SPLIT = {"train": "train", "valid": "validation", "validation": "validation", "test": "test"}
 
 
-def published_dataset(settings: Mapping[str, Any], num_modes: int) -> ReducedDataset:
+def published_dataset(settings: Mapping[str, Any], num_modes: int | str) -> ReducedDataset:
     """The runs of a folder, split for training.
 
     With a train.tfrecord every file is its split. Without one all runs are for training, but for one fold if there are
@@ -70,7 +70,7 @@ def published_dataset(settings: Mapping[str, Any], num_modes: int) -> ReducedDat
     if {run.scene["kind"] for name in SPLITS for run in split[name]} != {first.scene["kind"]}:
         raise UserError(f"{folder} mixes blades and wheels; keep one folder for each")
     modes = first.latent.shape[1]
-    if not 1 <= num_modes <= modes:
+    if not isinstance(num_modes, int) or not 1 <= num_modes <= modes:
         raise UserError(
             f"reduction.num_modes is {num_modes}; {folder} holds {modes} modes: allowed are 1 to {modes}"
         )
@@ -85,7 +85,7 @@ def published_dataset(settings: Mapping[str, Any], num_modes: int) -> ReducedDat
         fitted_on=[f"{run.name} {fingerprint(run)}" for run in split["train"]],
     )
     start = np.mean([run.latent[0] for run in split["train"]], axis=0)
-    return ReducedDataset(basis, folder, _FRAME_RATE, start, split)
+    return ReducedDataset(basis, num_modes, folder, _FRAME_RATE, start, split)
 
 
 def published_runs(folder: str | Path) -> dict[str, list[ReducedRun]]:

@@ -63,7 +63,14 @@ TRAINING: dict[str, Any] = {
     "resume": "auto",
     "threads": None,
 }
-REDUCTION: dict[str, Any] = {"num_modes": 4, "max_modes": 6, "centring": "particle_axis"}
+REDUCTION: dict[str, Any] = {
+    "num_modes": 4,
+    "max_modes": 6,
+    "centring": "particle_axis",
+    "choose": "position",
+    "tolerance": 1.0,
+    "share": 0.99,
+}
 
 
 def make_dataset(folder: Path, frames: int = 14, **kw: Any) -> Dataset:

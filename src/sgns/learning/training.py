@@ -63,10 +63,11 @@ def main(cfg: DictConfig) -> float:
     if cfg.dataset.get("format") == "published":
         reduced = published_dataset(plain["dataset"], cfg.reduction.num_modes)
     else:
-        reduced = reduce_dataset(Dataset.open(cfg.dataset.path, cfg.dataset.get("where")), cfg.reduction)
+        dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
+        reduced = reduce_dataset(dataset, cfg.reduction, device=cfg.device)
     return train(
         reduced,
-        num_modes=cfg.reduction.num_modes,
+        num_modes=reduced.num_modes,
         model=plain["model"],
         training=plain["training"],
         output=Path(cfg.output),

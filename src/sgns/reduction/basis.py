@@ -103,6 +103,10 @@ class Basis:
         z = self._input(latent, "reduced positions", self.num_modes)
         return (z.transpose(-1, -2) @ self.modes.T).transpose(-1, -2).contiguous().add_(self.mean)
 
+    def to(self, device: str | torch.device) -> Basis:
+        """The same basis with its arrays on a torch device."""
+        return replace(self, **{key: getattr(self, key).to(device) for key in _ARRAYS})
+
     def sliced(self, r: int) -> Basis:
         """The basis of the first `r` modes, with the same mean and total variance."""
         if not 1 <= r <= self.num_modes:

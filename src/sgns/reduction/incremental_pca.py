@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,12 +21,15 @@ from torch import Tensor
 from sgns.errors import UserError
 from sgns.reduction.basis import Basis, check_centring, orthonormality_error
 
-__all__ = ["IncrementalPCA"]
+__all__ = ["IncrementalPCA", "checked_device"]
 
 _EPS = torch.finfo(torch.float64).eps
 # A Gram matrix squares the singular values, so eigenvectors under this fraction of the largest eigenvalue
 # need a second look.
 _RESOLVED = 1e-12
+# A block is thinned out before it is merged where at most this share of its rows remains.
+_WORTH_THINNING = 2.0 / 3.0
+_GRAM_ROWS = 72
 _MIN_BLOCK_FRAMES = 32
 _LARGEST = 1e100
 
@@ -37,10 +40,12 @@ class _Moments:
 
     count: int  # frames
     mean: Tensor  # (3, n) [m]
-    sketch: (
-        Tensor  # (k, n) [m], orthogonal rows: sketch^T sketch is the scatter, centred per particle and axis
-    )
+    # Orthogonal rows, (k, n) [m]: sketch^T sketch is the scatter, centred per particle and axis.
+    sketch: Tensor
     scatter: float  # trace of that scatter [m^2], dropped directions included
+    dropped: (
+        float  # its part in dropped directions [m^2]; the difference of the two would be round-off if small
+    )
 
 
 class _Spectrum(NamedTuple):
@@ -67,10 +72,15 @@ class IncrementalPCA:
     even where the eigenvectors are poor; the modes themselves come from a QR and SVD of the sketch at the
     end and are orthonormal to round-off.
 
+    Frames that follow each other are alike. Once the stream has had to drop directions, a block is therefore
+    turned by its own eigenvectors first, and rows weaker than the block's share of the weakest tracked
+    direction are left out; several such blocks are merged at once. Over a steady stream, what is left out
+    along any one direction sums to no more than that weakest direction holds.
+
     All centrings share the stream, which is centred per particle and axis: another mean c adds exactly
     the rows sqrt(N) (mean_axis - c).
 
-    Memory: about 6 (num_modes + oversampling) n numbers of 8 bytes at most, beside the batch.
+    Memory: about 9 (num_modes + oversampling) n numbers of 8 bytes at most, beside the batch.
 
     Args:
         num_modes: The largest number of modes that will be asked for.
@@ -91,23 +101,20 @@ class IncrementalPCA:
             oversampling = max(16, num_modes // 8)
         if oversampling < 0:
             raise UserError(f"oversampling is {oversampling}; it must be at least 0")
-        try:
-            self.device = torch.device(device)
-            torch.zeros(1, dtype=torch.float64, device=self.device)
-        except (RuntimeError, AssertionError, TypeError) as error:
-            reason = str(error).splitlines()[0]
-            raise UserError(
-                f"cannot compute in float64 on device {device!r}: {reason}; use device=cpu"
-            ) from error
+        self.device = checked_device(device)
         self.num_modes = num_modes
         self.oversampling = oversampling
         self._tracked = num_modes + oversampling
         # The first frame (3, n) [m], subtracted from all so that a huge offset costs no digits.
         self._reference: Tensor | None = None
-        self._pending: Tensor | None = None  # (block, 3, n) [m]: frames waiting for a full block
+        self._pending: Tensor | None = None  # (m + 1, 3, n) [m]: frames waiting for a full block
         self._pending_count = 0
-        self._rows: Tensor | None = None  # (3 (block + 1), n) [m]: scratch for the centred block
         self._moments: _Moments | None = None
+        self._rooms: list[Tensor] = []  # twice (k, n) [m]: where the sketch is and where the next one goes
+        self._queue: Tensor | None = None  # (3 (m + 1), n) [m]: rows of thinned blocks, not in the sketch yet
+        self._queued = 0
+        # Scatter along the weakest tracked direction [m^2]; 0 while nothing had to be dropped.
+        self._weakest = 0.0
         # Squared Frobenius norm of the largest error that rounding to the input type can have made [m^2].
         self._input_noise = 0.0
 
@@ -131,29 +138,31 @@ class IncrementalPCA:
         Raises:
             UserError: If shape or type is wrong or a value is not finite; the stream is then as it was.
         """
-        x = self._checked(positions)
+        x, norm = self._checked(positions)
         if self._reference is None and len(x):
-            n = x.shape[1]
-            block = max(_MIN_BLOCK_FRAMES, math.ceil(self._tracked / 3))
-            self._reference = x[0].to(self.device, torch.float64).T.contiguous()
-            self._pending = torch.empty(block, 3, n, dtype=torch.float64, device=self.device)
-            self._rows = torch.empty(3 * (block + 1), n, dtype=torch.float64, device=self.device)
-            zeros = torch.zeros(3, n, dtype=torch.float64, device=self.device)
-            self._moments = _Moments(0, zeros, zeros[:0], 0.0)
-        unit = torch.finfo(x.dtype).eps / 2
+            self._begin(x[0])
+        self._input_noise += (torch.finfo(x.dtype).eps / 2 * norm) ** 2
         start = 0
         while start < len(x):
-            stop = min(len(x), start + len(self._pending) - self._pending_count)
-            chunk = x[start:stop].to(self.device)
-            rows = self._pending[self._pending_count : self._pending_count + stop - start]
-            torch.sub(chunk.permute(0, 2, 1), self._reference, out=rows)
-            self._input_noise += (unit * float(torch.linalg.vector_norm(chunk, dtype=torch.float64))) ** 2
+            # The last frame of the block is room for the move of the mean.
+            stop = min(len(x), start + len(self._pending) - 1 - self._pending_count)
+            frames = self._pending[self._pending_count : self._pending_count + stop - start]
+            frames.copy_(x[start:stop].to(self.device).permute(0, 2, 1)).sub_(self._reference)
             self._pending_count += stop - start
-            if self._pending_count == len(self._pending):
-                self._moments = self._absorbed()
-                self._pending_count = 0
+            if self._pending_count == len(self._pending) - 1:
+                self._absorb()
             start = stop
         return self
+
+    def _begin(self, frame: Tensor) -> None:
+        """The reference and all memory of the stream, from the first frame (n, 3)."""
+        self._reference = frame.to(self.device, torch.float64).T.contiguous()
+        n = len(frame)
+        block = max(_MIN_BLOCK_FRAMES, math.ceil(self._tracked / 3))
+        self._pending = self._reference.new_empty(block + 1, 3, n)
+        self._queue = self._reference.new_empty(3 * (block + 1), n)
+        self._rooms = [self._reference.new_empty(min(self._tracked, n), n) for _ in range(2)]
+        self._moments = _Moments(0, torch.zeros_like(self._reference), self._rooms[0][:0], 0.0, 0.0)
 
     def rank(self, centring: str = "particle_axis") -> int:
         """Modes that the stream can give, `num_modes` at most.
@@ -218,8 +227,6 @@ class IncrementalPCA:
             raise UserError("no basis without frames; call partial_fit with at least one frame first")
         moments = self._absorbed()
         sketch = moments.sketch
-        # Only the stream drops directions, so what is missing there is missing whatever the centring.
-        dropped = max(moments.scatter - float(sketch.square().sum()), 0.0)
         mean = self._reference + moments.mean
         centre = mean
         if centring == "particle":
@@ -245,28 +252,52 @@ class IncrementalPCA:
         floor = math.sqrt(self._input_noise) + _EPS * math.sqrt(max(rows, len(modes))) * largest
         rank = min(int((singular > floor).sum()), self.num_modes)
         mean = centre.T.contiguous()
-        return _Spectrum(rank, mean, modes, singular.square(), dropped, total, moments.scatter, rows)
+        # Only the stream drops directions, so what is missing there is missing whatever the centring.
+        return _Spectrum(rank, mean, modes, singular.square(), moments.dropped, total, moments.scatter, rows)
+
+    def _absorb(self) -> None:
+        """Take the full block of pending frames into the moments."""
+        before = self._moments.count
+        rows, self._moments = _centred(self._pending, self._moments)
+        self._pending_count = 0
+        gram = _gram(rows)
+        values, vectors = torch.linalg.eigh(gram)
+        limit = self._weakest * (1.0 - before / self._moments.count)
+        # Round-off may hide that a weak direction holds more than its eigenvalue says.
+        first = int((values.clamp_min(_RESOLVED * float(values[-1])) <= limit).sum())
+        kept = len(rows) - first
+        if kept > _WORTH_THINNING * len(rows):
+            self._merge(rows, gram)
+            return
+        if self._queued + kept > len(self._queue):
+            self._merge(self._queue[: self._queued])
+            self._queued = 0
+        left_out = self._moments.dropped + float(values[:first].clamp_min(0.0).sum())
+        self._moments = replace(self._moments, dropped=left_out)
+        torch.mm(vectors[:, first:].T, rows, out=self._queue[self._queued : self._queued + kept])
+        self._queued += kept
+
+    def _merge(self, rows: Tensor, gram: Tensor | None = None) -> None:
+        """Rows (b, n) into the sketch; `gram` is their Gram matrix if it is known."""
+        self._moments, self._weakest = _merged(self._moments, rows, self._rooms[1], gram)
+        self._rooms.reverse()
 
     def _absorbed(self) -> _Moments:
-        """The moments with the pending frames merged in; changes nothing."""
-        old, m = self._moments, self._pending_count
-        if m == 0:
-            return old
-        n = old.mean.shape[1]
-        frames = self._pending[:m]
-        mean = frames.mean(0)
-        move = mean - old.mean
-        merges = old.count > 0
-        rows = self._rows[: 3 * (m + merges)]
-        torch.sub(frames, mean, out=rows[: 3 * m].view(m, 3, n))
-        if merges:
-            torch.mul(move, math.sqrt(old.count * m / (old.count + m)), out=rows[3 * m :])
-        scatter = old.scatter + float(torch.linalg.vector_norm(rows)) ** 2
-        sketch = _compressed(old.sketch, rows, min(self._tracked, n))
-        return _Moments(old.count + m, old.mean + move * (m / (old.count + m)), sketch, scatter)
+        """The moments with everything that waits merged in; changes nothing."""
+        found = self._moments
+        waiting = [self._queue[: self._queued]]
+        if self._pending_count:
+            rows, found = _centred(self._pending[: self._pending_count + 1].clone(), found)
+            waiting.append(rows)
+        room = self._rooms[1]  # empty between merges
+        for rows in waiting:
+            if len(rows):
+                found, _ = _merged(found, rows, room)
+                room = torch.empty_like(room)
+        return found
 
-    def _checked(self, positions: Tensor | np.ndarray) -> Tensor:
-        """`positions` as a tensor in its own precision, after every check."""
+    def _checked(self, positions: Tensor | np.ndarray) -> tuple[Tensor, float]:
+        """`positions` as a tensor in its own precision, after every check, and its norm [m]."""
         if isinstance(positions, Tensor):
             x = positions.detach()
             floating = x.is_floating_point()
@@ -289,6 +320,9 @@ class IncrementalPCA:
                 f"positions have {x.shape[1]} particles but the frames before had "
                 f"{self._reference.shape[1]}; one basis serves one particle arrangement"
             )
+        norm = float(torch.linalg.vector_norm(x))
+        if norm < _LARGEST:
+            return x, norm
         # In float64 a finite number may still have a square that is not.
         bad = ~(x.abs() < _LARGEST) if x.dtype == torch.float64 else ~x.isfinite()
         if bad.any():
@@ -298,39 +332,99 @@ class IncrementalPCA:
                 f"{self.frame_count + frame} of the stream), particle {particle}, axis {'xyz'[axis]}; "
                 "positions must be finite lengths in metres; check the run with `sgns check`"
             )
-        return x
+        return x, float(torch.linalg.vector_norm(x, dtype=torch.float64))
 
 
-def _compressed(sketch: Tensor, rows: Tensor, budget: int) -> Tensor:
-    """The strongest orthogonal rows with the scatter of sketch (k, n) and rows (b, n): (<= budget, n)."""
+def checked_device(device: str | torch.device) -> torch.device:
+    """The torch device of that name; a UserError if it is not here or does not know float64."""
+    try:
+        torch.zeros(1, dtype=torch.float64, device=device)
+        return torch.device(device)
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(
+            f"cannot compute in float64 on device {device!r}: {reason}; use device=cpu"
+        ) from error
+
+
+def _centred(frames: Tensor, old: _Moments) -> tuple[Tensor, _Moments]:
+    """Rows of a block for the sketch, and the moments with its frames in all but the sketch.
+
+    Args:
+        frames: (m + 1, 3, n) [m], relative to the reference; the last is not one but room for the move of
+            the mean. Overwritten.
+        old: Moments so far.
+
+    Returns:
+        Rows whose scatter is to be added, (3 m or 3 (m + 1), n), a view of `frames`; new moments.
+    """
+    m = len(frames) - 1
+    mean = frames[:m].mean(0)
+    move = mean - old.mean
+    frames[:m] -= mean
+    count = old.count + m
+    if old.count:
+        torch.mul(move, math.sqrt(old.count * m / count), out=frames[m])
+    rows = frames[: m + (old.count > 0)].flatten(0, 1)
+    scatter = old.scatter + float(torch.linalg.vector_norm(rows)) ** 2
+    return rows, replace(old, count=count, mean=old.mean + move * (m / count), scatter=scatter)
+
+
+def _merged(old: _Moments, rows: Tensor, room: Tensor, gram: Tensor | None = None) -> tuple[_Moments, float]:
+    """The moments with rows in the sketch: of both, the strongest orthogonal directions.
+
+    Args:
+        old: Moments so far, which count these rows already in all but the sketch.
+        rows: Any rows, (b, n).
+        room: Where the new sketch goes, (largest number of rows wanted, n).
+        gram: rows rows^T, if it is known.
+
+    Returns:
+        The moments; scatter along the weakest row of the new sketch, 0 if only round-off was dropped.
+    """
+    sketch = old.sketch
     # The sketch's rows are orthogonal already, so its own Gram matrix is known.
     cross = sketch @ rows.T
     top = torch.cat([torch.diag(torch.linalg.vector_norm(sketch, dim=1).square()), cross], 1)
-    gram = torch.cat([top, torch.cat([cross.T, rows @ rows.T], 1)])
-    kept: list[Tensor] = []
-    largest = None
+    gram = torch.cat([top, torch.cat([cross.T, _gram(rows) if gram is None else gram], 1)])
+    done, largest, weakest, dropped = 0, None, 0.0, old.dropped
     while True:
         values, vectors = (x.flip(-1) for x in torch.linalg.eigh(gram))
         largest = float(values[0]) if largest is None else largest
         if float(values[0]) <= (16 * _EPS) ** 2 * largest:
             break  # round-off of the rotations before
-        take = min(int((values > _RESOLVED * values[0]).sum()), budget)
-        kept.append(_rotated(vectors[:, :take], sketch, rows))
-        budget -= take
-        if budget == 0 or take == len(values):
+        resolved = int((values > _RESOLVED * values[0]).sum())
+        take = min(resolved, len(room) - done)
+        _rotated(vectors[:, :take], sketch, rows, room[done : done + take])
+        done += take
+        if resolved > take:
+            weakest = float(values[take - 1])
+        if done == len(room):
+            dropped += float(values[take:].clamp_min(0.0).sum())
+        if done == len(room) or take == len(values):
             break
         # Eigenvectors this weak are mixed by round-off: rotate everything strong away and look at
         # the rest by itself.
         rows = _rotated(vectors[:, take:], sketch, rows)
         sketch = rows[:0]
-        if len(rows) <= budget:
-            kept.append(rows)
+        if done + len(rows) <= len(room):
+            room[done : done + len(rows)] = rows
+            done += len(rows)
             break
-        gram = rows @ rows.T
-    return kept[0] if len(kept) == 1 else torch.cat([rows[:0], *kept])
+        gram = _gram(rows)
+    return replace(old, sketch=room[:done], dropped=dropped), weakest
 
 
-def _rotated(vectors: Tensor, sketch: Tensor, rows: Tensor) -> Tensor:
+def _rotated(vectors: Tensor, sketch: Tensor, rows: Tensor, out: Tensor | None = None) -> Tensor:
     """vectors^T [sketch; rows] without stacking the two."""
     k = len(sketch)
-    return (vectors[:k].T @ sketch).addmm_(vectors[k:].T, rows)
+    return torch.mm(vectors[:k].T, sketch, out=out).addmm_(vectors[k:].T, rows)
+
+
+def _gram(rows: Tensor) -> Tensor:
+    """rows rows^T, with little of the half that symmetry gives: (b, n) -> (b, b)."""
+    if len(rows) <= _GRAM_ROWS:
+        return rows @ rows.T
+    upper, lower = rows.split((len(rows) + 1) // 2)
+    cross = upper @ lower.T
+    return torch.cat([torch.cat([_gram(upper), cross], 1), torch.cat([cross.T, _gram(lower)], 1)])

@@ -62,9 +62,9 @@ def reconstruction_curve(paths: Sequence[Path], basis: Basis) -> np.ndarray:
     for path in paths:
         with Run(path) as run:
             for frames in frame_chunks(run.particle_count, run.frame_count):
-                positions = torch.from_numpy(run.positions(frames)).double()
+                positions = torch.from_numpy(run.positions(frames)).to(basis.mean)
                 total += float((positions - basis.mean).square().sum())
-                taken += basis.transform(positions).square().sum(dim=(0, 2)).numpy()
+                taken += basis.transform(positions).square().sum(dim=(0, 2)).cpu().numpy()
                 count += positions.numel()
     if count == 0:
         return np.full(basis.num_modes + 1, np.nan)

@@ -25,27 +25,27 @@ def main(cfg: DictConfig) -> float:
     from sgns.campaign import Dataset
 
     dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
-    reduced = reduce_dataset(dataset, cfg.reduction)
-    basis, asked = reduced.basis, int(cfg.reduction.num_modes)
+    reduced = reduce_dataset(dataset, cfg.reduction, device=cfg.device)
+    basis, used = reduced.basis, reduced.num_modes
     validation = dataset.runs("validation")
     curves = reduction_curves(basis, validation)
     table = Path(cfg.output) / "energy.csv"
     write_energy_table(curves, table)
-    log.info("%s", "\n".join(energy_lines(curves, asked)))
+    log.info("%s", "\n".join(energy_lines(curves, used)))
     log.info("errors on %d training and %d validation runs", len(basis.fitted_on or []), len(validation))
     log.info("every number of modes: %s; basis and reduced runs: %s", table, reduced.folder)
-    return float(basis.residual_mse(asked))
+    return float(basis.residual_mse(used))
 
 
-def energy_lines(curves: ReductionCurves, asked: int) -> list[str]:
-    """A table for the terminal: powers of two, all modes, and the number asked for."""
+def energy_lines(curves: ReductionCurves, used: int) -> list[str]:
+    """A table for the terminal: powers of two, all modes, and the number in use."""
     last = len(curves.energy)
     lines = ["modes  energy     displacement energy  training RMSE [mm]  validation RMSE [mm]"]
-    for r in sorted({2**k for k in range(last.bit_length())} | {asked, last}):
+    for r in sorted({2**k for k in range(last.bit_length())} | {used, last}):
         training, held_out = (1e3 * math.sqrt(mse) for mse in (curves.training[r - 1], curves.held_out[r]))
         lines.append(
             f"{r:5d}  {curves.energy[r - 1]:.6f}  {curves.displacement_energy[r - 1]:19.6f}  {training:18.3f}  "
-            f"{held_out:20.3f}" + ("  <- reduction.num_modes" if r == asked else "")
+            f"{held_out:20.3f}" + ("  <- reduction.num_modes" if r == used else "")
         )
     return lines
 

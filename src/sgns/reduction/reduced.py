@@ -3,9 +3,9 @@
     <dataset>/reduced/<key>/basis.h5               fitted on the training split only
     <dataset>/reduced/<key>/<content hash>.h5      one reduced run each
 
-The key is made of the training runs' content and of the settings, without `num_modes`: a basis of `max_modes`
-modes is kept and its first `num_modes` are used, so that a sweep over them fits once. Every file appears
-complete or not at all, so several processes may do this at the same time.
+The key is made of the training runs' content and of the settings that the basis depends on, not of how many of
+its modes are used: a basis of `max_modes` modes is kept and its first `num_modes` are used, so that a sweep over
+them fits once. Every file appears complete or not at all, so several processes may do this at the same time.
 
 Letters: T frames, n particles, M body points, r modes.
 """
@@ -29,7 +29,8 @@ from tqdm import tqdm
 from sgns.campaign import SPLITS, Dataset
 from sgns.errors import UserError
 from sgns.reduction.basis import CENTRINGS, Basis
-from sgns.reduction.incremental_pca import IncrementalPCA
+from sgns.reduction.choice import MEASURES, choose_modes
+from sgns.reduction.incremental_pca import IncrementalPCA, checked_device
 from sgns.runs import Run, frame_chunks
 from sgns.settings import check_fields
 from sgns.wholefile import whole_file
@@ -74,12 +75,14 @@ class ReducedDataset:
     Attributes:
         basis: The basis with all `max_modes` modes; `basis.sliced(r)` keeps the first r, `latent[:, :r]`
             likewise.
+        num_modes: r, the modes to use: `reduction.num_modes`, or what `auto` chose.
         folder: Where it is cached.
         frame_rate: [Hz].
         start_positions: Common start of the soil [m], shape (n, 3), float64.
     """
 
     basis: Basis
+    num_modes: int
     folder: Path
     frame_rate: float
     start_positions: np.ndarray
@@ -97,21 +100,26 @@ class ReducedDataset:
         return list(self._runs[split])
 
 
-def reduce_dataset(dataset: Dataset, reduction: Mapping[str, Any], progress: bool = True) -> ReducedDataset:
+def reduce_dataset(
+    dataset: Dataset, reduction: Mapping[str, Any], progress: bool = True, device: str = "cpu"
+) -> ReducedDataset:
     """Fit the basis, or take the cached one, and reduce every run that is not yet.
 
     Args:
         dataset: With complete runs.
-        reduction: `conf/reduction`: num_modes, max_modes, centring.
+        reduction: Values of `conf/reduction`.
         progress: Whether to show a bar (never without a terminal).
+        device: Torch device that fits and projects.
 
     Returns:
         The reduced dataset, with all `max_modes` modes.
 
     Raises:
-        UserError: No training runs, runs of different beds, more modes asked than the data has.
+        UserError: No training runs, runs of different beds, more modes asked than the data has, or no
+            number of modes good enough.
     """
     settings = check_settings(reduction)
+    checked_device(device)
     paths = {split: [Path(path) for path in dataset.runs(split)] for split in SPLITS}
     if not paths["train"]:
         raise UserError(
@@ -123,15 +131,12 @@ def reduce_dataset(dataset: Dataset, reduction: Mapping[str, Any], progress: boo
     bar = {"disable": not (progress and sys.stderr.isatty()), "unit": "run", "leave": False}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        basis = fitted_basis(folder / "basis.h5", paths["train"], settings, bar)
-        if settings["num_modes"] > basis.num_modes:
-            raise UserError(
-                f"reduction.num_modes is {settings['num_modes']} but the training runs give "
-                f"{basis.num_modes} modes; ask for at most {basis.num_modes}"
-            )
+        basis = fitted_basis(folder / "basis.h5", paths["train"], settings, bar, device)
+        projector = basis.to(device)
+        num_modes = modes_to_use(projector, settings, paths["validation"])
         everything = [path for split in SPLITS for path in paths[split]]
         reduced = {
-            path: reduced_run(folder / f"{content[path]}.h5", path, basis)
+            path: reduced_run(folder / f"{content[path]}.h5", path, projector)
             for path in tqdm(everything, desc="reducing runs", **bar)
         }
     except OSError as error:
@@ -141,28 +146,39 @@ def reduce_dataset(dataset: Dataset, reduction: Mapping[str, Any], progress: boo
     with Run(paths["train"][0]) as run:
         start = run.positions(slice(0, 1))[0].astype(np.float64)
     runs = {split: [reduced[path] for path in paths[split]] for split in SPLITS}
-    return ReducedDataset(basis, folder, frame_rate, start, runs)
+    return ReducedDataset(basis, num_modes, folder, frame_rate, start, runs)
 
 
 class ReductionSettings(TypedDict):
     """What `conf/reduction` says; see there for the meaning of each key."""
 
-    num_modes: int
+    num_modes: int | str
     max_modes: int
     centring: str
+    choose: str
+    tolerance: float
+    share: float
 
 
 def check_settings(reduction: Mapping[str, Any]) -> dict[str, Any]:
     """The settings as plain values, refused where they make no sense."""
     check_fields(ReductionSettings, reduction, "reduction")
     settings = dict(reduction)
-    if settings["centring"] not in CENTRINGS:
-        raise UserError(f"reduction.centring is {settings['centring']!r}; allowed: {', '.join(CENTRINGS)}")
-    if not 1 <= settings["num_modes"] <= settings["max_modes"]:
+    for key, allowed in (("centring", CENTRINGS), ("choose", MEASURES)):
+        if settings[key] not in allowed:
+            raise UserError(f"reduction.{key} is {settings[key]!r}; allowed: {', '.join(allowed)}")
+    num_modes, max_modes = settings["num_modes"], settings["max_modes"]
+    if isinstance(num_modes, str) and num_modes != "auto":
+        raise UserError(f"reduction.num_modes is {num_modes!r}; it must be a whole number or auto")
+    if not 1 <= (1 if num_modes == "auto" else num_modes) <= max_modes:
         raise UserError(
-            f"reduction.num_modes is {settings['num_modes']}; allowed: 1 to reduction.max_modes "
-            f"({settings['max_modes']}); raise reduction.max_modes to keep more"
+            f"reduction.num_modes is {num_modes}; allowed: 1 to reduction.max_modes "
+            f"({max_modes}); raise reduction.max_modes to keep more"
         )
+    if settings["tolerance"] <= 0:
+        raise UserError(f"reduction.tolerance is {settings['tolerance']}; it must be more than 0 [mm]")
+    if not 0 < settings["share"] <= 1:
+        raise UserError(f"reduction.share is {settings['share']}; it must be more than 0 and at most 1")
     return settings
 
 
@@ -183,15 +199,31 @@ def check_one_bed(paths: Sequence[Path]) -> tuple[dict[Path, str], float]:
     return content, next(iter(beds))[2]
 
 
+def modes_to_use(basis: Basis, settings: Mapping[str, Any], validation: Sequence[Path]) -> int:
+    """`reduction.num_modes`, or for `auto` the number that is enough, with a line that says why."""
+    asked = settings["num_modes"]
+    if asked == "auto":
+        chosen, reason = choose_modes(basis, settings, validation)
+        log.info("reduction.num_modes=auto: %d modes; %s", chosen, reason)
+        return chosen
+    if asked > basis.num_modes:
+        raise UserError(
+            f"reduction.num_modes is {asked} but the training runs give "
+            f"{basis.num_modes} modes; ask for at most {basis.num_modes}"
+        )
+    return asked
+
+
 def cache_key(training_content: Sequence[str], settings: Mapping[str, Any]) -> str:
-    """Name of the cache for a training split and settings; `num_modes` does not matter, the order of runs
-    neither."""
-    told = {key: value for key, value in settings.items() if key != "num_modes"}
+    """Name of the cache for a training split, in any order, and the settings that the basis depends on."""
+    told = {key: settings[key] for key in ("max_modes", "centring")}
     text = json.dumps([_FORMAT, sorted(training_content), told], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def fitted_basis(path: Path, runs: Sequence[Path], settings: Mapping[str, Any], bar: dict[str, Any]) -> Basis:
+def fitted_basis(
+    path: Path, runs: Sequence[Path], settings: Mapping[str, Any], bar: dict[str, Any], device: str = "cpu"
+) -> Basis:
     """The cached basis, or a new one of as many modes as the data gives up to `max_modes`."""
     if path.exists():
         try:
@@ -199,7 +231,7 @@ def fitted_basis(path: Path, runs: Sequence[Path], settings: Mapping[str, Any], 
         except UserError as error:
             log.warning("%s; fitting it anew", error)
     # More modes than particles or rows cannot be had, whatever is asked.
-    pca = IncrementalPCA(settings["max_modes"])
+    pca = IncrementalPCA(settings["max_modes"], device=device)
     names, arrangement = [], ""
     for run_path in tqdm(runs, desc="fitting the basis", **bar):
         with Run(run_path) as run:
@@ -228,7 +260,7 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
     with Run(run_path) as run:
         latent = torch.cat(
             [
-                basis.transform(run.positions(frames))
+                basis.transform(run.positions(frames)).cpu()
                 for frames in frame_chunks(run.particle_count, run.frame_count)
             ]
         ).numpy()

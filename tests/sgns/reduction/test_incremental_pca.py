@@ -158,6 +158,32 @@ def test_truncated_stream_keeps_the_leading_subspace_and_the_exact_total():
     assert error <= basis.residual_mse(8) <= 1.02 * error
 
 
+def drifting(frames=900, particles=120) -> np.ndarray:
+    """Frames (T, n, 3) that follow each other slowly: few directions in any short stretch, many in all."""
+    rng = np.random.default_rng(5)
+    modes = np.linalg.qr(rng.normal(size=(particles, particles)))[0]
+    time = np.arange(frames)[:, None, None] / 90
+    size = 0.85 ** np.arange(particles)[:, None]
+    waves = size * np.sin(time * rng.uniform(0.1, 1.0, (particles, 1)) + rng.uniform(0, 6, (particles, 3)))
+    return rng.uniform(size=(particles, 3)) + modes @ waves
+
+
+def test_thinned_blocks_lose_no_more_than_the_weakest_tracked_direction():
+    x = drifting()
+    pca = fit(x, 12, oversampling=6)
+    assert pca._queued > 0  # blocks were thinned
+    values, modes = exact(x, "particle_axis")
+    basis = pca.basis()
+    error = np.mean((basis.inverse(basis.transform(x)).numpy() - x) ** 2)
+    assert largest_angle(basis.modes[:, :6], modes[:, :6]) < 1e-3
+    assert (values[:12] - basis.eigenvalues.numpy() >= -1e-12).all()
+    assert (values[:12] - basis.eigenvalues.numpy() <= 2.0 * values[17]).all()
+    assert values[12:].sum() / 120 <= error <= basis.residual_mse(12) <= 1.5 * error
+    assert basis.total_variance == pytest.approx(values.sum(), rel=1e-12)
+    total = float(basis.eigenvalues.sum()) + basis.residual_variance
+    assert total == pytest.approx(basis.total_variance, rel=1e-12)
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("centring", CENTRINGS)
 def test_rank_deficient_data(dtype, centring):

@@ -15,8 +15,15 @@ from sgns.reduction.reduce import main
 from sgns.reduction.reduced import reduce_dataset
 
 
-def settings(folder, output):
-    return OmegaConf.create({"dataset": {"path": str(folder)}, "reduction": REDUCTION, "output": str(output)})
+def settings(folder, output, **changes):
+    return OmegaConf.create(
+        {
+            "dataset": {"path": str(folder)},
+            "reduction": REDUCTION | changes,
+            "output": str(output),
+            "device": "cpu",
+        }
+    )
 
 
 def table(folder):
@@ -52,3 +59,15 @@ def test_without_validation_runs_their_column_is_empty(tmp_path) -> None:
     file.write_text(yaml.safe_dump(content))
     main(settings(tmp_path / "data", tmp_path / "out"))
     assert {row["mse_validation_m2"] for row in table(tmp_path / "out")} == {""}
+
+
+def test_auto_says_what_it_chose_and_why(tmp_path, caplog) -> None:
+    dataset = make_dataset(tmp_path / "data")
+    basis = reduce_dataset(dataset, REDUCTION).basis
+    curve = 1e3 * np.sqrt(reconstruction_curve(dataset.runs("validation"), basis))
+    tolerance = float(curve[2:4].mean())
+    with caplog.at_level("INFO"):
+        error = main(settings(tmp_path / "data", tmp_path / "out", num_modes="auto", tolerance=tolerance))
+    assert error == basis.residual_mse(3)
+    assert f"auto: 3 modes; RMSE on 2 validation runs is {curve[3]:.4g} mm" in caplog.text
+    assert "    3 " in next(line for line in caplog.text.splitlines() if "<- reduction.num_modes" in line)

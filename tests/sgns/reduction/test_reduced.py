@@ -48,7 +48,10 @@ def test_a_sweep_over_modes_fits_one_basis(tmp_path, monkeypatch) -> None:
     reduce_dataset(dataset, REDUCTION)
     monkeypatch.setattr(module, "IncrementalPCA", None)
     for r in (1, 2, 6):
-        assert reduce_dataset(dataset, REDUCTION | {"num_modes": r}).basis.num_modes == 6
+        reduced = reduce_dataset(dataset, REDUCTION | {"num_modes": r})
+        assert (reduced.basis.num_modes, reduced.num_modes) == (6, r)
+    auto = {"num_modes": "auto", "choose": "energy", "share": 0.5, "tolerance": 7.0}
+    assert reduce_dataset(dataset, REDUCTION | auto).num_modes < 6
     assert len(list((tmp_path / "reduced").iterdir())) == 1
 
 
@@ -83,16 +86,20 @@ def test_damaged_cache_is_made_anew(tmp_path) -> None:
 def test_no_more_modes_than_the_data_has(tmp_path) -> None:
     dataset = make_dataset(tmp_path, n=5)
     with pytest.raises(UserError, match="ask for at most"):
-        reduce_dataset(dataset, {"num_modes": 6, "max_modes": 9, "centring": "particle_axis"})
+        reduce_dataset(dataset, REDUCTION | {"num_modes": 6, "max_modes": 9})
 
 
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ({"num_modes": "many"}, "must be a whole number"),
+        ({"num_modes": "many"}, "must be a whole number or auto"),
+        ({"num_modes": None}, "must be a whole number"),
         ({"num_modes": 0}, "1 to"),
         ({"num_modes": 7}, "max_modes"),
         ({"centring": "median"}, "particle_axis"),
+        ({"choose": "taste"}, "allowed: position, energy, displacement_energy"),
+        ({"tolerance": 0.0}, "more than 0"),
+        ({"share": 1.5}, "at most 1"),
     ],
 )
 def test_wrong_settings(tmp_path, change, line) -> None:
@@ -105,3 +112,20 @@ def test_a_mixture_of_beds_is_refused(tmp_path) -> None:
     make_run(dataset.runs("validation")[0], frames=14, n=40)
     with pytest.raises(UserError, match="do not belong together"):
         reduce_dataset(dataset, REDUCTION)
+
+
+def test_a_device_that_is_not_here_is_one_line_also_with_a_cache(tmp_path) -> None:
+    dataset = make_dataset(tmp_path)
+    reduce_dataset(dataset, REDUCTION)
+    with pytest.raises(UserError, match=r"device 'abacus'.*use device=cpu"):
+        reduce_dataset(dataset, REDUCTION, device="abacus")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_the_gpu_reduces_alike(tmp_path) -> None:
+    cpu = reduce_dataset(make_dataset(tmp_path / "cpu"), REDUCTION)
+    gpu = reduce_dataset(make_dataset(tmp_path / "gpu"), REDUCTION, device="cuda")
+    assert gpu.basis.modes.device.type == "cpu"
+    np.testing.assert_allclose(gpu.basis.modes, cpu.basis.modes, atol=1e-8)
+    for a, b in zip(gpu.runs("test"), cpu.runs("test"), strict=True):
+        np.testing.assert_allclose(a.latent, b.latent, atol=1e-8)
