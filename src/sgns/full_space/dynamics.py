@@ -55,8 +55,8 @@ class FullSpaceDynamics(nn.Module):
         super().__init__()
         if settings.body_nodes != "points":
             raise UserError(
-                f"model.body_nodes is {settings.body_nodes!r}; a node interacts with the soil near it, so full space needs "
-                "model.body_nodes=points"
+                f"model.body_nodes is {settings.body_nodes!r}; a node acts on the soil near it, so full space "
+                "needs model.body_nodes=points"
             )
         self.settings = settings
         self.radius = radius
@@ -166,5 +166,7 @@ class FullSpaceDynamics(nn.Module):
         states[:, :d] = soil
         force = soil.new_zeros((soil.shape[0], frames, 3))
         for t in tqdm(range(d, frames), desc="full space", unit="frame", leave=False, disable=not progress):
-            states[:, t], force[:, t] = self.advance(states[:, t - d : t], body.frames(slice(t - d + 1, t + 1)))
+            states[:, t], force[:, t] = self.advance(
+                states[:, t - d : t], body.frames(slice(t - d + 1, t + 1))
+            )
         return states, force

@@ -19,11 +19,13 @@ _CELLS = 64
 
 
 @wp.kernel(enable_backward=False)
-def count_neighbours(grid: wp.uint64, points: wp.array(dtype=wp.vec3), radius: float, counts: wp.array(dtype=wp.int64)):
+def count_neighbours(
+    grid: wp.uint64, points: wp.array(dtype=wp.vec3), radius: float, counts: wp.array(dtype=wp.int64)
+):
     receiver = wp.tid()
     centre = points[receiver]
     query = wp.hash_grid_query(grid, centre, radius)
-    sender = int(0)
+    sender = wp.int32(0)
     count = wp.int64(0)
     while wp.hash_grid_query_next(query, sender):
         offset = points[sender] - centre
@@ -47,7 +49,7 @@ def list_neighbours(
     if receiver > 0:
         place = ends[receiver - 1]
     query = wp.hash_grid_query(grid, centre, radius)
-    sender = int(0)
+    sender = wp.int32(0)
     while wp.hash_grid_query_next(query, sender):
         offset = points[sender] - centre
         if sender != receiver and wp.dot(offset, offset) <= radius * radius:
@@ -74,7 +76,9 @@ def radius_graph(points: Tensor, radius: float) -> Tensor:
     if not radius > 0:
         raise UserError(f"the radius of the neighbours is {radius}; it must be above 0 m")
     if not bool(torch.isfinite(points).all()):
-        raise UserError("positions are not finite, so they have no neighbours; the rollout ran away or the run is damaged")
+        raise UserError(
+            "positions are not finite, so they have no neighbours; the rollout ran away or the run is damaged"
+        )
     if len(points) == 0:
         return torch.empty((2, 0), dtype=torch.int64, device=points.device)
     where = points.detach().float().contiguous()

@@ -100,7 +100,9 @@ def train(
         found = losses(dynamics, windows.batch(step, settings.batch_size, noise_scale))
         loss = settings.loss["acceleration"] * found[0] + settings.loss["force"] * found[1]
         if not bool(torch.isfinite(loss)):
-            raise UserError(f"the loss is {float(loss.detach())} at step {step}; lower training.learning_rate")
+            raise UserError(
+                f"the loss is {float(loss.detach())} at step {step}; lower training.learning_rate"
+            )
         optimiser.zero_grad()
         loss.backward()
         if settings.gradient_clip is not None:

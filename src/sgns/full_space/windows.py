@@ -118,7 +118,9 @@ class FullSpaceWindows:
             size: B.
             noise_scale: Deviation of the newest velocity's noise [m], shape (3,).
         """
-        source = torch.Generator().manual_seed(int(np.random.SeedSequence([self.seed, step]).generate_state(1)[0]))
+        source = torch.Generator().manual_seed(
+            int(np.random.SeedSequence([self.seed, step]).generate_state(1)[0])
+        )
         drawn = torch.randint(len(self), (size,), generator=source).tolist()
         windows = [self.window(index) for index in drawn]
         body = BodyTrack(*(torch.cat(parts) for parts in zip(*(w.body for w in windows), strict=True)))
