@@ -15,7 +15,6 @@ import csv
 import logging
 import multiprocessing
 import os
-import resource
 import statistics
 import tempfile
 import time
@@ -40,7 +39,7 @@ from sgns.learning.dynamics import ModelSettings
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.training import prepared
 from sgns.learning.training import train as train_subspace
-from sgns.reduction.reduced import ReducedDataset, reduce_dataset
+from sgns.reduction.reduced import reduce_dataset
 from sgns.runs import Run
 from sgns.simulator import Simulator
 
@@ -94,24 +93,32 @@ def timed(action: Callable[[], object], repeats: int) -> list[float]:
     return found
 
 
-def memory() -> float:
-    """The most memory that this process has had so far [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+def resident(peak: bool) -> float:
+    """Memory of this process now, or the most since `forget_peak` [MB]."""
+    key = "VmHWM:" if peak else "VmRSS:"
+    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith(key))
+    return float(line.split()[1]) / 1024
+
+
+def forget_peak() -> None:
+    Path("/proc/self/clear_refs").write_text("5")
 
 
 def rates(
     step: Callable[[], object], frame: Callable[[], object], frame_rate: float, repeats: int, parameters: int
 ) -> dict[str, Any]:
-    """Cost of rolling out frames and of training steps; memory is what each adds to the process."""
-    before = memory()
-    with torch.no_grad():  # inference_mode would spoil the edges that the subspace network keeps, for training
+    """Cost of rolling out frames and of training steps; memory is the most that each adds to the process."""
+    before = resident(peak=False)
+    forget_peak()
+    # Not inference_mode: the subspace network keeps its edges, and those made there cannot be trained with.
+    with torch.no_grad():
         frames = timed(frame, repeats)
-    rolled = memory()
+    rolled = resident(peak=True)
     steps = timed(step, repeats)
     return {
         "parameters": parameters,
         "training_s_per_step": statistics.median(steps),
-        "training_memory_MB": memory() - before,
+        "training_memory_MB": resident(peak=True) - before,
         "rollout_s_per_simulated_s": statistics.median(frames) * frame_rate,
         "rollout_memory_MB": rolled - before,
         "repeats": repeats,
@@ -197,6 +204,7 @@ def errors(
             ("constant velocity", truth[d - 1] + ahead * velocity),
         ):
             mse[key].append(float(np.mean((guess - truth[d:]) ** 2)))
+        logging.warning("%s: skill %.3f", file.stem, 1 - mse["total"][-1] / mse["frozen"][-1])
         force.append(VectorErrors.compare(true_force[d:], predicted[d:]))
         constant.append(VectorErrors.compare(true_force[d:], mean))
     return {
@@ -209,8 +217,8 @@ def errors(
     }
 
 
-def learn_full_space(path: Path, name: str, minutes: float, split: str) -> dict[str, Any]:
-    """Train for a processor time and predict the runs of a split."""
+def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
+    """Train for a processor time and predict test runs."""
     plain = settings(path, FULL_SPACE[name], **FULL_SPACE_TRAINING)
     dynamics, runs = full_space(path, plain["model"], "train")
     windows = FullSpaceWindows(runs, dynamics.history)
@@ -233,7 +241,7 @@ def learn_full_space(path: Path, name: str, minutes: float, split: str) -> dict[
         "%s: %d steps; mean loss of the last tenth: acceleration %.3f, force %.3f",
         name, steps, statistics.fmean(record.acceleration[-last:]), statistics.fmean(record.force[-last:]),
     )  # fmt: skip
-    _, predicted = full_space(path, plain["model"], split)
+    _, predicted = full_space(path, plain["model"], "test")
     by_path = {run.path: run for run in predicted}
 
     def predict(file: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -244,11 +252,15 @@ def learn_full_space(path: Path, name: str, minutes: float, split: str) -> dict[
         return positions[0].numpy(), force[0].numpy()
 
     dataset = Dataset.open(path)
-    found = errors(dataset.runs(split), dataset.runs("train"), predict, dynamics.history)
-    return {"trained_processor_s": taken, "trained_steps": steps} | found
+    found = errors(dataset.runs("test")[:runs], dataset.runs("train"), predict, dynamics.history)
+    return {
+        "trained_processor_s": taken,
+        "trained_steps": steps,
+        "test_runs": len(dataset.runs("test")[:runs]),
+    } | found
 
 
-def learn_subspace(path: Path, name: str, minutes: float, split: str) -> dict[str, Any]:
+def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
     """The same for the network on modes, with `sgns.learning`."""
     plain = settings(path)
     reduced = reduce_dataset(Dataset.open(path), plain["reduction"], progress=False)
@@ -272,18 +284,19 @@ def learn_subspace(path: Path, name: str, minutes: float, split: str) -> dict[st
         taken = fit(steps, folder / "training")
         simulator = Simulator.load(folder / "training" / "best.ckpt")
     dataset = Dataset.open(path)
+    by_name = {run.name: run for run in reduced.runs("test")}
 
     def predict(file: Path) -> tuple[np.ndarray, np.ndarray]:
-        run = named(reduced, split)[file.stem]
+        run = by_name[file.stem]
         rollout = simulator.rollout(run.pose, latent_history=run.latent[: simulator.history, :modes])
         return simulator.basis.inverse(torch.as_tensor(rollout.latent)).numpy(), rollout.force
 
-    found = errors(dataset.runs(split), dataset.runs("train"), predict, simulator.history)
-    return {"trained_processor_s": taken, "trained_steps": steps} | found
-
-
-def named(reduced: ReducedDataset, split: str) -> dict[str, Any]:
-    return {run.name: run for run in reduced.runs(split)}
+    found = errors(dataset.runs("test")[:runs], dataset.runs("train"), predict, simulator.history)
+    return {
+        "trained_processor_s": taken,
+        "trained_steps": steps,
+        "test_runs": len(dataset.runs("test")[:runs]),
+    } | found
 
 
 def solver(path: Path, name: str) -> dict[str, Any]:
@@ -359,7 +372,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data/quick"))
     parser.add_argument("--minutes", type=float, default=10.0, help="processor time of each training")
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--split", default="test", help="runs to predict")
+    parser.add_argument("--runs", type=int, help="how many of the test runs to predict; all by default")
     parser.add_argument("--table", type=Path, default=HERE / "table.csv")
     options = parser.parse_args()
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
@@ -381,7 +394,7 @@ def main() -> None:
             print(rows[name], flush=True)
     for name, learn in ((SUBSPACE, learn_subspace), (TRAINED, learn_full_space)):
         if not rows[name].get("trained_steps"):
-            rows[name] |= in_fresh_process(learn, options.data, name, options.minutes, options.split)
+            rows[name] |= in_fresh_process(learn, options.data, name, options.minutes, options.runs)
             save(options.table, rows)
             print(rows[name], flush=True)
     draw(done(options.table), HERE / "bars.png")
