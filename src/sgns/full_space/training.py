@@ -13,6 +13,7 @@ from tqdm import tqdm
 from sgns.errors import UserError
 from sgns.full_space.dynamics import FullSpaceDynamics
 from sgns.full_space.windows import FullSpaceWindows
+from sgns.learning.body import BodyTrack
 from sgns.learning.data import Batch
 from sgns.learning.normalisation import Standardiser
 from sgns.learning.trainee import TrainingSettings
@@ -67,7 +68,20 @@ def fit_normalisation(
 
 
 def losses(dynamics: FullSpaceDynamics, batch: Batch) -> tuple[Tensor, Tensor]:
-    """Squared errors of the normalised acceleration, mean over particles, and of the normalised force."""
+    """Squared errors of the normalised acceleration, mean over particles, and of the normalised force.
+
+    Args:
+        dynamics: On any device.
+        batch: From `FullSpaceWindows`; taken to that device.
+    """
+    device = dynamics.bin_size.device
+    batch = Batch(
+        latent=batch.latent.to(device),
+        noise=batch.noise.to(device),
+        body=BodyTrack(*(part.to(device) for part in batch.body)),
+        force=batch.force.to(device),
+        torque=batch.torque.to(device),
+    )
     prediction = dynamics(batch.history, batch.body)
     acceleration = prediction.acceleration - dynamics.acceleration.normalise(batch.acceleration)
     force = dynamics.force.normalise(dynamics.force_contributions(prediction).sum(-2))
