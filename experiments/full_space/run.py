@@ -4,8 +4,8 @@
 
 Needs the runs of `sgns simulate dataset=quick`. Every case runs in a fresh process bound to one core, torch on one
 thread. First the cost: processor time of a training step and of a rollout, and the largest memory. Then the errors on
-the test runs, for networks trained for the same processor time. Every case adds its line to table.csv beside this
-script, and a line that is there is not made again; bars.png is drawn last.
+the test runs, for two networks trained for at most a given processor time. Every case adds its line to table.csv
+beside this script, and a line that is there is not made again; bars.png is drawn last.
 """
 
 from __future__ import annotations
@@ -280,6 +280,7 @@ def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> d
 
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
+        # The pilot's start-up counts as well, so this errs towards a shorter training.
         steps = max(1, round(60 * minutes / ((fit(300, folder / "pilot")) / 300)))
         taken = fit(steps, folder / "training")
         simulator = Simulator.load(folder / "training" / "best.ckpt")
@@ -300,7 +301,7 @@ def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> d
 
 
 def solver(path: Path, name: str) -> dict[str, Any]:
-    """Wall time of the solver, as its runs recorded it: one core each, all cores busy."""
+    """Wall time of the solver, as its runs recorded it."""
     found = []
     for split in ("train", "validation", "test"):
         for file in Dataset.open(path).runs(split):
@@ -360,7 +361,7 @@ def draw(rows: dict[str, dict[str, str]], file: Path) -> None:
         bars = axes[3].barh(place + shift, values, 0.4, label=label, color="C2" if shift < 0 else "C3")
         axes[3].bar_label(bars, ["" if np.isnan(v) else f" {v:.2f}" for v in values])
     axes[3].axvline(0, color="0.2", lw=0.8)
-    axes[3].set(xlabel="test runs, equal training time")
+    axes[3].set(xlabel="test runs, trained for minutes")
     axes[3].margins(x=0.25)
     axes[3].legend(fontsize=7)
     axes[0].invert_yaxis()
