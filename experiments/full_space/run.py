@@ -351,7 +351,9 @@ def draw(rows: dict[str, dict[str, str]], file: Path) -> None:
     for axis, (key, label) in zip(axes, panels.items(), strict=False):
         values = [float(rows[n].get(key) or "nan") for n in names]
         bars = axis.barh(names, values, color=colours)
-        axis.bar_label(bars, ["" if np.isnan(v) else f" {v:.2g}" for v in values])
+        axis.bar_label(
+            bars, ["" if np.isnan(v) else f" {v:.0f}" if v >= 100 else f" {v:.2g}" for v in values]
+        )
         axis.set(xscale="log", xlabel=label)
         low, high = np.nanmin(values), np.nanmax(values)
         axis.set_xlim(low / 4, high * 30)
@@ -361,9 +363,9 @@ def draw(rows: dict[str, dict[str, str]], file: Path) -> None:
         bars = axes[3].barh(place + shift, values, 0.4, label=label, color="C2" if shift < 0 else "C3")
         axes[3].bar_label(bars, ["" if np.isnan(v) else f" {v:.2f}" for v in values])
     axes[3].axvline(0, color="0.2", lw=0.8)
-    axes[3].set(xlabel="test runs, trained for minutes")
+    axes[3].set(xlabel="test runs, after minutes of training")
     axes[3].margins(x=0.25)
-    axes[3].legend(fontsize=7)
+    axes[3].legend(fontsize=7, loc="upper right")
     axes[0].invert_yaxis()
     figure.savefig(file, dpi=130)
 
