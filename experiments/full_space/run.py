@@ -1,0 +1,407 @@
+"""What the subspace saves: the network on every particle beside the network on a few modes.
+
+    python experiments/full_space/run.py --minutes 10
+
+Needs the runs of `sgns simulate dataset=quick`. Every case runs in a fresh process bound to one core, torch on one
+thread. First the cost: processor time of a training step and of a rollout, and the largest memory. Then the errors on
+the test runs, for two networks trained for at most a given processor time. Every case adds its line to table.csv
+beside this script, and a line that is there is not made again; bars.png is drawn last.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import logging
+import multiprocessing
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from sgns.campaign import Dataset
+from sgns.evaluation.metrics import VectorErrors, mean_prediction, skill
+from sgns.full_space.body_surface import box_surface
+from sgns.full_space.dynamics import FullSpaceDynamics
+from sgns.full_space.training import fit_normalisation, train
+from sgns.full_space.windows import FullSpaceRun, FullSpaceWindows
+from sgns.learning.body import BodyTrack
+from sgns.learning.dynamics import ModelSettings
+from sgns.learning.trainee import SurrogateTraining, TrainingSettings
+from sgns.learning.training import prepared
+from sgns.learning.training import train as train_subspace
+from sgns.reduction.reduced import reduce_dataset
+from sgns.runs import Run
+from sgns.simulator import Simulator
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+HERE = Path(__file__).parent
+SPACING = 0.015  # of the particles of dataset=quick, and the largest of the body nodes [m]
+RADIUS = 0.020  # of the neighbourhood [m]: 6 neighbours in the bed at rest, about 10 where it is disordered
+STEPPED = {"body_nodes": "points", "layer_norm": True, "residual": True}
+FULL_SPACE = {  # changes to conf/model
+    "full space, 128 wide, 1 step": {"body_nodes": "points"},
+    "full space, 128 wide, 5 steps": STEPPED | {"message_passing_steps": 5},
+    "full space, 32 wide, 3 steps": STEPPED | {"message_passing_steps": 3, "hidden_width": 32},
+}
+TRAINED = "full space, 32 wide, 3 steps"
+SUBSPACE = "subspace, 8 modes"
+BATCH = 2  # windows of a training step when its cost is measured, the paper's, in every case
+# Steps are few, so each has one window (of 21 200 particles); the subspace network has the batch of its preset.
+FULL_SPACE_TRAINING = {"batch_size": 1, "noise": 0.5, "learning_rate": 2e-3, "warmup_steps": 20}
+
+
+def settings(path: Path, model: dict[str, Any] | None = None, **training: Any) -> dict[str, Any]:
+    """`conf/train` as plain values, with changes."""
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        plain = OmegaConf.to_container(compose("train", [f"dataset.path={path}"]), resolve=False)
+    plain["model"] |= model or {}
+    plain["training"] |= {"threads": 1} | training
+    return plain
+
+
+def full_space(path: Path, model: dict[str, Any], split: str) -> tuple[FullSpaceDynamics, list[FullSpaceRun]]:
+    """An untrained network and the runs of a split."""
+    torch.manual_seed(0)
+    paths = Dataset.open(path).runs(split)
+    with Run(paths[0]) as run:
+        blade = run.scene["blade"]
+    nodes = box_surface(np.array([blade["thickness"], blade["width"], blade["length"]]) / 2, SPACING)
+    runs = [FullSpaceRun(file, nodes) for file in paths]
+    return FullSpaceDynamics(ModelSettings(**model), RADIUS, runs[0].bin_size), runs
+
+
+def timed(action: Callable[[], object], repeats: int) -> list[float]:
+    """Processor times after one call to warm up [s]."""
+    action()
+    found = []
+    for _ in range(repeats):
+        began = time.process_time()
+        action()
+        found.append(time.process_time() - began)
+    return found
+
+
+def resident(peak: bool) -> float:
+    """Memory of this process now, or the most since `forget_peak` [MB]."""
+    key = "VmHWM:" if peak else "VmRSS:"
+    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith(key))
+    return float(line.split()[1]) / 1024
+
+
+def forget_peak() -> None:
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def rates(
+    step: Callable[[], object], frame: Callable[[], object], frame_rate: float, repeats: int, parameters: int
+) -> dict[str, Any]:
+    """Cost of rolling out frames and of training steps; memory is the most that each adds to the process."""
+    before = resident(peak=False)
+    forget_peak()
+    # Not inference_mode: the subspace network keeps its edges, and those made there cannot be trained with.
+    with torch.no_grad():
+        frames = timed(frame, repeats)
+    rolled = resident(peak=True)
+    steps = timed(step, repeats)
+    return {
+        "parameters": parameters,
+        "training_s_per_step": statistics.median(steps),
+        "training_memory_MB": resident(peak=True) - before,
+        "rollout_s_per_simulated_s": statistics.median(frames) * frame_rate,
+        "rollout_memory_MB": rolled - before,
+        "repeats": repeats,
+    }
+
+
+def cost_full_space(path: Path, name: str, repeats: int) -> dict[str, Any]:
+    """Of a network on all particles, with the tool in the soil."""
+    plain = settings(path, FULL_SPACE[name], max_steps=1, warmup_steps=0, batch_size=BATCH)
+    dynamics, runs = full_space(path, plain["model"], "train")
+    windows = FullSpaceWindows(runs[:1], dynamics.history)
+    window = windows.window(len(windows) // 2)
+    still = torch.zeros(3, dtype=torch.float64)
+    training = TrainingSettings.from_dict(plain["training"])
+    return rates(
+        lambda: train(dynamics, windows, training, still),
+        lambda: dynamics.advance(window.history, window.body),
+        runs[0].frame_rate,
+        repeats,
+        sum(p.numel() for p in dynamics.network.parameters()),
+    )
+
+
+def cost_subspace(path: Path, name: str, repeats: int) -> dict[str, Any]:
+    """Of the default network on modes."""
+    plain = settings(path, batch_size=BATCH)
+    reduced = reduce_dataset(Dataset.open(path), plain["reduction"], progress=False)
+    training = TrainingSettings.from_dict(plain["training"])
+    card: dict[str, Any] = {}
+    surrogate, data = prepared(
+        reduced, plain["reduction"]["num_modes"], ModelSettings(**plain["model"]), training, 0, card, None
+    )
+    module = SurrogateTraining(surrogate, training)
+    optimiser = torch.optim.AdamW(module.parameters(), lr=1e-5, fused=True)
+    window = data.training_windows.windows(data.training_windows.targets[100:101])
+
+    def step() -> None:
+        losses = module.losses(data.training_windows.batch(0, BATCH, data.noise_scale))
+        optimiser.zero_grad()
+        sum(training.loss[key] * value for key, value in losses.items()).backward()
+        torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+        optimiser.step()
+
+    return rates(
+        step,
+        lambda: surrogate.dynamics.advance(window.history, window.body),
+        float(reduced.frame_rate),
+        20 * repeats,
+        sum(p.numel() for p in surrogate.dynamics.network.parameters()),
+    )
+
+
+def errors(
+    paths: list[Path],
+    training_paths: list[Path],
+    predict: Callable[[Path], tuple[np.ndarray, np.ndarray]],
+    d: int,
+) -> dict[str, float]:
+    """Skill and force NRMSE over runs, the first d frames given, beside the baselines.
+
+    Args:
+        paths: runs to predict.
+        training_paths: runs whose mean force is a baseline.
+        predict: positions [m] (T, n, 3) and force [N] (T, 3) of a run.
+        d: frames given.
+    """
+    forces = []
+    for file in training_paths:
+        with Run(file) as run:
+            forces.append(run.force)
+    mean = mean_prediction(forces, d)
+    mse: dict[str, list[float]] = {"total": [], "frozen": [], "constant velocity": []}
+    force, constant = [], []
+    for file in paths:
+        positions, predicted = predict(file)
+        with Run(file) as run:
+            truth, true_force = run.positions().astype(np.float64), run.force
+        ahead = np.arange(1, len(truth) - d + 1)[:, None, None]
+        velocity = truth[d - 1] - truth[d - 2]
+        for key, guess in (
+            ("total", positions[d:]),
+            ("frozen", truth[d - 1]),
+            ("constant velocity", truth[d - 1] + ahead * velocity),
+        ):
+            mse[key].append(float(np.mean((guess - truth[d:]) ** 2)))
+        logging.warning("%s: skill %.3f", file.stem, 1 - mse["total"][-1] / mse["frozen"][-1])
+        force.append(VectorErrors.compare(true_force[d:], predicted[d:]))
+        constant.append(VectorErrors.compare(true_force[d:], mean))
+    return {
+        "position_rmse_mm": 1e3 * float(np.sqrt(np.mean(mse["total"]))),
+        "frozen_rmse_mm": 1e3 * float(np.sqrt(np.mean(mse["frozen"]))),
+        "skill_frozen": skill(mse["total"], mse["frozen"]),
+        "skill_constant_velocity": skill(mse["total"], mse["constant velocity"]),
+        "force_nrmse": sum(force[1:], force[0]).overall_nrmse,
+        "mean_force_nrmse": sum(constant[1:], constant[0]).overall_nrmse,
+    }
+
+
+def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
+    """Train for a processor time and predict test runs."""
+    plain = settings(path, FULL_SPACE[name], **FULL_SPACE_TRAINING)
+    dynamics, runs = full_space(path, plain["model"], "train")
+    windows = FullSpaceWindows(runs, dynamics.history)
+    noise_scale = fit_normalisation(
+        dynamics, windows, plain["training"]["noise"], plain["training"]["normalisation_floor"]
+    )
+    short = TrainingSettings.from_dict(
+        plain["training"]
+        | {"max_steps": 4, "warmup_steps": 0, "learning_rate": 1e-8, "final_learning_rate": 1e-8}
+    )
+    per_step = statistics.median(timed(lambda: train(dynamics, windows, short, noise_scale), 1)) / 4
+    steps = max(1, round(60 * minutes / per_step))
+    began = time.process_time()
+    record = train(
+        dynamics, windows, TrainingSettings.from_dict(plain["training"] | {"max_steps": steps}), noise_scale
+    )
+    taken = time.process_time() - began
+    last = max(1, steps // 10)
+    logging.warning(
+        "%s: %d steps; mean loss of the last tenth: acceleration %.3f, force %.3f",
+        name, steps, statistics.fmean(record.acceleration[-last:]), statistics.fmean(record.force[-last:]),
+    )  # fmt: skip
+    _, predicted = full_space(path, plain["model"], "test")
+    by_path = {run.path: run for run in predicted}
+
+    def predict(file: Path) -> tuple[np.ndarray, np.ndarray]:
+        run = by_path[file]
+        body = BodyTrack(*(part[None] for part in run.track))
+        with torch.inference_mode():
+            positions, force = dynamics.unroll(run.soil(slice(0, dynamics.history))[None], body)
+        return positions[0].numpy(), force[0].numpy()
+
+    dataset = Dataset.open(path)
+    found = errors(dataset.runs("test")[:runs], dataset.runs("train"), predict, dynamics.history)
+    return {
+        "trained_processor_s": taken,
+        "trained_steps": steps,
+        "test_runs": len(dataset.runs("test")[:runs]),
+    } | found
+
+
+def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
+    """The same for the network on modes, with `sgns.learning`."""
+    plain = settings(path)
+    reduced = reduce_dataset(Dataset.open(path), plain["reduction"], progress=False)
+    modes = plain["reduction"]["num_modes"]
+
+    def fit(steps: int, output: Path) -> float:
+        changes = {"max_steps": steps, "validate_every": max(1, steps // 10)}
+        began = time.process_time()
+        train_subspace(
+            reduced,
+            num_modes=modes,
+            model=plain["model"],
+            training=plain["training"] | changes,
+            output=output,
+        )
+        return time.process_time() - began
+
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        # The pilot's start-up counts as well, so this errs towards a shorter training.
+        steps = max(1, round(60 * minutes / ((fit(300, folder / "pilot")) / 300)))
+        taken = fit(steps, folder / "training")
+        simulator = Simulator.load(folder / "training" / "best.ckpt")
+    dataset = Dataset.open(path)
+    by_name = {run.name: run for run in reduced.runs("test")}
+
+    def predict(file: Path) -> tuple[np.ndarray, np.ndarray]:
+        run = by_name[file.stem]
+        rollout = simulator.rollout(run.pose, latent_history=run.latent[: simulator.history, :modes])
+        return simulator.basis.inverse(torch.as_tensor(rollout.latent)).numpy(), rollout.force
+
+    found = errors(dataset.runs("test")[:runs], dataset.runs("train"), predict, simulator.history)
+    return {
+        "trained_processor_s": taken,
+        "trained_steps": steps,
+        "test_runs": len(dataset.runs("test")[:runs]),
+    } | found
+
+
+def solver(path: Path, name: str) -> dict[str, Any]:
+    """Wall time of the solver, as its runs recorded it."""
+    found = []
+    for split in ("train", "validation", "test"):
+        for file in Dataset.open(path).runs(split):
+            with Run(file) as run:
+                found.append(run.wall_time_s / float(run.time[-1]))
+    return {"rollout_s_per_simulated_s": statistics.median(found), "repeats": len(found)}
+
+
+def in_fresh_process(action: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
+    """Run in a process of its own, so that memory is this case's."""
+    with multiprocessing.get_context("spawn").Pool(1, single_threaded) as pool:
+        return pool.apply(action, arguments)
+
+
+def single_threaded() -> None:
+    torch.set_num_threads(1)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+
+
+def done(table: Path) -> dict[str, dict[str, str]]:
+    """Lines of the table by case."""
+    if not table.exists():
+        return {}
+    with table.open(newline="") as stream:
+        return {row["case"]: row for row in csv.DictReader(stream)}
+
+
+def save(table: Path, rows: dict[str, dict[str, Any]]) -> None:
+    columns = list(dict.fromkeys(key for row in rows.values() for key in row))
+    with table.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, columns, restval="")
+        writer.writeheader()
+        for row in rows.values():
+            writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()})
+
+
+def draw(rows: dict[str, dict[str, str]], file: Path) -> None:
+    """Times, memory and errors side by side."""
+    panels = {
+        "training_s_per_step": f"training, batch {BATCH} [s/step]",
+        "rollout_s_per_simulated_s": "rollout [s per simulated s]",
+        "training_memory_MB": "memory of training [MB]",
+    }
+    figure, axes = plt.subplots(1, 4, figsize=(12, 2.6), layout="constrained", sharey=True)
+    names = list(rows)
+    colours = ["0.3" if n == "solver" else "C0" if n == SUBSPACE else "C1" for n in names]
+    for axis, (key, label) in zip(axes, panels.items(), strict=False):
+        values = [float(rows[n].get(key) or "nan") for n in names]
+        bars = axis.barh(names, values, color=colours)
+        axis.bar_label(
+            bars, ["" if np.isnan(v) else f" {v:.0f}" if v >= 100 else f" {v:.2g}" for v in values]
+        )
+        axis.set(xscale="log", xlabel=label)
+        low, high = np.nanmin(values), np.nanmax(values)
+        axis.set_xlim(low / 4, high * 30)
+    place = np.arange(len(names))
+    for shift, key, label in ((-0.2, "skill_frozen", "position skill"), (0.2, "force_nrmse", "force NRMSE")):
+        values = [float(rows[n].get(key) or "nan") for n in names]
+        bars = axes[3].barh(place + shift, values, 0.4, label=label, color="C2" if shift < 0 else "C3")
+        axes[3].bar_label(bars, ["" if np.isnan(v) else f" {v:.2f}" for v in values])
+    axes[3].axvline(0, color="0.2", lw=0.8)
+    axes[3].set(xlabel="test runs, after minutes of training")
+    axes[3].margins(x=0.25)
+    axes[3].legend(fontsize=7, loc="upper right")
+    axes[0].invert_yaxis()
+    figure.savefig(file, dpi=130)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path("data/quick"))
+    parser.add_argument("--minutes", type=float, default=10.0, help="processor time of each training")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--runs", type=int, help="how many of the test runs to predict; all by default")
+    parser.add_argument("--table", type=Path, default=HERE / "table.csv")
+    options = parser.parse_args()
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    os.environ["OMP_NUM_THREADS"] = "1"
+    # Freed blocks are kept for the next step: otherwise a third of the time goes into getting zeroed pages anew.
+    os.environ |= {"MALLOC_MMAP_THRESHOLD_": "4294967296", "MALLOC_TRIM_THRESHOLD_": "17179869184"}
+    rows: dict[str, dict[str, Any]] = dict(done(options.table))
+    order = ("solver", SUBSPACE, *FULL_SPACE)
+    for name in order:
+        if name not in rows:
+            cost = cost_subspace if name == SUBSPACE else cost_full_space
+            found = (
+                solver(options.data, name)
+                if name == "solver"
+                else in_fresh_process(cost, options.data, name, options.repeats)
+            )
+            rows[name] = {"case": name, **found}
+            save(options.table, rows)
+            print(rows[name], flush=True)
+    for name, learn in ((SUBSPACE, learn_subspace), (TRAINED, learn_full_space)):
+        if not rows[name].get("trained_steps"):
+            rows[name] |= in_fresh_process(learn, options.data, name, options.minutes, options.runs)
+            save(options.table, rows)
+            print(rows[name], flush=True)
+    draw(done(options.table), HERE / "bars.png")
+
+
+if __name__ == "__main__":
+    main()
