@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
-from run import FIRST, HERE, plt, smoothed
+from run import FIRST, HERE, first_third, plt, smoothed
 
 from mpm_warp import Scene
 from sgns.published import excavation_case, read_published
@@ -81,7 +81,7 @@ def main() -> None:
         fitted = np.zeros_like(slow)
         fitted[:still] = with_the_cells(slow[:still], travel[:still])
         scale = rms(smoothed(theirs))
-        third = travel < travel[0] + (travel[-1] - travel[0]) / 3.0
+        third = first_third(travel)
         row = {
             "case": run.case,
             **excavation_case(run.case),
@@ -92,6 +92,8 @@ def main() -> None:
             "share_first_third": float(np.sum(slow[third] ** 2) / np.sum(slow**2)),
             "nrmse_after_first_third": rms(slow[~third]) / rms(smoothed(theirs)[~third]),
             "nrmse_other_draw": math.nan,
+            "first_third": float(smoothed(ours)[third].mean()),
+            "first_third_published": float(smoothed(theirs)[third].mean()),
         }
         if options.redrawn and (options.redrawn / "runs" / f"case_{run.case:03d}.h5").exists():
             row["nrmse_other_draw"] = rms(smoothed(run_of(options.redrawn, run.case)[0] - ours)) / scale
@@ -115,7 +117,7 @@ def main() -> None:
         writer = csv.DictWriter(stream, rows[0])
         writer.writeheader()
         writer.writerows(rows)
-    for key in list(rows[0])[5:]:
+    for key in [name for name in rows[0] if "share" in name or "nrmse" in name]:
         values = [row[key] for row in rows if not math.isnan(row[key])]
         if values:
             logging.info(

@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from run import HERE, campaign_of, compared, smoothed
+from run import HERE, campaign_of, compared, first_third, smoothed
 
 from mpm_warp import Excavation
 from mpm_warp.push import Push
@@ -99,11 +99,13 @@ def main() -> None:
     for theirs in published:
         with Run(campaign.file(f"case_{theirs.case:03d}")) as run:
             ours = run.force[1 : 1 + len(theirs.force)]
+            third = first_third(smoothed(run.pose[1 : 1 + len(ours), 0]))
         row = {"case": theirs.case, **excavation_case(theirs.case)}
         for name, component, sign in (("draft", 0, -1), ("vertical", 2, 1)):
             found = compared(sign * ours[:, component], sign * theirs.force[: len(ours), component])
             row[f"{name}_square"] = float(square[theirs.case][f"{name}_mean"])
             row |= {f"{name}_{key}": round(float(value), 3) for key, value in found.items()}
+        row["draft_first_third"] = round(float(smoothed(-ours[:, 0])[third].mean()), 3)
         cut = cuts[f"case_{theirs.case:03d}"]
         own = math.degrees(math.asin(cut.material.static_friction))
         for name, angle in (("nominal", ANGLE), ("own", own)):

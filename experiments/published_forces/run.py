@@ -40,6 +40,11 @@ def smoothed(series: np.ndarray) -> np.ndarray:
     return np.convolve(series[FIRST:], np.ones(WINDOW) / WINDOW, mode="valid")
 
 
+def first_third(travel: np.ndarray) -> np.ndarray:
+    """Which frames lie in the first third of the blade's way along x, shape (T,)."""
+    return travel < travel[0] + (travel[-1] - travel[0]) / 3.0
+
+
 def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
     """Means [N], correlation and NRMSE (RMS difference over RMS of the published series)."""
     a, b = smoothed(ours), smoothed(theirs)
@@ -96,12 +101,14 @@ def main() -> None:
         default="published_excavation",
         help="published_excavation, or excavation: the reference setting",
     )
+    parser.add_argument("--results", default=HERE, type=Path, help="folder for the table and the figure")
+    parser.add_argument("--cases", type=int, nargs="*", help="only these case numbers")
     parser.add_argument("--workers", type=int, default=None, help="runs at once (default: one per core)")
     parser.add_argument("overrides", nargs="*", help="changes of the scene, for example scene.courant=0.4")
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
-    published, campaign = campaign_of(options, excavation_case, "published_excavation")
+    published, campaign = campaign_of(options, excavation_case, "published_excavation", options.cases)
     simulate_campaign(campaign, device="cpu", workers=options.workers)
     suffix = "" if options.scene == "published_excavation" else f"_{options.scene}"
 
@@ -132,8 +139,9 @@ def main() -> None:
     axes[-1].legend(*axes[0].get_legend_handles_labels(), loc="center")
     figure.supxlabel("time [s]")
     figure.supylabel("force on the blade, centred mean over 0.25 s [N]")
-    figure.savefig(HERE / f"histories{suffix}.png", dpi=100)
-    with (HERE / f"table{suffix}.csv").open("w", newline="") as stream:
+    options.results.mkdir(parents=True, exist_ok=True)
+    figure.savefig(options.results / f"histories{suffix}.png", dpi=100)
+    with (options.results / f"table{suffix}.csv").open("w", newline="") as stream:
         writer = csv.DictWriter(stream, rows[0])
         writer.writeheader()
         writer.writerows(rows)
