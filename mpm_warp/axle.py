@@ -12,6 +12,8 @@ from functools import cache
 
 import warp as wp
 
+from .launches import SceneKernel, scene_kernel
+
 __all__ = ["Axle", "axle_step", "stable_step"]
 
 
@@ -26,12 +28,13 @@ class Axle:
 
 
 @cache
-def axle_step(real: type) -> wp.Kernel:
+def axle_step(real: type) -> SceneKernel:
     """Kernel of one thread: symplectic Euler with the damping taken implicitly."""
     vec3 = wp.types.vector(3, real)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @scene_kernel()
     def step(
+        _: int,
         axle: wp.array(
             dtype=wp.float64
         ),  # height [m], its rate [m/s], vertical impulse of this frame so far [N s]

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterable, Iterator
-from itertools import repeat
+from itertools import islice, repeat
+from typing import Any
 
 from .effects import Effects
 from .errors import SceneError, SolverStopped
 from .scene import Scene
 from .solver import Frame, Solver
-from .streams import in_turns
+from .start import find_device
+from .work import Work, Worker
 
-__all__ = ["frames_together"]
+__all__ = ["all_together", "frames_together"]
 
 
 def frames_together(
@@ -28,7 +30,8 @@ def frames_together(
                 print(f"scene {number} ended: {frame}")
 
     It pays on a GPU, which a scene of some ten thousand particles does not fill. Scenes may differ in anything; none
-    depends on which others are computed with it.
+    depends on which others are computed with it. Those of the same effects, walls, contact and precision
+    share every launch.
 
     Args:
         scenes: what to compute.
@@ -44,11 +47,46 @@ def frames_together(
 
     def frames(
         scene: Scene, effects: Effects | None
-    ) -> Generator[Frame | SceneError | SolverStopped | None, None, None]:
+    ) -> Generator[Frame | SceneError | SolverStopped | Work, None, None]:
         try:
             yield from Solver(scene, effects, device, precision).stages()
         except (SceneError, SolverStopped) as error:
             yield error
 
     each = repeat(effects) if effects is None or isinstance(effects, Effects) else effects
-    return in_turns(map(frames, scenes, each), at_once, device)
+    return all_together(map(frames, scenes, each), at_once, device)
+
+
+def all_together(
+    tasks: Iterable[Generator[Any, None, None]], at_once: int, device: str
+) -> Iterator[tuple[int, Any]]:
+    """Advances `at_once` generators side by side, the next one as soon as one has ended.
+
+    Args:
+        tasks: what to advance; each is taken when its turn comes.
+        at_once: how many are under way.
+        device: where they compute.
+
+    Yields:
+        A task's number and what it yielded, unless that was work. Work is done when all have asked for some.
+    """
+    worker = Worker(find_device(device))
+    waiting = enumerate(tasks)
+    running = list(islice(waiting, at_once))
+    try:
+        while running:
+            works: list[Work] = []
+            while len(works) < len(running):
+                place = len(works)
+                number, task = running[place]
+                item = next(task, None)
+                if isinstance(item, Work):
+                    works.append(item)
+                elif item is not None:
+                    yield number, item
+                else:
+                    running[place : place + 1] = islice(waiting, 1)
+            worker.do(works)
+    finally:
+        for _, task in running:
+            task.close()

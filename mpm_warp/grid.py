@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .launches import scene_kernel
+
 __all__ = ["grid_step", "grid_struct"]
 
 
@@ -75,8 +77,9 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
     conditions = {"no_slip": no_slip, "slip": slip, "friction": rub, "periodic": slip}
     at_x, at_y, at_floor = (conditions[kind] for kind in walls)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @scene_kernel()
     def begin(
+        n: int,
         grid: Grid,
         momentum: wp.array(dtype=vec4),
         velocity: wp.array(dtype=vec4),
@@ -84,7 +87,6 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
         inverse_mass: wp.array(dtype=real),
         impulse: wp.array(dtype=vec4),
     ):
-        n = wp.tid()
         node = momentum[n]
         mass = node[3]
         result = vec4()
@@ -99,15 +101,15 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
         before[n] = result
         inverse_mass[n] = inverse
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @scene_kernel()
     def step(
+        n: int,
         grid: Grid,
         velocity: wp.array(dtype=vec4),
         inverse_mass: wp.array(dtype=real),
         impulse: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
     ):
-        n = wp.tid()
         if n == 0:
             substep[0] = substep[0] + 1
         inverse = inverse_mass[n]

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .launches import Launch, SceneKernel, scene_kernel
+
 __all__ = ["Images", "images", "mirror_pairs", "seam_pairs"]
 
 _REACH = 2  # layers of ghost nodes: one more than the splines of a particle on the plane reach
@@ -40,12 +42,16 @@ def images(real: type) -> SimpleNamespace:
     def node_of(row: int, layer: int, stride: int, extent: int):
         return (row // stride) * stride * extent + row % stride + layer * stride
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @scene_kernel()
     def fold(
-        nodes: wp.array(dtype=vec4), pairs: wp.array(dtype=wp.vec2i), sign: vec4, stride: int, extent: int
+        row: int,
+        nodes: wp.array(dtype=vec4),
+        pairs: wp.array(dtype=wp.vec2i),
+        sign: vec4,
+        stride: int,
+        extent: int,
     ):
         """Add ghost layers to their images; `sign` mirrors a node's momentum, `stride` and `extent` are the axis'."""
-        row = wp.tid()
         for q in range(pairs.shape[0]):
             ghost = node_of(row, pairs[q][0], stride, extent)
             image = node_of(row, pairs[q][1], stride, extent)
@@ -54,21 +60,24 @@ def images(real: type) -> SimpleNamespace:
             if ghost != image:
                 nodes[ghost] = vec4()
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @scene_kernel()
     def unfold(
-        velocity: wp.array(dtype=vec4), pairs: wp.array(dtype=wp.vec2i), sign: vec4, stride: int, extent: int
+        row: int,
+        velocity: wp.array(dtype=vec4),
+        pairs: wp.array(dtype=wp.vec2i),
+        sign: vec4,
+        stride: int,
+        extent: int,
     ):
         """Give ghost layers the velocity of their images."""
-        row = wp.tid()
         for q in range(pairs.shape[0]):
             ghost = node_of(row, pairs[q][0], stride, extent)
             image = node_of(row, pairs[q][1], stride, extent)
             velocity[ghost] = wp.cw_mul(sign, velocity[image])
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def wrap(x: wp.array(dtype=vec3), turns: wp.array(dtype=int), axis: int, length: real):
+    @scene_kernel()
+    def wrap(p: int, x: wp.array(dtype=vec3), turns: wp.array(dtype=int), axis: int, length: real):
         """Bring particles back into 0 <= x < length along an axis and count the turns."""
-        p = wp.tid()
         at = x[p]
         if at[axis] < real(0.0):
             at[axis] = at[axis] + length
@@ -105,13 +114,13 @@ class Images:
             rows = grid.nx * grid.ny * grid.nz // extent
             self._axes.append((rows, [layers, sign, stride, extent]))
 
-    def fold(self, nodes: wp.array) -> list[wp.Launch]:
+    def fold(self, nodes: wp.array) -> list[Launch]:
         """Add ghost layers to their images."""
         return [self._record(self._kernels.fold, nodes, *axis) for axis in self._axes]
 
-    def unfold(self, nodes: wp.array) -> list[wp.Launch]:
+    def unfold(self, nodes: wp.array) -> list[Launch]:
         """Give ghost layers the values of their images."""
         return [self._record(self._kernels.unfold, nodes, *axis) for axis in reversed(self._axes)]
 
-    def _record(self, kernel: wp.Kernel, nodes: wp.array, rows: int, rest: list) -> wp.Launch:
-        return wp.launch(kernel, rows, [nodes, *rest], device=self._device, record_cmd=True)
+    def _record(self, kernel: SceneKernel, nodes: wp.array, rows: int, rest: list) -> Launch:
+        return Launch(kernel, rows, [nodes, *rest], self._device)

@@ -38,6 +38,7 @@ from .effects import Effects
 from .fluidity import fluidity
 from .grid import grid_struct
 from .images import Images
+from .launches import Launch, scene_kernel
 from .soil import soil_struct
 from .splines import splines
 
@@ -112,8 +113,9 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         else:
             sums[at] = sums[at] + amount
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @scene_kernel()
     def project(
+        p: int,
         home: wp.array(dtype=vec3),
         e: wp.array(dtype=vec6),
         ln_j: wp.array(dtype=real),
@@ -122,7 +124,6 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         on_plane: int,  # so many particles, the first ones, lie on a mirror plane and count half
         sums: wp.array(dtype=vec4),
     ):
-        p = wp.tid()
         found = source(e[p], ln_j[p], p, grid.dt, soil)
         if found[0] > real(0.0):
             base, f = base_and_offset(home[p], grid)
@@ -142,9 +143,8 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
                     deposit(sums, row + 1, wz[1] * at)
                     deposit(sums, row + 2, wz[2] * at)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def prepare(sums: wp.array(dtype=vec4), field: wp.array(dtype=vec4)):
-        n = wp.tid()
+    @scene_kernel()
+    def prepare(n: int, sums: wp.array(dtype=vec4), field: wp.array(dtype=vec4)):
         s = sums[n]
         filled = s[0]
         if filled > real(0.0):
@@ -158,8 +158,9 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         else:
             field[n] = vec4()
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @scene_kernel()
     def sweep(
+        n: int,
         ratio: real,  # (A d / dx)^2
         nz: int,
         plane: int,  # nodes of one x, ny nz
@@ -167,7 +168,6 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         field: wp.array(dtype=vec4),
         swept: wp.array(dtype=vec4),
     ):
-        n = wp.tid()
         here = field[n]
         # No soil lies in the outermost layers of the grid, so only the ends of the array need care.
         if here[0] > real(0.0) and n >= plane and n < field.shape[0] - plane:
@@ -205,8 +205,9 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
                 sharp -= real(0.25) * (before[1] - real(2.0) * here[1] + after[1])
         return sharp
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @scene_kernel()
     def place(
+        n: int,
         grid: Grid,
         soil: Soil,
         nz: int,
@@ -214,7 +215,6 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         field: wp.array(dtype=vec4),
         cooperation: wp.array(dtype=vec4),
     ):
-        n = wp.tid()
         found = field[n]
         amount = real(0.0)
         if found[0] > real(0.0):
@@ -267,19 +267,18 @@ class NonlocalFluidity:
         ratio = (soil.cooperative_length / grid.spacing) ** 2
         relaxation = soil.fluidity_time / grid.dt if effects.fluidity else None
         strides = (grid.nz, grid.ny * grid.nz)
-        record = {"device": device, "record_cmd": True}
 
-        def sweep(start: wp.array, end: wp.array) -> list[wp.Launch]:
+        def sweep(start: wp.array, end: wp.array) -> list[Launch]:
             inputs = [ratio, *strides, walls, start, end]
-            return [*images.unfold(start), wp.launch(kernels.sweep, count, inputs, **record)]
+            return [*images.unfold(start), Launch(kernels.sweep, count, inputs, device)]
 
         inputs = [*particles, grid, soil, on_plane, sums]
-        project = wp.launch(kernels.project, len(particles[0]), inputs, **record)
+        project = Launch(kernels.project, len(particles[0]), inputs, device)
         self.launches = [
             project,
             *images.fold(sums),
-            wp.launch(kernels.prepare, count, [sums, field], **record),
+            Launch(kernels.prepare, count, [sums, field], device),
             *[*sweep(field, other), *sweep(other, field)] * (sweep_count(ratio, relaxation) // 2),
-            wp.launch(kernels.place, count, [grid, soil, *strides, field, cooperation], **record),
+            Launch(kernels.place, count, [grid, soil, *strides, field, cooperation], device),
         ]
         """In order, after the grid step and before the particles read the grid."""

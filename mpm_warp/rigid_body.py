@@ -11,9 +11,9 @@ import warp as wp
 from .axle import axle_step, stable_step
 from .contact import HOLDING_LAYER, ContactLaw, body_struct
 from .errors import SolverStopped
+from .launches import Launch
 from .rotation import angular_velocity
 from .shapes import shape_data
-from .streams import on_host
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -91,7 +91,7 @@ class RigidBody:
         data.spin = wp.zeros(substeps, dtype=vec3, device=device)
         data.stick = wp.zeros(particles, dtype=vec3, device=device)
         data.impulse = wp.zeros(1 + torque, dtype=vec3, device=device)
-        self.launches: list[wp.Launch] = []
+        self.launches: list[Launch] = []
         """What has to run in every substep after the soil's push was added up."""
         self._axle: wp.array | None = None
         if axle is not None:
@@ -99,7 +99,7 @@ class RigidBody:
             self._axle = wp.array([height, 0.0, 0.0], dtype=wp.float64, device=device)
             data.axle = self._axle
             values = [self._axle, data.impulse, dt, share * axle.mass, scene.gravity, axle.damping]
-            self.launches.append(wp.launch(axle_step(real), 1, values, device=device, record_cmd=True))
+            self.launches.append(Launch(axle_step(real), 1, values, device))
         self.data = data
         """The struct that kernels take."""
 
@@ -123,7 +123,7 @@ class RigidBody:
         """Centre of mass [m] and quaternion now, at `time` [s], shape (7,)."""
         pose = self.scene.poses_at(np.array([time]))[0]
         if self._axle is not None:
-            pose[2] = on_host(self._axle)[0]
+            pose[2] = self._axle.numpy()[0]
         return pose
 
     def check(self, time: float) -> None:
@@ -134,7 +134,7 @@ class RigidBody:
         """
         if self._axle is None:
             return
-        lowest = on_host(self._axle)[0] - self.scene.body.half_size[2]
+        lowest = self._axle.numpy()[0] - self.scene.body.half_size[2]
         if not lowest > -self.scene.bed.size[2]:
             raise SolverStopped(
                 f"the body reached the floor of the bin by {time:.3f} s: make scene.bed.size deeper or the load smaller"
@@ -144,6 +144,6 @@ class RigidBody:
         """By the soil on the body since the frame began [N s], and its moment [N m s], shape (2, 3); a moment that is
         not added up is 0."""
         found = np.zeros((2, 3))
-        impulse = on_host(self.data.impulse)
+        impulse = self.data.impulse.numpy()
         found[: len(impulse)] = impulse
         return found

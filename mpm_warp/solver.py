@@ -17,16 +17,17 @@ from .grid import grid_step
 from .grid_layout import lay_grid
 from .images import Images, images
 from .initial_stress import initial_stress
+from .launches import Launch, SceneKernel
 from .nonlocal_fluidity import NonlocalFluidity, wall_sink
 from .rigid_body import RigidBody
 from .rotation import rotate
 from .scene import Scene
 from .soil import soil_parameters
 from .start import find_device
-from .streams import on_host
 from .symmetry import half, require_symmetry
 from .time_step import steps_to_remap, substeps_per_frame, top_body_speed
 from .transfer import transfer
+from .work import Program, Work, Worker
 
 __all__ = ["PRECISIONS", "Frame", "Solver"]
 
@@ -107,11 +108,18 @@ class Solver:
         Raises:
             SolverStopped: at the end of the first frame in which a particle or the body went wrong.
         """
-        return (frame for frame in self.stages() if frame is not None)
+        worker = Worker(self.device)
+        for stage in self.stages():
+            if isinstance(stage, Work):
+                worker.do([stage])
+            else:
+                yield stage
 
-    def stages(self) -> Generator[Frame | None, None, None]:
-        """As `frames`, with None wherever the host is about to wait for the device, which may do something else
-        meanwhile (batch.py)."""
+    def stages(self) -> Generator[Frame | Work, None, None]:
+        """As `frames`, with all work that the device has to do before the solver can go on: the caller has it done,
+        that of other scenes with it (batch.py)."""
+        for program in (self._remap, self._until_remap):
+            yield Work(program, 0)
         for index in range(self.scene.frame_count):
             if index > 0:
                 self._substep.zero_()
@@ -160,6 +168,7 @@ class Solver:
         self._inverse_mass = wp.zeros(nodes, dtype=real, device=device)
         self._substep = wp.zeros(1, dtype=int, device=device)
         self._top_speed = wp.zeros(1, dtype=real, device=device)
+        self._keep = wp.zeros(1, dtype=real, device=device)
         self._stray = wp.zeros(4, dtype=int, device=device)
 
         self._body: RigidBody | None = None
@@ -178,8 +187,8 @@ class Solver:
             )
         self._record_launches(n, nodes, ghosts)
 
-    def _record(self, kernel: wp.Kernel, count: int, *arguments: Any) -> wp.Launch:
-        return wp.launch(kernel, count, arguments, device=self.device, record_cmd=True)
+    def _record(self, kernel: SceneKernel, count: int, *arguments: Any) -> Launch:
+        return Launch(kernel, count, arguments, self.device)
 
     def _record_launches(self, n: int, nodes: int, ghosts: dict[int, np.ndarray]) -> None:
         """What runs at a remap and in every step, in order."""
@@ -242,8 +251,9 @@ class Solver:
                 kernels.material, n, felt, c, e, ln_j, self._stress, self._swelling, self._excess, grid, soil
             ),
         ]
-        self._from_grid = self._record(kernels.from_grid, n, home, felt, v, grid, self._before, 0.0)
-        self._graphs: dict[int, wp.Graph] = {}
+        self._from_grid = self._record(kernels.from_grid, n, home, felt, v, grid, self._before, self._keep)
+        self._remap = Program(self._to_grid)
+        self._until_remap = Program(self._begin, self._step, [self._from_grid])
 
     def _parts(self, n: int) -> Iterator[tuple[slice, Any, Any]]:
         """Particles with the grid and the body that they see. Those on the plane of symmetry count half."""
@@ -266,7 +276,7 @@ class Solver:
                 its_body.stick = body.stick[part]
             yield part, its_grid, its_body
 
-    def _record_nonlocal(self, ghosts: dict[int, np.ndarray]) -> list[wp.Launch]:
+    def _record_nonlocal(self, ghosts: dict[int, np.ndarray]) -> list[Launch]:
         if not self.effects.nonlocality:
             return []
         real, grid = self._real, self._grid
@@ -290,7 +300,7 @@ class Solver:
         )
         return [*term.launches, *ghost.unfold(self._cooperation)]
 
-    def _record_wraps(self, n: int) -> list[wp.Launch]:
+    def _record_wraps(self, n: int) -> list[Launch]:
         """Bring particles that left a periodic bin back in."""
         self._turns: dict[int, wp.array] = {}
         launches = []
@@ -303,48 +313,24 @@ class Solver:
 
     # --- stepping -----------------------------------------------------------------------------------------
 
-    def _advance(self, index: int) -> Iterator[None]:
+    def _advance(self, index: int) -> Iterator[Work]:
         left = self.substeps_per_frame
         while left:
             self._top_speed.zero_()
-            for launch in self._to_grid:
-                launch.launch()
-            yield
-            speed = max(self._top_body_speed, float(on_host(self._top_speed)[0]))
+            yield Work(self._remap, 1)
+            speed = max(self._top_body_speed, float(self._top_speed.numpy()[0]))
             steps = min(left, steps_to_remap(self.scene, self.time_step, speed))
             left -= steps
-            if self.device.is_cuda:
-                wp.capture_launch(self._captured(steps))
-            else:
-                self._until_remap(steps)
-        yield
+            self._keep.fill_(math.exp(-steps * self.time_step / self.scene.velocity_memory))
+            yield Work(self._until_remap, steps)
         self._check_particles(index)
 
-    def _until_remap(self, steps: int) -> None:
-        for launch in self._begin:
-            launch.launch()
-        for _ in range(steps):
-            for launch in self._step:
-                launch.launch()
-        keep = math.exp(-steps * self.time_step / self.scene.velocity_memory)
-        self._from_grid.set_param_by_name("keep", keep)
-        self._from_grid.launch()
-
-    def _captured(self, steps: int) -> wp.Graph:
-        if steps not in self._graphs:
-            for launch in (*self._begin, *self._step, self._from_grid):
-                wp.load_module(launch.kernel.module, device=self.device)
-            with wp.ScopedCapture(device=self.device) as capture:
-                self._until_remap(steps)
-            self._graphs[steps] = capture.graph
-        return self._graphs[steps]
-
     def _check_particles(self, index: int) -> None:
-        count, particle, substep, near = (int(i) for i in on_host(self._stray))
+        count, particle, substep, near = (int(i) for i in self._stray.numpy())
         if not count:
             return
         time = (index - 1) / self.scene.frame_rate + substep * self.time_step
-        at = ", ".join(f"{c:.4f}" for c in on_host(self._x)[particle])
+        at = ", ".join(f"{c:.4f}" for c in self._x.numpy()[particle])
         if self._half is not None:
             particle = int(self._half.kept[particle])
         cause = (
@@ -365,10 +351,10 @@ class Solver:
         impulse = np.zeros((2, 3))
         if self._body is not None:
             pose, impulse = self._body.pose(time), self._body.impulse() * (scene.frame_rate if index else 0.0)
-        position, velocity = on_host(self._x), on_host(self._felt)[:, :3]
+        position, velocity = self._x.numpy(), self._felt.numpy()[:, :3]
         for axis, turns in self._turns.items():
             position = position.copy()  # on the CPU it is the solver's own memory
-            position[:, axis] += on_host(turns) * scene.bed.size[axis]
+            position[:, axis] += turns.numpy() * scene.bed.size[axis]
         if self._half is not None:
             position, velocity = self._half.whole(position, velocity)
             # The other half doubles force along and moment within the plane of symmetry, and cancels the rest.

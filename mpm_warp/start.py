@@ -22,8 +22,6 @@ def start_warp() -> None:
     # Warp announces every kernel it loads; here only its warnings are of use.
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     if _has_cuda_driver():
-        # Work queues of a device, read when CUDA starts. Streams that share one wait for each other; 32 is the most.
-        os.environ.setdefault("CUDA_DEVICE_MAX_CONNECTIONS", "32")
         wp.init()
     else:
         with _silent_stderr():

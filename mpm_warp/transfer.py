@@ -20,6 +20,7 @@ from .contact import ContactLaw, body_struct, contact
 from .effects import Effects
 from .fluidity import fluidity
 from .grid import grid_struct
+from .launches import scene_kernel
 from .rows import rows
 from .soil import soil_struct
 from .splines import splines
@@ -84,8 +85,9 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
                 at = plus(at, real(1.0), row_y)
             plane = plus(plane, real(1.0), row_x)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
+    @scene_kernel(fused)
     def to_grid(
+        p: int,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         c: wp.array(dtype=mat33),
@@ -96,7 +98,6 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         substep: wp.array(dtype=int),
         stray: wp.array(dtype=int),
     ):
-        p = wp.tid()
         speed = wp.length(v[p])
         if not (speed < grid.speed_limit):  # true for a NaN, too
             fault(stray, p, substep[0], 0)
@@ -108,8 +109,9 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         start = grid.particle_mass * v[p] - q * f
         deposit(base, f, vec4(start[0], start[1], start[2], grid.particle_mass), q, grid, momentum)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
+    @scene_kernel(fused)
     def scatter(
+        p: int,
         x: wp.array(dtype=vec3),
         home: wp.array(dtype=vec3),
         felt: wp.array(dtype=vec4),
@@ -120,7 +122,6 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         impulse: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
     ):
-        p = wp.tid()
         base, f = base_and_offset(home[p], grid)
         # Of the stress: -dt V D^-1 tau (x_i - x_p), D = dx^2 / 4; q is per cell.
         t = stress[p]
@@ -135,8 +136,9 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
             base, f, vec4(start[0], start[1], start[2], grid.particle_mass * swelling[p]), q, grid, impulse
         )
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
+    @scene_kernel(fused)
     def gather(
+        p: int,
         x: wp.array(dtype=vec3),
         home: wp.array(dtype=vec3),
         felt: wp.array(dtype=vec4),
@@ -148,7 +150,6 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         substep: wp.array(dtype=int),
         stray: wp.array(dtype=int),
     ):
-        p = wp.tid()
         base, f = base_and_offset(home[p], grid)
         wx = weights(f[0])
         wy = weights(f[1])
@@ -204,8 +205,9 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
             fault(stray, p, substep[0], wp.where(near, 1, 0))
 
     # A kernel of its own: in one with the transfer the C++ compiler makes both slower.
-    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
+    @scene_kernel(fused)
     def material(
+        p: int,
         felt: wp.array(dtype=vec4),
         c: wp.array(dtype=mat33),
         e: wp.array(dtype=vec6),
@@ -216,7 +218,6 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         grid: Grid,
         soil: Soil,
     ):
-        p = wp.tid()
         # What `update` means by its last number; `excess` is what cooperative flow adds (nonlocal_fluidity.py).
         g = real(0.0)
         if wp.static(effects.nonlocality):
@@ -247,18 +248,18 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         t = kirchhoff(after + grid.damping * (after - before), volume, soil)
         stress[p] = vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=fused)
+    @scene_kernel(fused)
     def from_grid(
+        p: int,
         home: wp.array(dtype=vec3),
         felt: wp.array(dtype=vec4),
         v: wp.array(dtype=vec3),
         grid: Grid,
         before: wp.array(dtype=vec4),
-        keep: real,
+        keep: wp.array(dtype=real),
     ):
         # The particle's own velocity changes by what changed on the grid; of the part that the grid does not resolve
         # the share `keep` is left.
-        p = wp.tid()
         base, f = base_and_offset(home[p], grid)
         wx = weights(f[0])
         wy = weights(f[1])
@@ -268,7 +269,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
                 total = plus(total, wx[i] * wy[j], gather_row(before, node_index(base, i, j, grid)))
         smooth = fold(weights(f[2]), total)
         u = vec3(felt[p][0], felt[p][1], felt[p][2])
-        v[p] = u + keep * (v[p] - vec3(smooth[0], smooth[1], smooth[2]))
+        v[p] = u + keep[0] * (v[p] - vec3(smooth[0], smooth[1], smooth[2]))
 
     return SimpleNamespace(
         to_grid=to_grid, scatter=scatter, gather=gather, material=material, from_grid=from_grid

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import csv
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
@@ -20,7 +21,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns.campaign import Campaign
-from sgns.published import excavation_case, read_published
+from sgns.published import PublishedRun, excavation_case, read_published
 from sgns.runs import Run
 from sgns.scene_effects import asked_effects
 from sgns.scenes import scene_from_config
@@ -50,6 +51,42 @@ def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
     }
 
 
+def campaign_of(
+    options: argparse.Namespace,
+    values_of: Callable[[int], dict[str, float | str]],
+    published_scene: str,
+    cases: list[int] | None = None,
+) -> tuple[list[PublishedRun], Campaign]:
+    """The published runs in the order of their cases, and the campaign that makes them with `options.scene`.
+
+    Args:
+        options: published, scene, runs and overrides of the command line.
+        values_of: the scene's keys of a case.
+        published_scene: whose bin the published coordinates belong to.
+        cases: only these; None: all.
+    """
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        config = compose("simulate", [f"scene={options.scene}", *options.overrides])
+        theirs = compose("simulate", [f"scene={published_scene}"])
+    published = read_published(options.published, scene_from_config(theirs).bed.size)
+    published = sorted((r for r in published if not cases or r.case in cases), key=lambda run: run.case)
+    scenes = {}
+    for run in published:
+        for key, value in values_of(run.case).items():
+            OmegaConf.update(config, f"scene.{key}", value)
+        scenes[f"case_{run.case:03d}"] = scene_from_config(config)
+    campaign = Campaign(
+        "published_forces",
+        Path(options.runs or f"data/{options.scene}"),
+        scenes,
+        dict.fromkeys(scenes, "test"),
+        asked_effects(config),
+        config.solver.precision,
+        seed=0,
+    )
+    return published, campaign
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("published", help="folder with valid.tfrecord and metadata.json")
@@ -64,26 +101,9 @@ def main() -> None:
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        config = compose("simulate", [f"scene={options.scene}", *options.overrides])
-    published = read_published(options.published, scene_from_config(config).bed.size)
-    published.sort(key=lambda run: run.case)
-    suffix = "" if options.scene == "published_excavation" else f"_{options.scene}"
-    scenes = {}
-    for run in published:
-        for key, value in excavation_case(run.case).items():
-            OmegaConf.update(config, f"scene.{key}", value)
-        scenes[f"case_{run.case:03d}"] = scene_from_config(config)
-    campaign = Campaign(
-        "published_forces",
-        Path(options.runs or f"data/{options.scene}"),
-        scenes,
-        dict.fromkeys(scenes, "test"),
-        asked_effects(config),
-        config.solver.precision,
-        seed=0,
-    )
+    published, campaign = campaign_of(options, excavation_case, "published_excavation")
     simulate_campaign(campaign, device="cpu", workers=options.workers)
+    suffix = "" if options.scene == "published_excavation" else f"_{options.scene}"
 
     rows = []
     figure = plt.figure(figsize=(13, 12), layout="constrained")

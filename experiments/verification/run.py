@@ -1,8 +1,8 @@
 """The solver against cases with known answers, resolved well enough to see how it converges.
 
-    python experiments/verification/run.py [bagnold passive runout silo slope stopping waves]
+    python experiments/verification/run.py [bagnold mckyes passive runout silo slope stopping waves]
 
-Writes NAME.csv and NAME.png beside this script; all of them take about a quarter of an hour on one core.
+Writes NAME.csv and NAME.png beside this script; all of them take about 25 minutes on one core.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
-CASES = ("bagnold", "passive", "runout", "silo", "slope", "stopping", "waves")
+CASES = ("bagnold", "mckyes", "passive", "runout", "silo", "slope", "stopping", "waves")
 
 
 def main() -> None:

@@ -7,8 +7,9 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +22,7 @@ from omegaconf import OmegaConf
 from mpm_warp import Decision, Effects, Scene
 from sgns.errors import UserError
 from sgns.scene_effects import decided
+from sgns.settings import flattened
 from sgns.wholefile import write_whole
 
 __all__ = ["SPLITS", "Campaign", "Dataset", "plan"]
@@ -165,8 +167,12 @@ class Dataset:
     split: dict[str, list[str]]
 
     @classmethod
-    def open(cls, folder: str | os.PathLike[str]) -> Dataset:
+    def open(cls, folder: str | os.PathLike[str], where: Mapping[str, Any] | None = None) -> Dataset:
         """The dataset in a folder.
+
+        Args:
+            folder: its folder.
+            where: only runs of scenes with these values: dotted key of the scene → value, or list of allowed values.
 
         Raises:
             UserError: there is none, or it is not complete.
@@ -181,6 +187,8 @@ class Dataset:
         split = content.get("split") if isinstance(content, dict) else None
         if not isinstance(split, dict) or not all(isinstance(split.get(s), list) for s in SPLITS):
             raise UserError(f"{file} has no split into {', '.join(SPLITS)}; it was not made by sgns simulate")
+        if where:
+            split = _chosen(split, content.get("scenes") or {}, where, file)
         dataset = cls(name=str(content.get("name", path.name)), path=path, split=split)
         missing = [run for s in SPLITS for run in dataset.runs(s) if not run.exists()]
         if missing:
@@ -195,6 +203,32 @@ class Dataset:
         if split not in SPLITS:
             raise UserError(f"split is {split!r}; allowed: {', '.join(SPLITS)}")
         return [self.path / "runs" / f"{name}.h5" for name in self.split[split]]
+
+
+def _chosen(
+    split: dict[str, list[str]], scenes: Mapping[str, Any], where: Mapping[str, Any], file: Path
+) -> dict[str, list[str]]:
+    """The part of a split whose scenes have the values asked for."""
+    known = {name: flattened(scenes.get(name, {})) for names in split.values() for name in names}
+    for key, value in flattened(dict(where)).items():
+        allowed = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+        if lacking := [name for name, scene in known.items() if key not in scene]:
+            raise UserError(
+                f"dataset.where names {key}, which the scene of {lacking[0]} in {file} does not have"
+            )
+        there = {name: scene[key] for name, scene in known.items()}
+        known = {name: scene for name, scene in known.items() if any(_same(there[name], a) for a in allowed)}
+        if not known:
+            values = ", ".join(map(str, sorted(set(there.values()), key=str)))
+            raise UserError(f"dataset.where leaves no run: {key} is {allowed}; in {file} it is {values}")
+    return {part: [name for name in names if name in known] for part, names in split.items()}
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two values of a scene are equal, numbers to six digits."""
+    if isinstance(a, (int, float)) and isinstance(b, (int, float)):
+        return math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-12)
+    return bool(a == b)
 
 
 def _read(file: Path) -> Any:

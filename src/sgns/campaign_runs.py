@@ -19,7 +19,8 @@ from typing import Any
 from tqdm import tqdm
 
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
-from mpm_warp.streams import in_turns
+from mpm_warp.batch import all_together
+from mpm_warp.work import Work
 from sgns.campaign import Campaign
 from sgns.claim import claimed
 from sgns.cost import RunCost, duration_words, finishing_time, require_space, run_cost, size_words
@@ -115,7 +116,7 @@ def _compile(campaign: Campaign, names: list[str], device: str) -> None:
         }
         kinds.setdefault((frozenset(chosen.items()), campaign.physics[name][0]), scene)
     for (_, physics), scene in kinds.items():
-        Solver(scene, physics, device, campaign.precision)
+        next(Solver(scene, physics, device, campaign.precision).frames())
 
 
 class _Production:
@@ -294,7 +295,7 @@ def _make_share(
     `_make` says of each."""
     tasks = (_make(*job, seed, device, precision) for _, *job in jobs)
     outcomes = {}
-    for number, outcome in in_turns(tasks, batch, device):
+    for number, outcome in all_together(tasks, batch, device):
         name, index, *_ = jobs[number]
         outcomes[name] = outcome
         _ended[index] = True
@@ -310,9 +311,9 @@ def _make(
     seed: int,
     device: str,
     precision: str,
-) -> Generator[tuple[str, str] | None, None, None]:
-    """Make one run unless another process does, pausing where others may have their turn; gives made, elsewhere or
-    failed, and what went wrong in words."""
+) -> Generator[tuple[str, str] | Work, None, None]:
+    """Make one run unless another process does, passing on the work for the device; gives made, elsewhere or failed,
+    and what went wrong in words."""
 
     def count_frame() -> None:
         _frames_done[index] += 1
@@ -323,7 +324,7 @@ def _make(
             if not ours or _done(output, Scene.from_dict(scene)):
                 outcome = "elsewhere", ""
             else:
-                for timing in scene_stages(
+                for stage in scene_stages(
                     Scene.from_dict(scene),
                     output,
                     effects=effects,
@@ -333,8 +334,8 @@ def _make(
                     precision=precision,
                     progress=count_frame,
                 ):
-                    if timing is None:
-                        yield
+                    if isinstance(stage, Work):
+                        yield stage
     except (UserError, SceneError, SolverStopped) as error:
         outcome = "failed", str(error)
     yield outcome

@@ -250,7 +250,7 @@ def main(cfg: DictConfig) -> float:
     from sgns.simulator import Simulator
 
     scene = scene_from_config(cfg)
-    simulator = Simulator.load(cfg.checkpoint, device=cfg.device)
+    simulator = Simulator.load(cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes)
     require_same_freedom(simulator, scene, cfg.checkpoint)
     require_known_bed(simulator, scene, cfg.checkpoint)
     ignored = unlearned(simulator.scene, scene.to_dict(), simulator.context_keys)

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from mpm_warp import Effects, Scene, Solver
+from mpm_warp.batch import all_together
+from mpm_warp.work import Work
 from sgns.runs import RunWriter
 
 __all__ = ["Timing", "scene_stages", "simulate_scene"]
@@ -19,7 +21,7 @@ class Timing:
     """What a run cost; compilation and set-up are not in it, recording the frames is."""
 
     wall_time: float
-    """[s]; of scenes that take turns, each has its own turns, which add up to the time that passed."""
+    """[s]; of scenes that are computed side by side, each has its share; the shares add up to the time that passed."""
     simulated: float
     """[s]"""
     particle_steps: int
@@ -37,7 +39,7 @@ class Timing:
 
 def simulate_scene(scene: Scene, output: Path, **settings: Any) -> Timing:
     """Compute a scene and write its run file; arguments as in `scene_stages`."""
-    *_, timing = scene_stages(scene, output, **settings)
+    ((_, timing),) = all_together([scene_stages(scene, output, **settings)], 1, settings.get("device", "cpu"))
     return timing
 
 
@@ -51,7 +53,7 @@ def scene_stages(
     device: str = "cpu",
     precision: str = "float32",
     progress: Any = None,
-) -> Generator[Timing | None, None, None]:
+) -> Generator[Timing | Work, None, None]:
     """Compute a scene and write its run file, with the particles that `scene.bed.store_every` leaves in it.
 
     Args:
@@ -59,7 +61,7 @@ def scene_stages(
         progress: called once after every frame.
 
     Yields:
-        None wherever other scenes may have their turn (mpm_warp's streams.py), and at the end what it cost.
+        All work that the device has to do (mpm_warp's work.py), and at the end what it cost.
     """
     solver = Solver(scene, effects, device, precision)
     stored = scene.stored
@@ -81,27 +83,29 @@ def scene_stages(
             "particles_simulated": solver.particle_count,
         },
     ) as writer:
-        wall_time, start = 0.0, None
-        for frame in solver.stages():
-            # The clock starts with the first step: loading kernels is not part of the cost of a run.
-            start = start if start is not None else time.perf_counter()
-            if frame is None:
-                wall_time += time.perf_counter() - start
-                yield
-                start = time.perf_counter()
+        wall_time, seen, shared_by = 0.0, None, 1
+        for stage in solver.stages():
+            if isinstance(stage, Work):
+                yield stage
+                shared_by = stage.shared_by
+                if seen is not None:
+                    now = time.perf_counter()
+                    wall_time, seen = wall_time + (now - seen) / shared_by, now
                 continue
+            # The clock starts with the first frame: loading kernels is not part of the cost of a run.
+            seen = seen if seen is not None else time.perf_counter()
             writer.append(
-                frame.time,
-                frame.position[stored],
-                frame.velocity[stored],
-                frame.body_points,
-                frame.body_pose,
-                frame.force,
-                frame.torque,
+                stage.time,
+                stage.position[stored],
+                stage.velocity[stored],
+                stage.body_points,
+                stage.body_pose,
+                stage.force,
+                stage.torque,
             )
             if progress is not None:
                 progress()
-        wall_time += time.perf_counter() - start
+        wall_time += (time.perf_counter() - seen) / shared_by
         writer.finish(wall_time)
     frames = scene.frame_count - 1
     yield Timing(

@@ -50,6 +50,10 @@ def main(cfg: DictConfig) -> float | None:
         raise UserError(f"solver.batch is {batch!r}; it must be a whole number, 1 or more")
     if cfg.get("dataset") is not None:  # `dataset: null` in a defaults list leaves no key
         settings = OmegaConf.to_container(cfg.dataset, resolve=True)
+        if settings.get("where"):
+            raise UserError(
+                "dataset.where picks among runs that are there; to simulate fewer change dataset.draw"
+            )
         campaign = plan(settings, _base_scene(settings), asked, cfg.solver.precision, cfg.seed)
         simulate_campaign(
             campaign,

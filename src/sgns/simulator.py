@@ -97,9 +97,10 @@ class Simulator:
     Args:
         surrogate: Network, basis and start.
         device: "cpu" or "cuda".
+        num_modes: Of the soil, the first of those it was trained with; None: all.
     """
 
-    def __init__(self, surrogate: Surrogate, device: str = "cpu") -> None:
+    def __init__(self, surrogate: Surrogate, device: str = "cpu", num_modes: int | None = None) -> None:
         try:
             self.device = torch.device(device)
             self._surrogate = surrogate.to(self.device).eval()
@@ -107,21 +108,22 @@ class Simulator:
             raise UserError(
                 f"device={device} cannot be used: {str(error).splitlines()[0]}; use device=cpu"
             ) from error
-        self._dynamics = surrogate.dynamics
-        self.basis = surrogate.basis
+        self._dynamics, self.basis = surrogate.dynamics, surrogate.basis
+        if num_modes is not None:
+            self._dynamics, self.basis = self._dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
         self.start_positions = surrogate.start_positions.cpu().numpy()
         self.body_points = surrogate.body_points.cpu().numpy()
-        self._start_latent = surrogate.start_latent
+        self._start_latent = self.basis.transform(surrogate.start_positions.cpu())
         self.reset()
 
     @classmethod
-    def load(cls, path: str | Path, device: str = "cpu") -> Simulator:
-        """From a checkpoint written by `sgns train`.
+    def load(cls, path: str | Path, device: str = "cpu", num_modes: int | None = None) -> Simulator:
+        """From a checkpoint written by `sgns train`; arguments as of the class.
 
         Raises:
             UserError: The file is missing, truncated or not such a checkpoint.
         """
-        return cls(load_surrogate(path), device)
+        return cls(load_surrogate(path), device, num_modes)
 
     @property
     def frame_rate(self) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -13,15 +13,19 @@ from mpm_warp import (
     Bed,
     Effects,
     Frame,
+    Incline,
     Material,
     Scene,
     SceneError,
     Solver,
     SolverStopped,
+    Walls,
     Wheel,
     frames_together,
 )
-from mpm_warp.streams import in_turns, on_host
+from mpm_warp.batch import all_together
+from mpm_warp.launches import Launch, Together
+from mpm_warp.work import Program, Work
 
 needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
 
@@ -34,12 +38,20 @@ class Thrown(Scene):
 
 
 def different_scenes():
-    """Scenes of different motion, gravity, material, kind, time step and number of frames."""
+    """Scenes of different motion, gravity, material, grid, kind, time step and number of frames."""
     return [
         cut(duration=0.15),
         cut(duration=0.12, rake=30.0, gravity=1.62, material=Material(youngs_modulus=2.0e6)),
+        cut(duration=0.12, bed=Bed(size=(0.5, 0.3, 0.1), spacing=0.025, headroom=0.12)),
         Wheel(bed=cut().bed, duration=0.08, settle=0.02),
+        Wheel(bed=cut().bed, duration=0.1, settle=0.02, load=60.0),
     ]
+
+
+def assert_same(one, two):
+    """Two frames are equal bit by bit."""
+    for a, b in zip(astuple(one), astuple(two), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def by_scene(frames):
@@ -57,9 +69,64 @@ def test_scenes_together_are_the_scenes_alone(at_once):
     for scene, frames in zip(scenes, together, strict=True):
         assert len(frames) == scene.frame_count
         for one, two in zip(frames, Solver(scene).frames(), strict=True):
-            for a, b in zip(astuple(one), astuple(two), strict=True):
-                np.testing.assert_array_equal(a, b)
+            assert_same(one, two)
         assert np.linalg.norm(frames[-1].force) > 0.1
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        Effects(symmetry=True),
+        Effects(fluidity=True, nonlocality=True),
+        Effects(symmetry=True, nonlocality=True, torque=False),
+    ],
+)
+def test_every_effect_knows_its_own_scene(effects):
+    """Beds with 15 and 16 rows across have particles on the plane of symmetry and none."""
+    material = Material(grain_diameter=5e-3)
+    scenes = [
+        cut(duration=0.05, material=material, bed=Bed(size=(0.5, width, 0.16), spacing=0.025, headroom=0.12))
+        for width in (0.375, 0.4)
+    ]
+    scenes.append(replace(scenes[0], depth=0.04, rake=20.0))
+    for scene, frames in zip(scenes, by_scene(frames_together(scenes, effects)), strict=True):
+        assert_same(frames[-1], list(Solver(scene, effects).frames())[-1])
+
+
+def test_periodic_bins_keep_their_own_length():
+    scenes = [
+        Incline(
+            bed=Bed(size=(length, 0.06, 0.05), spacing=0.01, walls=Walls(x="periodic", y="periodic")),
+            tilt=40.0,
+            flowing=True,
+            duration=0.05,
+        )
+        for length in (0.06, 0.1)
+    ]
+    for scene, frames in zip(scenes, by_scene(frames_together(scenes)), strict=True):
+        assert_same(frames[-1], list(Solver(scene).frames())[-1])
+
+
+def test_scenes_of_the_same_kernels_share_every_launch(monkeypatch):
+    """As many launches as the scene with the most steps makes alone, whatever the others are."""
+    counts = {"alone": 0, "together": 0}
+
+    def counted(kind, launch):
+        def launches(self, step=0):
+            counts[kind] += 1
+            launch(self, step)
+
+        return launches
+
+    monkeypatch.setattr(Launch, "launch", counted("alone", Launch.launch))
+    monkeypatch.setattr(Together, "launch", counted("together", Together.launch))
+    scenes = [cut(duration=0.05, speed=speed, depth=0.03) for speed in (0.1, 0.15, 0.2)]
+    for _ in Solver(scenes[-1]).frames():
+        pass
+    alone = counts.pop("alone")
+    counts["alone"] = 0
+    by_scene(frames_together(scenes))
+    assert counts == {"alone": 0, "together": alone}
 
 
 def test_scenes_may_have_effects_of_their_own():
@@ -87,18 +154,21 @@ def test_scenes_that_fail_leave_the_others():
     assert len(whole) == sound.frame_count
 
 
-def test_turns_go_round_and_the_next_begins_when_one_ends():
+def test_tasks_go_side_by_side_and_the_next_begins_when_one_ends():
     log = []
 
     def task(name, turns):
         log.append(f"{name} begins")
         for turn in range(turns):
-            yield turn or None
+            yield Work(Program([]), 0)
+            yield name, turn
         log.append(f"{name} ends")
 
-    given = list(in_turns((task(name, turns) for name, turns in [("a", 3), ("b", 2), ("c", 3)]), 2, "cpu"))
-    assert given == [(0, 1), (1, 1), (0, 2), (2, 1), (2, 2)]
-    assert log == ["a begins", "b begins", "b ends", "a ends", "c begins", "c ends"]
+    given = list(
+        all_together((task(name, turns) for name, turns in [("a", 2), ("b", 1), ("c", 2)]), 2, "cpu")
+    )
+    assert given == [(0, ("a", 0)), (1, ("b", 0)), (0, ("a", 1)), (2, ("c", 0)), (2, ("c", 1))]
+    assert log == ["a begins", "b begins", "b ends", "c begins", "a ends", "c ends"]
 
 
 def test_when_one_breaks_the_others_are_closed():
@@ -107,22 +177,22 @@ def test_when_one_breaks_the_others_are_closed():
     def waits(name):
         try:
             while True:
-                yield name
+                yield Work(Program([]), 0)
         finally:
             closed.append(name)
 
     def breaks():
-        yield
+        yield Work(Program([]), 0)
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        list(in_turns([waits("a"), breaks(), waits("b")], 3, "cpu"))
+        list(all_together([waits("a"), breaks(), waits("b")], 3, "cpu"))
     assert sorted(closed) == ["a", "b"]
 
 
 def test_unknown_device():
     with pytest.raises(SceneError, match="device is 'tpu'; allowed here: cpu"):
-        list(in_turns([], 2, "tpu"))
+        list(all_together([], 2, "tpu"))
 
 
 @needs_cuda
@@ -134,26 +204,3 @@ def test_many_scenes_on_cuda_agree_with_the_cpu():
         one, two = frames[-1], list(Solver(scene).frames())[-1]
         np.testing.assert_allclose(one.force, two.force, atol=0.01 * np.linalg.norm(two.force))
         assert np.abs(one.position - two.position).max() < 1e-4
-
-
-@wp.kernel
-def busy(end: wp.array(dtype=float)):
-    number = end[0]
-    for _ in range(30_000_000):
-        number = wp.sin(number + 1.0)
-    end[0] = number
-
-
-@needs_cuda
-def test_reading_does_not_wait_for_other_streams():
-    end, number = (wp.full(1, 3.0, dtype=float, device="cuda") for _ in range(2))
-    wp.load_module(busy.module, device="cuda")
-    one, two = wp.Stream("cuda"), wp.Stream("cuda")
-    wp.synchronize_device("cuda")
-    with wp.ScopedStream(one, sync_enter=False):
-        wp.launch(busy, 1, [end], device="cuda")
-    with wp.ScopedStream(two, sync_enter=False):
-        assert on_host(number)[0] == 3.0
-    assert not one.is_complete
-    wp.synchronize_stream(one)
-    assert end.numpy()[0] != 3.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from beds import cut
-from test_nonlocal_fluidity import compiled_source, launches
+from test_nonlocal_solver import compiled_source, launches
 
 from mpm_warp import (
     Bed,
@@ -190,7 +190,7 @@ SHEARED = cut(duration=0.05)
 
 
 def source(effects: Effects, kernel: str, scene: Scene = SHEARED) -> str:
-    found = next(k for k in launches(Solver(scene, effects)) if k.kernel.func.__name__ == kernel)
+    found = next(k for k in launches(Solver(scene, effects)) if k.kernel.name == kernel)
     return compiled_source(found)
 
 
@@ -218,21 +218,21 @@ def test_no_instruction_of_what_is_off(on, off, kernel, function):
 def test_no_instruction_of_a_free_height_in_a_prescribed_body():
     driven, pushed = (source(Effects(), "scatter", scene) for scene in (WHEEL, SHEARED))
     assert pushed.count("axle") < driven.count("axle")
-    names = [k.kernel.func.__name__ for k in launches(Solver(SHEARED))]
+    names = [k.kernel.name for k in launches(Solver(SHEARED))]
     assert len(names) + 1 == len(launches(Solver(WHEEL)))
 
 
 def test_no_array_of_what_is_off():
     """Sizes of what the solver allocates for each effect, on and off. Fluidity and nonlocality:
-    test_nonlocal_fluidity.py."""
+    test_nonlocal_solver.py."""
     plain, halved, driven = Solver(SHEARED), Solver(SHEARED, Effects(symmetry=True)), Solver(WHEEL)
     silent = Solver(SHEARED, Effects(torque=False))
     assert (len(plain._body.data.impulse), len(silent._body.data.impulse)) == (2, 1)
     assert plain._body._axle is None and len(driven._body._axle) == 3
     assert (len(halved._x), len(plain._x)) == (1920, 3840)
-    names = {k.kernel.func.__name__ for k in launches(plain)}
+    names = {k.kernel.name for k in launches(plain)}
     assert not names & {"fold", "unfold", "wrap", "project", "sweep", "place"}
-    assert {"fold", "unfold"} <= {k.kernel.func.__name__ for k in launches(halved)}
+    assert {"fold", "unfold"} <= {k.kernel.name for k in launches(halved)}
     column = Solver(COLUMN, effects_for(COLUMN)[0])
     assert column._body is None
 

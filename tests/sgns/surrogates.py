@@ -110,4 +110,4 @@ def made_scores(name: str, total: float, frozen: float, force: float = 1.0, rate
     mse = dict.fromkeys(("reduction", "network", "surface", "surface_frozen"), 1e-6)
     mse |= {"total": total, "frozen": frozen, "constant_velocity": 2.0 * frozen}
     mpe = {"draft": 100 * abs(force - 1), "lateral": math.nan, "vertical": 100 * abs(force - 1)}
-    return Scores(name, 4, mse, errors, errors, errors, errors, rate, mpe)
+    return Scores(name, 4, mse, errors, errors, errors, errors, rate, mpe, mpe)

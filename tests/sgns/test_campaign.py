@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pytest
+import yaml
+from omegaconf import OmegaConf
 
 from mpm_warp import Scene
 from sgns.campaign import SPLITS, Dataset, plan
@@ -114,3 +116,25 @@ def test_a_foreign_dataset_file_is_refused(tmp_path, text):
 def test_no_dataset(tmp_path):
     with pytest.raises(UserError, match="sgns simulate dataset=quick"):
         Dataset.open(tmp_path / "nothing")
+
+
+def test_where_picks_runs_by_their_scene(tmp_path) -> None:
+    (tmp_path / "runs").mkdir()
+    scenes = {n: {"load": 100.0 / n, "material": {"friction": n}} for n in (1, 2, 3, 4)}
+    content = {
+        "name": "some",
+        "split": {"train": ["1", "2"], "validation": ["3"], "test": ["4"]},
+        "scenes": {str(n): scene for n, scene in scenes.items()},
+    }
+    (tmp_path / "dataset.yaml").write_text(yaml.safe_dump(content))
+    for n in scenes:
+        (tmp_path / "runs" / f"{n}.h5").touch()
+    names = lambda where: [p.stem for s in SPLITS for p in Dataset.open(tmp_path, where).runs(s)]  # noqa: E731
+    assert names(None) == names({}) == ["1", "2", "3", "4"]
+    assert names({"load": 33.3333333333}) == ["3"]
+    assert names({"load": [100, 25], "material.friction": [1, 2]}) == ["1"]
+    assert names(OmegaConf.create({"material": {"friction": [2, 4]}})) == ["2", "4"]
+    with pytest.raises(UserError, match=r"dataset\.where names depth, which the scene of \d in"):
+        names({"depth": 1})
+    with pytest.raises(UserError, match=r"leaves no run: load is \[7\]; .* it is 100\.0, 25\.0, 33"):
+        names({"load": 7})

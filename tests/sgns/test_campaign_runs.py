@@ -38,7 +38,7 @@ from mpm_warp.start import start_warp
 start_warp()
 print("ready", flush=True)
 input()
-kernel = grid_step(wp.float32, ("no_slip",) * 3).step
+kernel = grid_step(wp.float32, ("no_slip",) * 3).step.alone
 wp.load_module(kernel.module, device="cpu")
 print("done")
 """
@@ -141,7 +141,12 @@ def test_a_disk_that_is_too_full_is_refused_before_anything_is_made(tmp_path, or
 
 def test_kernels_are_compiled_once_for_each_kind_of_scene(tmp_path, monkeypatch):
     compiled = []
-    monkeypatch.setattr(campaign_runs, "Solver", lambda scene, *_: compiled.append(scene))
+
+    def solver(scene, *_):
+        compiled.append(scene)
+        return SimpleNamespace(frames=lambda: iter(["the first"]))
+
+    monkeypatch.setattr(campaign_runs, "Solver", solver)
     numbers = campaign(tmp_path, draw={"rake": [5.0, 10.0], "depth": [0.02, 0.04, 0.05]}, runs=None)
     campaign_runs._compile(numbers, list(numbers.scenes), "cpu")
     assert len(compiled) == 1

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -11,8 +13,15 @@ import pytest
 from mpm_warp import Wheel
 from sgns.errors import UserError
 from sgns.published import excavation_case, read_published, wheel_case
+from sgns.published_dataset import fingerprint, published_dataset
 
 BIN = (0.8, 0.6, 0.15)
+
+
+def sgns(folder, *arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "sgns", *arguments], cwd=folder, capture_output=True, text=True, check=False
+    )
 
 
 def varint(n):
@@ -111,3 +120,87 @@ def test_what_is_not_published_data_is_refused(tmp_path, damage):
         (tmp_path / "valid.tfrecord").write_bytes((tmp_path / "valid.tfrecord").read_bytes()[:-9])
     with pytest.raises(UserError):
         read_published(tmp_path, BIN)
+
+
+def blade(case, frames=8, points=15):
+    """A record of a blade that moves on, with two modes, and its case."""
+    rng = np.random.default_rng(case)
+    rows, columns = points // 5, 5
+    grid = np.stack(
+        np.meshgrid(np.linspace(0, 0.2, rows), np.linspace(-0.2, 0.2, columns), indexing="ij"), -1
+    )
+    plate = np.concatenate([np.full((points, 1), 0.8), grid.reshape(-1, 2)], axis=1) + np.array(
+        [0.0, 0.3, 0.4]
+    )
+    still = rng.normal(size=(2, 3))
+    moved = [np.concatenate([plate - [0.01 * t, 0, 0], still + 0.1 * t]) for t in range(frames)]
+    force = rng.normal(size=(frames, 3)) + np.array([50.0, 30.0, 0.0])
+    return record([moved[0], *moved], [3] * points + [6, 6], np.concatenate([force[:1], force]))
+
+
+def test_a_folder_becomes_a_dataset(tmp_path):
+    cases = [186, 99, 22, 78]
+    write(tmp_path, [blade(case, points=15 if case in (99, 78) else 20) for case in cases], cases)
+    settings = {"path": str(tmp_path), "folds": None, "fold": 0}
+    whole = published_dataset(settings, 2)
+    assert [run.name for run in whole.runs("train")] == [f"excavation_{case:03d}" for case in cases]
+    assert whole.runs("test") == [] and whole.runs("validation") == []
+    assert whole.basis.arrangement_hash == "published-excavation"
+    folded = published_dataset(settings | {"folds": 2, "fold": 1}, 2)
+    assert [run.name for run in folded.runs("test")] == ["excavation_099", "excavation_078"]
+    assert [name.split()[1] for name in folded.basis.fitted_on] == [
+        fingerprint(r) for r in folded.runs("train")
+    ]
+    for run in whole.runs("train"):
+        # Whatever the number of points, the pose is the middle of the lowest row, which moves along x.
+        np.testing.assert_allclose(run.pose[0, :3], [0.1, 0.3, 0.05], atol=1e-6)
+        np.testing.assert_allclose(run.pose[:, 0], 0.1 + 0.01 * np.arange(8), atol=1e-6)
+        np.testing.assert_allclose(run.latent[1] - run.latent[0], [[-0.1, 0.1, 0.1]] * 2, atol=1e-6)
+    for wrong in ({"folds": 5}, {"folds": 2, "fold": 2}, {"folds": 2.5}):
+        with pytest.raises(UserError, match=r"dataset\.fold"):
+            published_dataset(settings | wrong, 2)
+    with pytest.raises(UserError, match="holds 2 modes"):
+        published_dataset(settings, 3)
+
+
+def test_files_of_the_authors_split_are_kept_apart(tmp_path):
+    for split, cases in (("train", [1, 2, 2]), ("valid", [3]), ("test", [4])):
+        data = b"".join(
+            struct.pack("<Q", len(r)) + b"crc!" + r + b"crc!"
+            for r in (blade(case, points=15) for case in cases)
+        )
+        (tmp_path / f"{split}.tfrecord").write_bytes(data)
+    split = {"train": [1, 2, 2], "valid": [3], "test": [4]}
+    (tmp_path / "metadata.json").write_text(json.dumps({"dataset_split": split}))
+    found = published_dataset({"path": str(tmp_path)}, 2)
+    # Drawn twice with replacement, used once.
+    assert [run.name for run in found.runs("train")] == ["excavation_001", "excavation_002"]
+    assert [run.name for run in found.runs("validation")] == ["excavation_003"]
+    assert [run.name for run in found.runs("test")] == ["excavation_004"]
+    with pytest.raises(UserError, match=r"dataset\.folds=null"):
+        published_dataset({"path": str(tmp_path), "folds": 2}, 2)
+
+
+def test_training_and_judging_from_the_command_line(tmp_path):
+    train, other = tmp_path / "train", tmp_path / "other"
+    for folder, cases in ((train, [5, 6, 7]), (other, [7, 8, 9])):
+        folder.mkdir()
+        write(folder, [blade(case) for case in cases], cases)
+    small = [
+        "model.hidden_width=8",
+        "training.max_steps=4",
+        "training.validate_every=4",
+        "reduction.num_modes=2",
+    ]
+    done = sgns(tmp_path, "train", "dataset=published", f"dataset.path={train}", "output=t", *small)
+    assert done.returncode == 0, done.stderr
+    judge = ["evaluate", "dataset=published", "checkpoint=t/best.ckpt", "output=e"]
+    done = sgns(tmp_path, *judge, f"dataset.path={other}")
+    assert done.returncode == 0, done.stderr
+    # Run 7 was trained on: it is left out of the table.
+    assert "excavation_008" in done.stdout and "excavation_009" in done.stdout
+    assert "excavation_007" not in done.stdout and (tmp_path / "e" / "metrics.csv").exists()
+    done = sgns(tmp_path, *judge, f"dataset.path={train}")
+    assert done.returncode == 0 and "was trained on all of these runs" in done.stdout + done.stderr
+    done = sgns(tmp_path, *judge, f"dataset.path={tmp_path}")
+    assert done.returncode == 2 and "it needs metadata.json" in done.stderr

@@ -11,6 +11,7 @@ import pytest
 from test_campaign import campaign
 
 from mpm_warp import Effects, SolverStopped
+from mpm_warp.batch import all_together
 from sgns.errors import UserError
 from sgns.runs import Run, check_run
 from sgns.scene_run import scene_stages, simulate_scene
@@ -99,16 +100,16 @@ def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("*"))
 
 
-def test_a_run_counts_the_time_of_its_own_turns(tmp_path):
-    scene = next(iter(campaign(tmp_path).scenes.values()))
-    slept = 0.0
-    for timing in scene_stages(scene, tmp_path / "run.h5", effects=Effects()):
-        if timing is None:
-            time.sleep(0.05)
-            slept += 0.05
-    assert 0.0 < timing.wall_time < 0.5 * slept
-    with Run(tmp_path / "run.h5") as run:
-        assert run.wall_time_s == timing.wall_time
+def test_scenes_side_by_side_share_the_time_that_passes(tmp_path):
+    scenes, begin = list(campaign(tmp_path).scenes.values())[:2], time.perf_counter()
+    stages = [scene_stages(scene, tmp_path / f"{n}.h5", effects=Effects()) for n, scene in enumerate(scenes)]
+    timings = dict(all_together(stages, 2, "cpu"))
+    passed = time.perf_counter() - begin
+    assert 0.0 < sum(timing.wall_time for timing in timings.values()) < passed
+    for number, timing in timings.items():
+        assert timing.wall_time < 0.7 * passed
+        with Run(tmp_path / f"{number}.h5") as run:
+            assert run.wall_time_s == timing.wall_time
 
 
 def test_output_that_is_a_folder(tmp_path):

@@ -179,3 +179,16 @@ def test_bad_checkpoints_are_named(trained, tmp_path) -> None:
     torch.save(content, tmp_path / "incomplete.ckpt")
     with pytest.raises(UserError, match="fit together"):
         Simulator.load(tmp_path / "incomplete.ckpt")
+
+
+def test_fewer_modes_than_it_was_trained_with(trained) -> None:
+    data, folder = trained
+    run = data.runs("test")[0]
+    simulator = Simulator.load(folder / "pose" / "best.ckpt", num_modes=2)
+    rollout = simulator.rollout(run.pose, latent_history=run.latent[:3, :2])
+    assert rollout.latent.shape == (14, 2, 3) and np.isfinite(rollout.latent).all()
+    assert simulator.basis.num_modes == simulator.num_modes == 2
+    simulator.reset(history=(run.latent[:3, :2], run.pose[:3]))
+    np.testing.assert_array_equal(simulator.step(run.pose[3]).latent, rollout.latent[3])
+    with pytest.raises(UserError, match="trained with 4 modes and cannot have 5; allowed: 1 to 4"):
+        Simulator.load(folder / "pose" / "best.ckpt", num_modes=5)

@@ -20,14 +20,18 @@ import torch
 from tqdm import tqdm
 
 from sgns.errors import UserError
-from sgns.evaluation.metrics import mean_prediction, position_errors
+from sgns.evaluation.bodies import is_wheel
+from sgns.evaluation.costs import forget_peak, network_costs, peak_memory
+from sgns.evaluation.metrics import body_errors, mean_prediction, position_errors
+from sgns.evaluation.overlap import overlap_warning, seen_before
 from sgns.evaluation.provenance import provenance
 from sgns.evaluation.report import write_report
-from sgns.evaluation.report_words import describe, short_names
+from sgns.evaluation.report_words import describe, forward_name, short_names
 from sgns.evaluation.results import EvaluatedRun, Evaluation, NetworkTiming
 from sgns.evaluation.scores import aggregate, run_scores
 from sgns.evaluation.surface import surface_grid
 from sgns.evaluation.tables import write_tables
+from sgns.evaluation.training_curves import read_log
 from sgns.poses import in_body_frame
 from sgns.reduction import Basis
 from sgns.reduction.reconstruction import reduction_curves
@@ -58,15 +62,24 @@ def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTimin
     with Run(path) as run, single_thread():
         simulated = (run.frame_count - simulator.history) / run.frame_rate
         for repeat in range(repeats + 1):
+            forget_peak()
             rollout = roll_out(simulator, run)
+            stepping_bytes = peak_memory()
+            forget_peak()
             began = time.perf_counter()
             for latent in torch.as_tensor(rollout.latent):
                 simulator.basis.inverse(latent)
             if repeat:
                 stepping.append(float(rollout.wall_time_s) / simulated)
                 decoding.append(stepping[-1] + (time.perf_counter() - began) / simulated)
+            decoding_bytes = peak_memory()
         return NetworkTiming(
-            statistics.median(stepping), statistics.median(decoding), len(stepping), path.stem
+            statistics.median(stepping),
+            statistics.median(decoding),
+            len(stepping),
+            path.stem,
+            stepping_bytes,
+            decoding_bytes,
         )
 
 
@@ -142,6 +155,7 @@ def evaluate(
     for path in (*paths, *new_rollouts):  # all of them before anything is written
         with Run(path) as run:
             require_known_run(simulator, run, checkpoint)
+    costs = network_costs(checkpoint, simulator.card)
     try:
         (output / "rollouts").mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -171,18 +185,26 @@ def evaluate(
             )
             prediction = stack.enter_context(Run(target))
             errors = position_errors(truth, prediction, simulator.basis, history, grid)
-            words = describe(truth.scene)
-            scores = run_scores(path.stem, errors, truth, prediction, history, mean_force, mean_torque)
-        runs.append(EvaluatedRun(path.stem, label, words, path, target, errors, scores))
+            words, wheel = describe(truth.scene), is_wheel(truth.scene)
+            body = body_errors(truth, prediction, history)
+            scores = run_scores(path.stem, errors, truth, prediction, history, mean_force, mean_torque, body)
+        runs.append(EvaluatedRun(path.stem, label, words, path, target, errors, scores, wheel))
 
+    trained_on, chosen_by = seen_before(simulator, [run.name for run in runs])
     evaluation = Evaluation(
         dataset=str(dataset.name),
         split=split,
         runs=runs,
         total=aggregate([run.scores for run in runs]),
         timing=time_network(simulator, paths[0], repeats),
+        costs=costs,
         mean_force=mean_force,
+        mean_torque=mean_torque,
+        training_log=read_log(checkpoint.parent / "tensorboard"),
+        trained_on=trained_on,
+        chosen_by=chosen_by,
         curves=reduction_curves(full_basis(dataset, simulator.basis), paths),
+        basis=simulator.basis,
         num_modes=int(simulator.num_modes),
         history=history,
         particle_count=len(start),
@@ -197,6 +219,8 @@ def evaluate(
 def log_summary(evaluation: Evaluation, report: Path) -> None:
     """The main numbers on the terminal."""
     total, timing = evaluation.total, evaluation.timing
+    if warning := overlap_warning(evaluation):
+        log.warning("%s", warning)
     log.info("%d %s runs of %s", len(evaluation.runs), evaluation.split, evaluation.dataset)
     log.info(
         "position: RMSE %.3g mm (reduction alone %.3g, frozen %.3g); skill %.3f against frozen, %.3f "
@@ -208,9 +232,10 @@ def log_summary(evaluation: Evaluation, report: Path) -> None:
         total.skill("constant_velocity"),
     )
     log.info(
-        "force: NRMSE %.3f (mean force of the training split: %.3f); draft MAE %.3g N, vertical MAE %.3g N",
+        "force: NRMSE %.3f (mean force of the training split: %.3f); %s MAE %.3g N, vertical MAE %.3g N",
         total.force.overall_nrmse,
         total.mean_force.overall_nrmse,
+        forward_name(evaluation),
         total.force.mae[0],
         total.force.mae[2],
     )
@@ -235,10 +260,10 @@ def main(cfg: DictConfig) -> float:
     if cfg.dataset.get("format") == "published":
         from sgns.evaluation.published_scores import evaluate_published
 
-        simulator = Simulator.load(checkpoint, device=cfg.device)
+        simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
         return evaluate_published(simulator, cfg.dataset, cfg.split, Path(cfg.output), checkpoint)
-    dataset = Dataset.open(cfg.dataset.path)
-    simulator = Simulator.load(checkpoint, device=cfg.device)
+    dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
+    simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
     output = Path(cfg.output)
     evaluation = evaluate(
         simulator,

@@ -10,7 +10,6 @@ import functools
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
 import matplotlib
@@ -20,18 +19,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
-from sgns.evaluation.metrics import PositionErrors
 from sgns.evaluation.surface import SurfaceGrid, height_map
 
-__all__ = [
-    "ForceHistory",
-    "energy_figure",
-    "error_figure",
-    "force_figure",
-    "png",
-    "profile_figure",
-    "reconstruction_figure",
-]
+__all__ = ["energy_figure", "png", "profile_figure", "reconstruction_figure"]
 
 TRUTH = "#1a1a1a"
 NETWORK = "#0072b2"  # blue and vermilion of Okabe and Ito's palette: told apart by every eye
@@ -39,6 +29,9 @@ ACCENT = "#d55e00"
 BASELINE = "#8c8c8c"
 
 DPI = 130
+# All of a report's pictures are this wide [inches]: on a phone one fills the screen and its words can still be
+# read, on a desk and on paper several stand side by side.
+PICTURE_WIDTH = 4.8
 STYLE: dict[str, Any] = {
     "font.size": 10.0,
     "axes.spines.top": False,
@@ -49,25 +42,6 @@ STYLE: dict[str, Any] = {
     "legend.fontsize": 9.0,
     "lines.linewidth": 1.6,
 }
-
-
-@dataclass(frozen=True)
-class ForceHistory:
-    """Force on the body through a run.
-
-    Attributes:
-        name: of the run.
-        time: [s], shape (T,).
-        network: predicted force [N], shape (T, 3).
-        truth: simulated force [N], shape (T, 3); None for a path that was never simulated.
-        start: time of the first predicted frame [s].
-    """
-
-    name: str
-    time: np.ndarray
-    network: np.ndarray
-    truth: np.ndarray | None = None
-    start: float = 0.0
 
 
 P = ParamSpec("P")
@@ -100,78 +74,7 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-# --- histories --------------------------------------------------------------------------------------------
-
-
-@styled
-def force_figure(histories: Sequence[ForceHistory], mean_force: np.ndarray | None = None) -> Figure:
-    """Draft and vertical force through time, one row of panels per run.
-
-    Args:
-        histories: the runs to show.
-        mean_force: mean force of the training split [N], shape (3,), the baseline.
-    """
-    figure = new_figure(9.0, 2.1 * len(histories) + 0.8)
-    axes = figure.subplots(len(histories), 2, squeeze=False, sharex=len(histories) > 1)
-    for row, history in enumerate(histories):
-        for axis, component, sign, label in (
-            (axes[row, 0], 0, -1.0, "draft −Fx [N]"),
-            (axes[row, 1], 2, 1.0, "vertical force Fz [N]"),
-        ):
-            if mean_force is not None:
-                axis.axhline(
-                    sign * mean_force[component], color=BASELINE, linestyle="--", label="training mean"
-                )
-            if history.truth is not None:
-                axis.plot(
-                    history.time, sign * history.truth[:, component], color=TRUTH, label="simulated (MPM)"
-                )
-            shown = history.time >= history.start
-            axis.plot(
-                history.time[shown], sign * history.network[shown, component], color=NETWORK, label="network"
-            )
-            axis.set_ylabel(label)
-            axis.grid(alpha=0.25, linewidth=0.6)
-        axes[row, 0].set_title(history.name)
-    for axis in axes[-1]:
-        axis.set_xlabel("time [s]")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=len(handles))
-    return figure
-
-
-@styled
-def error_figure(errors: Mapping[str, PositionErrors]) -> Figure:
-    """Position RMSE through time of the network and of the two baselines, one panel per run."""
-    columns = min(3, len(errors))
-    rows = math.ceil(len(errors) / columns)
-    figure = new_figure(max(5.5, 3.2 * columns), 2.4 * rows + 0.8)
-    axes = figure.subplots(rows, columns, squeeze=False)
-    for axis in axes.ravel()[len(errors) :]:
-        axis.set_visible(False)
-    curves = (
-        ("constant_velocity", "constant velocity", BASELINE, ":"),
-        ("frozen", "frozen", BASELINE, "--"),
-        ("reduction", "PCA alone", ACCENT, "-"),
-        ("total", "network", NETWORK, "-"),
-    )
-    for axis, (name, error) in zip(axes.ravel(), errors.items(), strict=False):
-        millimetres = {key: 1e3 * np.sqrt(getattr(error, key)) for key, *_ in curves}
-        for key, label, colour, style in curves:
-            axis.plot(error.time, millimetres[key], color=colour, linestyle=style, label=label)
-        # A baseline that runs away must not flatten the curves that matter.
-        finite = [float(np.max(v[np.isfinite(v)], initial=0.0)) for v in millimetres.values()]
-        top = max(finite[1:])
-        axis.set_ylim(0.0, 1.15 * top if top > 0.0 else 1.0)
-        axis.set_title(name)
-        axis.grid(alpha=0.25, linewidth=0.6)
-    for row in axes:
-        row[0].set_ylabel("position RMSE [mm]")
-    for axis in axes.ravel()[: len(errors)][-columns:]:
-        axis.set_xlabel("time [s]")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles[::-1], labels[::-1], loc="outside upper center", ncols=2 if columns == 1 else 4)
-    return figure
+# --- surface -------------------------------------------------------------------------------------------
 
 
 @styled
@@ -183,7 +86,7 @@ def profile_figure(runs: Mapping[str, Any], frames: Sequence[int], grid: Surface
         frames: one panel each.
         grid: columns of the height map; the two rows of columns next to mid-width are averaged.
     """
-    figure = new_figure(9.0, 1.9 * len(frames) + 0.7)
+    figure = new_figure(PICTURE_WIDTH, 1.45 * len(frames) + 0.8)
     axes = figure.subplots(len(frames), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
     count = grid.shape[1]
     middle = slice((count - 1) // 2, count // 2 + 1)
@@ -197,11 +100,11 @@ def profile_figure(runs: Mapping[str, Any], frames: Sequence[int], grid: Surface
             axis.plot(grid.x_centres, heights, color=colour, label=name, marker=".", markersize=4)
             axis.set_title(f"t = {run.time[frame]:.2f} s")
         axis.plot(grid.x_centres, rest, color=BASELINE, linestyle="--", label="before")
-        axis.set_ylabel("highest particle [mm]")
         axis.grid(alpha=0.25, linewidth=0.6)
     axes[-1].set_xlabel("x [m]")
+    figure.supylabel("highest particle [mm]", fontsize=10)
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=len(handles))
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(handles), fontsize=8.5)
     return figure
 
 
@@ -227,7 +130,7 @@ def energy_figure(energy: np.ndarray, displacement_energy: np.ndarray, num_modes
         displacement_energy: share of the variance about each particle's mean place, shape (R,).
         num_modes: modes that the network uses.
     """
-    figure = new_figure(5.5, 3.4)
+    figure = new_figure(PICTURE_WIDTH, 3.4)
     axis = figure.subplots()
     r = np.arange(1, len(energy) + 1)
     for values, label, colour, width in (  # the wide one stays visible where both agree
@@ -259,7 +162,7 @@ def reconstruction_figure(
         network_rmse_mm: the network's own error, drawn as a line for comparison.
         label: name of the evaluated runs.
     """
-    figure = new_figure(5.5, 3.4)
+    figure = new_figure(PICTURE_WIDTH, 3.4)
     axis = figure.subplots()
     last = len(test) - 1
     shown = sorted({min(2**k, last) for k in range(int(math.log2(max(last, 1))) + 2)})

@@ -15,14 +15,19 @@ import numpy as np
 import torch
 
 from sgns.errors import UserError
+from sgns.evaluation.bodies import is_wheel
 from sgns.evaluation.surface import SurfaceGrid, height_map
 from sgns.runs import frame_chunks
 
 __all__ = [
     "FORCE_COMPONENTS",
+    "PRESCRIBED",
     "TORQUE_COMPONENTS",
+    "BodyErrors",
+    "ParticleErrors",
     "PositionErrors",
     "VectorErrors",
+    "body_errors",
     "mean_prediction",
     "position_errors",
     "skill",
@@ -38,6 +43,19 @@ NEGLIGIBLE_SHARE = 0.05
 
 
 @dataclass(frozen=True)
+class ParticleErrors:
+    """Mean-square position errors of one run's particles, over axes and the frames after the history.
+
+    Attributes:
+        reduction: PCA⁻¹PCA(truth) − truth [m²], shape (n,).
+        network: prediction − PCA⁻¹PCA(truth) [m²], shape (n,).
+    """
+
+    reduction: np.ndarray
+    network: np.ndarray
+
+
+@dataclass(frozen=True)
 class PositionErrors:
     """Mean-square position errors of one run at every frame after the history.
 
@@ -50,6 +68,7 @@ class PositionErrors:
         constant_velocity: last step of the history, continued − truth [m²], shape (t,).
         surface: height map of the prediction − of the truth [m²], shape (t,).
         surface_frozen: height map of the last frame of the history − of the truth [m²], shape (t,).
+        particles: the same run, by particle instead of by frame; None if only frames were asked for.
     """
 
     time: np.ndarray
@@ -60,6 +79,7 @@ class PositionErrors:
     constant_velocity: np.ndarray
     surface: np.ndarray
     surface_frozen: np.ndarray
+    particles: ParticleErrors | None = None
 
     def mse(self, name: str) -> float:
         """Mean over frames of one of the errors [m²]."""
@@ -72,6 +92,23 @@ class PositionErrors:
     def skill(self, baseline: str = "frozen") -> float:
         """1 − total MSE / MSE of a baseline (`frozen` or `constant_velocity`)."""
         return skill([self.mse("total")], [self.mse(baseline)])
+
+
+@dataclass(frozen=True)
+class BodyErrors:
+    """How far a predicted body is from its true place, over the frames after the history.
+
+    Attributes:
+        mse: mean-square distance of the centres of mass [m²].
+        sinkage_mae: mean absolute error of a wheel's sinkage [m]; NaN for other bodies.
+    """
+
+    mse: float
+    sinkage_mae: float
+
+
+PRESCRIBED = BodyErrors(0.0, math.nan)
+"""Of a body whose path was given."""
 
 
 @dataclass(frozen=True)
@@ -218,15 +255,19 @@ def position_errors(
     before = np.asarray(truth.positions(slice(max(history - 2, 0), max(history - 1, 1))), dtype=np.float64)[0]
     step = last - before
     last_heights = height_map(last, grid)
-    names = [f.name for f in fields(PositionErrors) if f.name != "time"]
+    names = [f.name for f in fields(PositionErrors) if f.name not in ("time", "particles")]
     collected: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    by_particle = {name: np.zeros(truth.particle_count) for name in ("reduction", "network")}
     for frames in frame_chunks(truth.particle_count, truth.frame_count, history):
         true = np.asarray(truth.positions(frames), dtype=np.float64)
         predicted = np.asarray(prediction.positions(frames), dtype=np.float64)
         latent = basis.transform(torch.from_numpy(true))
         difference = basis.transform(torch.from_numpy(predicted)) - latent
         elapsed = np.arange(frames.start, frames.stop) - (history - 1)
-        collected["reduction"].append(mean_square(basis.inverse(latent).numpy() - true))
+        projected = basis.inverse(latent).numpy()
+        collected["reduction"].append(mean_square(projected - true))
+        by_particle["reduction"] += np.einsum("tna,tna->n", projected - true, projected - true)
+        by_particle["network"] += np.einsum("tna,tna->n", predicted - projected, predicted - projected)
         collected["network"].append(
             difference.square().sum(dim=(-2, -1)).numpy() / (3 * truth.particle_count)
         )
@@ -240,7 +281,24 @@ def position_errors(
         )
         collected["surface_frozen"].append(np.array([height_error(last_heights, b) for b in heights]))
     values = {name: np.concatenate(parts) for name, parts in collected.items()}
-    return PositionErrors(time=np.asarray(truth.time)[history:], **values)
+    entries = 3 * (truth.frame_count - history)
+    particles = ParticleErrors(**{name: total / entries for name, total in by_particle.items()})
+    return PositionErrors(time=np.asarray(truth.time)[history:], **values, particles=particles)
+
+
+def body_errors(truth: Any, prediction: Any, history: int) -> BodyErrors:
+    """Errors of the body's place in a predicted run.
+
+    Args:
+        truth: the simulated `Run`.
+        prediction: the predicted `Run` of the same scene.
+        history: frames at the start that count in no metric.
+    """
+    misplaced = prediction.pose[history:, :3] - truth.pose[history:, :3]
+    return BodyErrors(
+        mse=float(np.mean((misplaced**2).sum(axis=1))),
+        sinkage_mae=float(np.mean(np.abs(misplaced[:, 2]))) if is_wheel(truth.scene) else math.nan,
+    )
 
 
 def mean_square(difference: np.ndarray) -> np.ndarray:

@@ -12,14 +12,16 @@ if TYPE_CHECKING:
     from sgns.evaluation.results import Evaluation
 
 __all__ = [
+    "cost_note",
     "describe",
+    "example_note",
     "fixed",
     "force_note",
+    "forward_name",
     "number",
     "short_names",
     "soil_note",
     "summary",
-    "time_note",
     "titled",
 ]
 
@@ -48,12 +50,18 @@ def fixed(value: float, decimals: int = 2, sign: bool = False) -> str:
 
 
 def describe(scene: Mapping[str, Any]) -> str:
-    """A blade's scene in a few words; empty for other scenes."""
-    keys = ("depth", "speed", "rake", "motion")
-    if not all(key in scene for key in keys):
-        return ""
-    depth, speed, rake, motion = (scene[key] for key in keys)
-    return f"{100 * depth:.3g} cm deep, {100 * speed:.3g} cm/s, rake {rake:.3g}°, {motion} motion"
+    """What the paper lists of a blade's or a wheel's scene, in a few words; empty for other scenes."""
+    if all(key in scene for key in ("depth", "speed", "rake", "motion")):
+        depth, speed, rake, motion = (scene[key] for key in ("depth", "speed", "rake", "motion"))
+        return f"{100 * depth:.3g} cm deep, {100 * speed:.3g} cm/s, rake {rake:.3g}°, {motion} motion"
+    if all(key in scene for key in ("diameter", "load", "slip")):
+        words = (
+            f"{100 * scene['diameter']:.3g} cm wheel, {scene['load']:.3g} N, slip {100 * scene['slip']:.3g} %"
+        )
+        angle, gravity = scene.get("friction_angle"), scene.get("gravity")
+        words += "" if angle is None else f", friction angle {angle:.3g}°"
+        return words + ("" if gravity is None else f", gravity {gravity:.3g} m/s²")
+    return ""
 
 
 def titled(name: str, scene: Mapping[str, Any]) -> str:
@@ -66,6 +74,11 @@ def short_names(names: Sequence[str]) -> list[str]:
     """The part of every name before its first underscore, if that still tells the names apart."""
     short = [name.partition("_")[0] or name for name in names]
     return short if len(set(short)) == len(set(names)) else list(names)
+
+
+def forward_name(evaluation: Evaluation) -> str:
+    """What the forward force is called: wheels pull, other bodies draw."""
+    return "drawbar pull" if all(run.wheel for run in evaluation.runs) else "draft"
 
 
 def soil_words(total: Scores) -> str:
@@ -115,6 +128,14 @@ def force_words(total: Scores) -> str:
     )
 
 
+def body_words(total: Scores) -> str:
+    """How far a predicted body is from its true place."""
+    sentence = f"The tool itself, which it moves, is {number(1e3 * math.sqrt(total.body_mse))} mm (RMS) from its place"
+    if math.isnan(total.sinkage_mae):
+        return sentence + "."
+    return f"{sentence}; the sinkage is off by {number(1e3 * total.sinkage_mae)} mm on average."
+
+
 def time_words(evaluation: Evaluation) -> str:
     """How fast the network is beside the solver."""
     own, solver = evaluation.timing.stepping, evaluation.total.solver_rate
@@ -126,20 +147,31 @@ def time_words(evaluation: Evaluation) -> str:
     return f"{sentence}, {compared} than the solver's {number(solver, 2)} s."
 
 
+def seen_words(evaluation: Evaluation) -> str:
+    """Whether the evaluated runs were new to the network."""
+    count, trained_on, chosen_by = (
+        len(names) for names in (evaluation.runs, evaluation.trained_on, evaluation.chosen_by)
+    )
+    if trained_on == count:
+        return "on which it was trained, so this is no test"
+    if chosen_by == count:
+        return "that it was not trained on, but that chose its checkpoint"
+    return "that are not all new to it" if trained_on + chosen_by else "that it never saw"
+
+
 def summary(evaluation: Evaluation) -> str:
     """The result in one paragraph of plain words."""
-    count = len(evaluation.runs)
-    seen = {
-        "train": "on which it was trained, so this is no test",
-        "validation": "that it was not trained on, but that chose its checkpoint",
-        "test": "that it never saw",
-    }.get(evaluation.split, "of this split")
+    count, free = len(evaluation.runs), evaluation.total.body_mse > 0.0
+    given = "what is prescribed of the tool's motion" if free else "the tool's path"
+    sentences = [soil_words(evaluation.total), force_words(evaluation.total)]
+    if free:
+        sentences.append(body_words(evaluation.total))
     return (
         "A graph network learned the soil's motion and the force on the tool from material point "
         f"simulations, in a subspace of {evaluation.num_modes} modes instead of "
-        f"{evaluation.particle_count} particles. It was given the tool's path and the first "
-        f"{evaluation.history} frames of {count} run{'s' if count != 1 else ''} {seen}, and predicted the "
-        f"rest. {soil_words(evaluation.total)} {force_words(evaluation.total)} {time_words(evaluation)}"
+        f"{evaluation.particle_count} particles. It was given {given} and the first "
+        f"{evaluation.history} frames of {count} run{'s' if count != 1 else ''} {seen_words(evaluation)}, and "
+        f"predicted the rest. {' '.join(sentences)} {time_words(evaluation)}"
     )
 
 
@@ -158,25 +190,43 @@ def soil_note(evaluation: Evaluation) -> str:
     )
 
 
-def force_note(evaluation: Evaluation) -> str:
-    """Under the table of force errors."""
-    x, y, z = (fixed(float(value), 1) for value in evaluation.mean_force)
-    draft, vertical = (fixed(evaluation.total.absolute_mpe[name], 1) for name in ("draft", "vertical"))
+def example_note() -> str:
+    """Under the table of test examples."""
     return (
-        "Force by the soil on the tool, mean over a frame; draft is −Fx, vertical Fz. MAE: mean absolute "
-        "error. NRMSE: RMS error / RMS of the truth, of the whole vector where no component is named. "
-        "MPE: difference of the means in percent, signed, so that errors cancel; the mean of |MPE| over "
-        f"runs, where they do not, is {draft} % for the draft and {vertical} % for the vertical force. – "
-        "stands where the truth is negligible beside the whole force, as it is for a component that "
-        f"symmetry makes zero. Mean force: always answering the mean of the training runs, ({x}, {y}, {z}) "
-        "N. Torque is about the tool's centre of mass."
+        "The paper's columns are the position MSE (network: PCA⁻¹ of the prediction against PCA⁻¹ of the reduced "
+        "truth, so without what the subspace leaves out) and the force MPE, the difference of the means in "
+        "percent of the true one: signed, so that errors along a run cancel. Beside them what it takes to judge "
+        "these: the total error, bed and force of the plainest guesses, and the NRMSE, in which nothing cancels. "
+        "Last row: mean of the MSE over runs, mean of the sizes |MPE|, NRMSE of all frames. – stands where the "
+        "true mean is negligible beside the whole force, as it is for a component that symmetry makes zero."
     )
 
 
-def time_note(evaluation: Evaluation) -> str:
-    """Under the table of times."""
+def force_note(evaluation: Evaluation) -> str:
+    """Under the table of force errors."""
+    x, y, z = (fixed(float(value), 1) for value in evaluation.mean_force)
     return (
-        f"Network: median of {evaluation.timing.repeats} warm repeats on one thread along run "
-        f"{evaluation.timing.run}; nothing is written to disk. Solver: what its run files say, on the "
-        "machine that made them."
+        "Force by the soil on the tool, mean over a frame; draft is −Fx, drawbar pull Fx, vertical Fz, lateral "
+        "Fy. MAE: mean absolute error. NRMSE: RMS error / RMS of the truth, of the whole vector where no "
+        "component is named. – stands where the truth is negligible beside the whole force. Mean force: always "
+        f"answering the mean of the training runs, ({x}, {y}, {z}) N. Torque is about the tool's centre of mass."
+    )
+
+
+def cost_note(evaluation: Evaluation) -> str:
+    """Under the table of time and memory."""
+    costs, timing = evaluation.costs, evaluation.timing
+    samples = f" of {costs.batch_size} samples" if costs.batch_size > 0 else ""
+    training = (
+        f"Training: {costs.training_steps} steps{samples}, their validation "
+        "included, as training.json beside the checkpoint says. "
+        if costs.training_steps > 0.0
+        else "Training: there is no training.json beside the checkpoint. "
+    )
+    return (
+        f"Network: median of {timing.repeats} warm repeats on one thread along run {timing.run}; nothing is "
+        "written to disk; the peak memory is that of the whole process, Python and its libraries included. "
+        f"{training}Solver: what its run files say, on the machine that made them; they hold position and velocity "
+        "of every particle and no memory figure. The same network on all particles, the paper's reference, is "
+        "not measured here: see experiments/full_space in the repository."
     )

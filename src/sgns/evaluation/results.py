@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,9 +11,10 @@ import numpy as np
 
 from sgns.evaluation.metrics import PositionErrors
 from sgns.evaluation.scores import Scores
+from sgns.reduction import Basis
 from sgns.reduction.reconstruction import ReductionCurves
 
-__all__ = ["EvaluatedRun", "Evaluation", "NetworkTiming"]
+__all__ = ["Costs", "EvaluatedRun", "Evaluation", "NetworkTiming"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,7 @@ class EvaluatedRun:
         rollout: path of the predicted run.
         errors: position errors through time.
         scores: every metric.
+        wheel: whether its body is a wheel.
     """
 
     name: str
@@ -36,6 +39,7 @@ class EvaluatedRun:
     rollout: Path
     errors: PositionErrors
     scores: Scores
+    wheel: bool = False
 
 
 @dataclass(frozen=True)
@@ -47,12 +51,40 @@ class NetworkTiming:
         decoding: the same, and every frame decoded to all particles.
         repeats: number of timed repeats.
         run: run that was timed.
+        stepping_bytes: peak memory of the whole process while it steps; NaN if not known.
+        decoding_bytes: the same while it decodes.
     """
 
     stepping: float
     decoding: float
     repeats: int
     run: str
+    stepping_bytes: float = math.nan
+    decoding_bytes: float = math.nan
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What the network takes besides time; NaN is not known.
+
+    Attributes:
+        parameters: weights that were learned.
+        checkpoint_bytes: size of the file, with the basis and what is needed to go on training.
+        training_steps: of the whole training.
+        training_seconds: wall time of the whole training, validation included.
+        batch_size: samples of a training step.
+    """
+
+    parameters: int | float = math.nan
+    checkpoint_bytes: float = math.nan
+    training_steps: int | float = math.nan
+    training_seconds: float = math.nan
+    batch_size: int | float = math.nan
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Wall time of a training step [s]."""
+        return self.training_seconds / self.training_steps
 
 
 @dataclass(frozen=True)
@@ -67,10 +99,16 @@ class Evaluation:
         timing: of the network.
         mean_force: mean force of the training split [N], shape (3,).
         curves: of the reduction; held out are the evaluated runs.
+        basis: of the network.
         num_modes: modes r that the network uses.
         history: frames d that it was given.
         particle_count: particles n of the bed.
         start: common start of the particles [m], shape (n, 3).
+        costs: of the network.
+        mean_torque: mean torque of the training split [N m], shape (3,).
+        training_log: losses and validation scores by step, as `training_curves.read_log` gives them.
+        trained_on: names of the evaluated runs that the basis and the network were fitted on.
+        chosen_by: names of those that chose the checkpoint.
         new_rollouts: run files without truth that are shown too.
         made: how it was made: name → value, in the order to show.
     """
@@ -82,9 +120,15 @@ class Evaluation:
     timing: NetworkTiming
     mean_force: np.ndarray
     curves: ReductionCurves
+    basis: Basis
     num_modes: int
     history: int
     particle_count: int
     start: np.ndarray
+    costs: Costs = field(default_factory=Costs)
+    mean_torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    training_log: Mapping[str, np.ndarray] = field(default_factory=dict)
+    trained_on: Sequence[str] = ()
+    chosen_by: Sequence[str] = ()
     new_rollouts: Sequence[Path] = ()
     made: dict[str, str] = field(default_factory=dict)

@@ -9,7 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from sgns.evaluation.metrics import FORCE_COMPONENTS, TORQUE_COMPONENTS, PositionErrors, VectorErrors, skill
+from sgns.evaluation.metrics import (
+    FORCE_COMPONENTS,
+    PRESCRIBED,
+    TORQUE_COMPONENTS,
+    BodyErrors,
+    PositionErrors,
+    VectorErrors,
+    skill,
+)
 
 __all__ = ["Scores", "aggregate", "run_scores"]
 
@@ -31,6 +39,9 @@ class Scores:
         mean_torque: errors of the mean torque of the training split [N m].
         solver_rate: wall seconds per simulated second of the solver; NaN if not recorded.
         absolute_mpe: mean over runs of |MPE| [%] by component of the force.
+        mean_force_absolute_mpe: the same of the mean force of the training split [%].
+        body_mse: mean-square distance of the body from its true place [m²]; 0 where its path was given.
+        sinkage_mae: mean absolute error of a wheel's sinkage [m]; NaN for other bodies.
     """
 
     name: str
@@ -42,6 +53,9 @@ class Scores:
     mean_torque: VectorErrors
     solver_rate: float
     absolute_mpe: Mapping[str, float]
+    mean_force_absolute_mpe: Mapping[str, float]
+    body_mse: float = 0.0
+    sinkage_mae: float = math.nan
 
     def rmse_mm(self, name: str) -> float:
         """Root of a mean-square error [mm]."""
@@ -66,6 +80,7 @@ class Scores:
         row |= {f"{name}_abs_mpe_percent": value for name, value in self.absolute_mpe.items()}
         for prefix, errors in (("", self.torque), ("mean_torque_", self.mean_torque)):
             row |= columns(errors, TORQUE_COMPONENTS, prefix, "torque", "Nm")
+        row |= {"body_rmse_mm": 1e3 * math.sqrt(self.body_mse), "sinkage_mae_mm": 1e3 * self.sinkage_mae}
         row["solver_wall_s_per_s"] = self.solver_rate
         return row
 
@@ -91,6 +106,7 @@ def run_scores(
     history: int,
     mean_force: np.ndarray,
     mean_torque: np.ndarray,
+    body: BodyErrors = PRESCRIBED,
 ) -> Scores:
     """Scores of one run.
 
@@ -102,8 +118,10 @@ def run_scores(
         history: frames at the start that count in no metric.
         mean_force: mean force of the training split [N], shape (3,).
         mean_torque: mean torque of the training split [N m], shape (3,).
+        body: how far the body is from its true place; by default its path was given.
     """
     force = VectorErrors.compare(truth.force[history:], prediction.force[history:])
+    mean = VectorErrors.compare(truth.force[history:], mean_force)
     simulated = float(truth.time[-1] - truth.time[0])
     wall = truth.wall_time_s
     return Scores(
@@ -112,18 +130,26 @@ def run_scores(
         mse={key: positions.mse(key) for key in POSITION_ERRORS + SURFACE_ERRORS},
         force=force,
         torque=VectorErrors.compare(truth.torque[history:], prediction.torque[history:]),
-        mean_force=VectorErrors.compare(truth.force[history:], mean_force),
+        mean_force=mean,
         mean_torque=VectorErrors.compare(truth.torque[history:], mean_torque),
         solver_rate=float(wall) / simulated if wall else math.nan,
-        absolute_mpe={key: abs(float(force.mpe[axis])) for key, axis in FORCE_COMPONENTS.items()},
+        absolute_mpe=absolute_mpe(force),
+        mean_force_absolute_mpe=absolute_mpe(mean),
+        body_mse=body.mse,
+        sinkage_mae=body.sinkage_mae,
     )
+
+
+def absolute_mpe(force: VectorErrors) -> dict[str, float]:
+    """|MPE| [%] by component of the force."""
+    return {key: abs(float(force.mpe[axis])) for key, axis in FORCE_COMPONENTS.items()}
 
 
 def aggregate(runs: Sequence[Scores], name: str = "all runs") -> Scores:
     """Scores of several runs together.
 
     Position errors are means over runs, so that skill is 1 − Σ MSE / Σ MSE of the baseline; forces are pooled
-    over all frames; |MPE| and the solver's time are means over the runs that have them.
+    over all frames; |MPE|, sinkage and the solver's time are means over the runs that have them.
     """
     first = runs[0]
 
@@ -139,10 +165,16 @@ def aggregate(runs: Sequence[Scores], name: str = "all runs") -> Scores:
         mean_force=pooled("mean_force"),
         mean_torque=pooled("mean_torque"),
         solver_rate=mean_of_known([run.solver_rate for run in runs]),
-        absolute_mpe={
-            key: mean_of_known([run.absolute_mpe[key] for run in runs]) for key in first.absolute_mpe
-        },
+        absolute_mpe=means_of_known([run.absolute_mpe for run in runs]),
+        mean_force_absolute_mpe=means_of_known([run.mean_force_absolute_mpe for run in runs]),
+        body_mse=float(np.mean([run.body_mse for run in runs])),
+        sinkage_mae=mean_of_known([run.sinkage_mae for run in runs]),
     )
+
+
+def means_of_known(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """`mean_of_known` for every key of the first."""
+    return {key: mean_of_known([run[key] for run in runs]) for key in runs[0]}
 
 
 def mean_of_known(values: Sequence[float]) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,21 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
+from matplotlib.ticker import MaxNLocator
 
-from sgns.evaluation.figures import NETWORK, TRUTH, new_figure, styled
+from sgns.evaluation.bodies import body_corners, is_wheel
+from sgns.evaluation.figures import NETWORK, PICTURE_WIDTH, TRUTH, new_figure, styled
 from sgns.evaluation.surface import particle_spacing
-from sgns.poses import in_world_frame
 
-__all__ = ["body_outline", "middle_slice", "side_views", "view_times"]
+__all__ = [
+    "Scales",
+    "body_outline",
+    "common_scales",
+    "middle_slice",
+    "side_view",
+    "side_views",
+    "view_times",
+]
 
 STEEL = "#4d5a66"
 
@@ -34,20 +44,13 @@ SHORTEST_ARROW = 0.02
 def body_outline(run: Any, frame: int) -> np.ndarray:
     """Outline of the body seen from the side [m], shape (k, 2) in x and z.
 
-    The box of the scene's blade, the circle of its wheel, else the hull of the body's points.
+    The circle of the scene's wheel, else the hull of the body's corners.
     """
-    if "diameter" in run.scene:
+    if is_wheel(run.scene):
         angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
         radius = 0.5 * float(run.scene["diameter"])
         return run.pose[frame, [0, 2]] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    blade = run.scene.get("blade")
-    if isinstance(blade, Mapping):
-        half = 0.5 * np.array([blade["thickness"], blade["width"], blade["length"]], dtype=np.float64)
-        signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-        points = in_world_frame(run.pose[[frame]], signs * half)[0]
-    else:
-        points = np.asarray(run.body_points[frame])
-    return hull(points[:, [0, 2]])
+    return hull(body_corners(run, frame)[:, [0, 2]])
 
 
 def hull(points: np.ndarray) -> np.ndarray:
@@ -86,6 +89,68 @@ def view_times(run: Any, history: int, count: int = 3) -> list[int]:
     return [round(first + (last - first) * 0.9 * (k + 1) / count) for k in range(count)]
 
 
+@dataclass(frozen=True)
+class Scales:
+    """What makes several side views comparable.
+
+    Attributes:
+        chosen: which particles lie near mid-width, shape (n,).
+        speed: range of the colours [m/s].
+        arrow: length of a force arrow [m/N].
+        x_limits: of the picture [m].
+        z_limits: of the picture [m].
+        spacing: between particles [m].
+    """
+
+    chosen: np.ndarray
+    speed: Normalize
+    arrow: float
+    x_limits: tuple[float, float]
+    z_limits: tuple[float, float]
+    spacing: float
+
+    @property
+    def aspect(self) -> float:
+        """Height of a view over its width."""
+        return (self.z_limits[1] - self.z_limits[0]) / (self.x_limits[1] - self.x_limits[0])
+
+    def disc(self, width: float) -> float:
+        """Diameter [points] of a particle's disc in a view so many inches wide: the room that it has."""
+        return max(1.4, 0.98 * self.spacing * 72.0 * width / (self.x_limits[1] - self.x_limits[0]))
+
+
+def common_scales(runs: Sequence[Any], frames: Sequence[int], start: np.ndarray) -> Scales:
+    """Scales for all views of some runs at some frames; the first run sets the colours.
+
+    Args:
+        runs: `Run`s.
+        frames: frames that will be drawn.
+        start: common start of the particles [m], shape (n, 3).
+    """
+    chosen, spacing = middle_slice(start), particle_spacing(start)
+    fastest = max(float(np.percentile(slice_speed(runs[0], frame, chosen), 99.5)) for frame in frames)
+    low, high = start.min(axis=0), start.max(axis=0)
+    x_limits = (low[0] - 1.5 * spacing, high[0] + 1.5 * spacing)
+    reach = max(float(np.max(slice_positions(run, f, chosen)[:, 2])) for run in runs for f in frames)
+    tool = max(float(np.max(body_outline(run, f)[:, 1])) for run in runs for f in frames)
+    # A tall tool is cut off: the soil is the subject.
+    top = max(min(tool + spacing, high[2] + 0.22), reach + 2.0 * spacing)
+    strongest = max(float(np.max(np.linalg.norm(run.force[list(frames)][:, [0, 2]], axis=1))) for run in runs)
+    arrow = ARROW_SHARE * (x_limits[1] - x_limits[0]) / strongest if strongest > 0.0 else 0.0
+    speed = Normalize(0.0, nice(fastest) if fastest > 0.0 else 1.0)
+    return Scales(chosen, speed, arrow, x_limits, (low[2] - 1.5 * spacing, top), spacing)
+
+
+def slice_positions(run: Any, frame: int, chosen: np.ndarray) -> np.ndarray:
+    """Positions [m] of the chosen particles, shape (k, 3)."""
+    return run.positions(slice(frame, frame + 1))[0][chosen]
+
+
+def slice_speed(run: Any, frame: int, chosen: np.ndarray) -> np.ndarray:
+    """Speeds [m/s] of the chosen particles, shape (k,)."""
+    return np.linalg.norm(run.velocities(slice(frame, frame + 1))[0][chosen], axis=1)
+
+
 @styled
 def side_views(runs: Mapping[str, Any], frames: Sequence[int], start: np.ndarray) -> Figure:
     """Soil near mid-width coloured by speed, body and force, at some frames (rows) of runs (columns).
@@ -95,61 +160,64 @@ def side_views(runs: Mapping[str, Any], frames: Sequence[int], start: np.ndarray
         frames: frames to draw.
         start: common start of the particles [m], shape (n, 3): which of them are near mid-width.
     """
-    chosen = middle_slice(start)
-    positions = {(t, f): run.positions(slice(f, f + 1))[0][chosen] for t, run in runs.items() for f in frames}
-    speeds = {
-        (t, f): np.linalg.norm(run.velocities(slice(f, f + 1))[0][chosen], axis=1)
-        for t, run in runs.items()
-        for f in frames
-    }
-    first_title = next(iter(runs))
-    top = max(float(np.percentile(speeds[first_title, f], 99.5)) for f in frames)
-    speed_scale = Normalize(0.0, nice(top) if top > 0.0 else 1.0)
-    outlines = {(t, f): body_outline(run, f) for t, run in runs.items() for f in frames}
+    panel, width = (5.4, 4.95) if len(runs) > 1 else (7.2, 6.15)  # [inches], with and without labels
+    scales = common_scales(list(runs.values()), frames, start)
+    figure = new_figure(len(runs) * panel, len(frames) * (width * scales.aspect + 0.38) + 1.0, "compressed")
+    axes = figure.subplots(len(frames), len(runs), squeeze=False, sharex=True, sharey=True)
+    for row, frame in zip(axes, frames, strict=True):
+        for axis, (title, run) in zip(row, runs.items(), strict=True):
+            draw_view(axis, title, run, frame, scales, width)
+    finish(figure, axes, scales)
+    return figure
 
-    low, high = start.min(axis=0), start.max(axis=0)
-    spacing = particle_spacing(start)
-    x_limits = (low[0] - 1.5 * spacing, high[0] + 1.5 * spacing)
-    reach = float(max(np.max(p[:, 2]) for p in positions.values()))
-    tool = float(max(np.max(outline[:, 1]) for outline in outlines.values()))
-    # A tall tool is cut off: the soil is the subject.
-    z_limits = (low[2] - 1.5 * spacing, max(min(tool + spacing, high[2] + 0.22), reach + 2 * spacing))
-    strongest = max(
-        float(np.max(np.linalg.norm(run.force[list(frames)][:, [0, 2]], axis=1))) for run in runs.values()
-    )
-    arrow = ARROW_SHARE * (x_limits[1] - x_limits[0]) / strongest if strongest > 0.0 else 0.0
 
-    columns, rows = len(runs), len(frames)
-    panel, axes_width = (5.4, 4.95) if columns > 1 else (7.2, 6.15)  # [inches]
-    aspect = (z_limits[1] - z_limits[0]) / (x_limits[1] - x_limits[0])
-    # Discs about as wide as the room that each particle has.
-    size = max(1.4, 0.98 * spacing * 72.0 * axes_width / (x_limits[1] - x_limits[0]))
-    figure = new_figure(columns * panel, rows * (axes_width * aspect + 0.38) + 1.0, "compressed")
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    for column, (title, run) in enumerate(runs.items()):
-        for row, frame in enumerate(frames):
-            axis = axes[row, column]
-            draw_soil(axis, positions[title, frame], speeds[title, frame], speed_scale, size)
-            draw_body(axis, outlines[title, frame])
-            draw_force(axis, run, frame, arrow)
-            axis.set_xlim(*x_limits)
-            axis.set_ylim(*z_limits)
-            axis.set_aspect("equal")
-            axis.set_title(f"{title}, t = {run.time[frame]:.2f} s")
-            if column == 0:
-                axis.set_ylabel("z [m]")
-            if row == rows - 1:
-                axis.set_xlabel("x [m]")
+@styled
+def side_view(runs: Mapping[str, Any], frame: int, scales: Scales) -> Figure:
+    """The same at one frame, the runs above each other in one narrow picture.
+
+    Args:
+        runs: title → `Run`.
+        frame: frame to draw.
+        scales: of this and other pictures.
+    """
+    width = PICTURE_WIDTH - 0.75
+    figure = new_figure(PICTURE_WIDTH, len(runs) * (width * scales.aspect + 0.38) + 1.0, "compressed")
+    axes = figure.subplots(len(runs), 1, squeeze=False, sharex=True, sharey=True)
+    for axis, (title, run) in zip(axes[:, 0], runs.items(), strict=True):
+        draw_view(axis, title, run, frame, scales, width)
+    finish(figure, axes, scales)
+    return figure
+
+
+def draw_view(axis: Axes, title: str, run: Any, frame: int, scales: Scales, width: float) -> None:
+    """One run at one frame in a view so many inches wide."""
+    positions = slice_positions(run, frame, scales.chosen)
+    speed = slice_speed(run, frame, scales.chosen)
+    draw_soil(axis, positions, speed, scales.speed, scales.disc(width))
+    draw_body(axis, body_outline(run, frame))
+    draw_force(axis, run, frame, scales.arrow)
+    axis.set_xlim(*scales.x_limits)
+    axis.set_ylim(*scales.z_limits)
+    axis.set_aspect("equal")
+    axis.set_title(f"{title}, t = {run.time[frame]:.2f} s")
+
+
+def finish(figure: Figure, axes: np.ndarray, scales: Scales) -> None:
+    """Names of the outer axes and the colour bar."""
+    for axis in axes[:, 0]:
+        axis.set_ylabel("z [m]")
+    for axis in axes[-1]:
+        axis.set_xlabel("x [m]")
     bar = figure.colorbar(
-        ScalarMappable(speed_scale, SPEED),
+        ScalarMappable(scales.speed, SPEED),
         ax=list(axes.ravel()),
         location="bottom",
-        shrink=0.5,
+        shrink=0.5 if axes.shape[1] > 1 else 0.9,
         aspect=40,
         pad=0.02,
+        ticks=MaxNLocator(5),
     )
-    bar.set_label("speed of the soil [m/s]      arrow: force by the soil on the tool")
-    return figure
+    bar.set_label("speed of the soil [m/s]")
 
 
 def draw_soil(

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["Batch", "NoiseScales", "TrainingWindows", "WindowDataModule", "random_walk"]
 
 # Streams of random numbers that must not be the same.
-_SHUFFLE, _NOISE, _BODY_NOISE = 0, 1, 2
+_CHOICE, _NOISE, _BODY_NOISE = 0, 1, 2
 
 
 class NoiseScales(NamedTuple):
@@ -97,7 +97,7 @@ class TrainingWindows:
         num_modes: r.
         history: d.
         body_nodes: "pose" or "points".
-        seed: Of shuffle and noise.
+        seed: Of choice and noise.
         horizon: h, targets of a window.
         context: Keys of the scene whose numbers go with every window.
     """
@@ -116,8 +116,6 @@ class TrainingWindows:
             raise UserError(
                 "the training split has no runs; simulate the dataset first: sgns simulate dataset=<name>"
             )
-        if len({run.body_points.shape[1] for run in runs}) > 1 and body_nodes == "points":
-            raise UserError("the runs have different numbers of body points; use model.body_nodes=pose")
         self.history = history
         self.horizon = horizon
         self.seed = seed
@@ -133,7 +131,8 @@ class TrainingWindows:
             of_run.append(torch.full((pad + len(run.latent),), number))
             offset += pad + len(run.latent)
         self.latent = torch.cat(latent)
-        self.body = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
+        self.body = BodyTrack(*(torch.cat(filled(parts)) for parts in zip(*tracks, strict=True)))
+        self.body_nodes = torch.tensor([len(track.position[0]) for track in tracks])
         self.force = torch.cat(force)
         self.torque = torch.cat(torque)
         self.targets = torch.cat(targets)
@@ -148,21 +147,24 @@ class TrainingWindows:
             raise UserError(
                 "a reduced training run holds values that are not finite; find it with: sgns check <run.h5>"
             )
-        self._order: dict[int, Tensor] = {}
+        # Windows of one batch have the same number of body nodes.
+        nodes = self.body_nodes[self.of_run[self.targets]]
+        self.groups = [self.targets[nodes == count] for count in nodes.unique()]
 
     def __len__(self) -> int:
         """W, the number of windows."""
         return len(self.targets)
 
     def windows(self, rows: Tensor, noise: tuple[Tensor, Tensor] | None = None) -> Batch:
-        """The windows whose first targets are the given stacked frames, shape (B,); without noise unless the offsets of
-        modes and body are given."""
+        """The windows whose first targets are the given stacked frames, shape (B,), of runs with the same number of
+        body nodes; without noise unless the offsets of modes and body are given."""
         frames = rows[:, None] + torch.arange(-self.history, self.horizon)
         latent = self.latent[frames]
-        body = BodyTrack(*(part[frames[:, 1:]] for part in self.body))
+        nodes = int(self.body_nodes[self.of_run[rows[0]]])
+        body = BodyTrack(*(part[frames[:, 1:], :nodes] for part in self.body))
         if noise is None:
-            shown = frames[:, : self.history]
-            noise = torch.zeros_like(self.latent[shown]), torch.zeros_like(self.body.position[shown])
+            shown = len(rows), self.history
+            noise = latent.new_zeros(*shown, *latent.shape[2:]), latent.new_zeros(*shown, nodes, 3)
         last = frames[:, self.history :]
         return Batch(
             latent,
@@ -182,21 +184,17 @@ class TrainingWindows:
             size: B.
             noise: Its deviations.
         """
-        place = torch.arange(step * size, (step + 1) * size)
-        epoch = place // len(self)
-        rows = torch.cat(
-            [
-                self._epoch_order(int(e))[place[epoch == e] % len(self)]
-                for e in torch.unique_consecutive(epoch)
-            ]
-        )
+        chance = generator(self.seed, step, _CHOICE)
+        sizes = torch.tensor([float(len(group)) for group in self.groups])
+        group = self.groups[int(torch.multinomial(sizes, 1, generator=chance))]
+        rows = group[torch.randint(len(group), (size,), generator=chance)]
+        nodes = int(self.body_nodes[self.of_run[rows[0]]])
         shape = (size, self.history)
         offsets = random_walk(noise.latent, shape, generator(self.seed, step, _NOISE))
-        nodes = self.body.position.shape[1]
         body_offsets = random_walk(
             noise.body.expand(nodes, 3), shape, generator(self.seed, step, _BODY_NOISE)
         )
-        return self.windows(self.targets[rows], (offsets, body_offsets))
+        return self.windows(rows, (offsets, body_offsets))
 
     def batches(self, size: int, noise: NoiseScales, first: int = 0) -> Iterator[Batch]:
         """Batches without end, from step `first`."""
@@ -205,12 +203,11 @@ class TrainingWindows:
             yield self.batch(step, size, noise)
             step += 1
 
-    def _epoch_order(self, epoch: int) -> Tensor:
-        if epoch not in self._order:
-            # A batch may straddle two epochs; older ones are never asked for again.
-            self._order = {e: order for e, order in self._order.items() if e == epoch - 1}
-            self._order[epoch] = torch.randperm(len(self), generator=generator(self.seed, epoch, _SHUFFLE))
-        return self._order[epoch]
+
+def filled(parts: Sequence[Tensor]) -> list[Tensor]:
+    """Series of body nodes (T, N, K) filled up with NaN to the largest N."""
+    most = max(part.shape[1] for part in parts)
+    return [torch.nn.functional.pad(part, (0, 0, 0, most - part.shape[1]), value=torch.nan) for part in parts]
 
 
 def pad_start(values: Tensor, count: int) -> Tensor:

@@ -46,9 +46,9 @@ def fit_normalisation(
     """
     rows = windows.targets
     position, velocity, change = motions(windows.latent, rows)
-    body_position, body_velocity, body_change = motions(windows.body.position, rows)
+    body_position, body_velocity, body_change = map(nodes, motions(windows.body.position, rows))
     free = free_axes(dynamics.predicts_body, dynamics.settings.body_nodes)
-    motion = windows.body.motion[rows].flatten(0, 1)
+    motion = nodes(windows.body.motion[rows])
 
     if scales == "pooled":
         # Rigid points and modes together; the pose node's rotation has a scale of its own.
@@ -61,14 +61,14 @@ def fit_normalisation(
     else:
         dynamics.position = Standardiser.fit(position, floor)
         dynamics.velocity = Standardiser.fit(velocity, floor, centred=False)
-        dynamics.body_position = Standardiser.fit(body_position.flatten(0, 1), floor)
+        dynamics.body_position = Standardiser.fit(body_position, floor)
         # Displacement [m] and rotation [rad] have their own largest scale each.
         parts = motion.split(3, dim=-1)
         dynamics.body_motion = joined(*(Standardiser.fit(part, floor, centred=False) for part in parts))
         clean = Standardiser.fit(change, floor, centred=False)
         # No floor here: a wheel rises and sinks far less than it drives, and that little is to be predicted.
-        body_clean = Standardiser.fit(body_change.flatten(0, 1), centred=False)
-        moved = Standardiser.fit(body_velocity.flatten(0, 1), centred=False)
+        body_clean = Standardiser.fit(body_change, centred=False)
+        moved = Standardiser.fit(body_velocity, centred=False)
 
     if noise_unit == "metre":
         scale = NoiseScales(torch.full_like(dynamics.velocity.scale, noise), noise * free)
@@ -80,7 +80,7 @@ def fit_normalisation(
         # The target contains the correction of the velocity's noise; without either it would be constant.
         dynamics.change = widened(clean, scale.latent)
         dynamics.body_change = widened(body_clean, scale.body)
-    dynamics.body_orientation = Standardiser.fit(windows.body.orientation[rows - 1].flatten(0, 1), floor)
+    dynamics.body_orientation = Standardiser.fit(nodes(windows.body.orientation[rows - 1]), floor)
     dynamics.force = Standardiser.fit(windows.force[rows], floor)
     dynamics.torque = Standardiser.fit(windows.torque[rows], floor)
     dynamics.context = Standardiser.fit(windows.context[windows.of_run[rows]])
@@ -93,9 +93,15 @@ def motions(position: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return position[rows - 1], velocity, velocity - (position[rows - 1] - position[rows - 2])
 
 
+def nodes(values: Tensor) -> Tensor:
+    """All body nodes one below the other, those that fill up to the largest number left out; (W N, K)."""
+    flat = values.flatten(0, 1)
+    return flat[~flat.isnan().any(-1)]
+
+
 def pooled(modes: Tensor, body: Tensor) -> tuple[Standardiser, Standardiser]:
     """One mean and scale per axis over all nodes, for the modes (r, 3) and for a body node (3,)."""
-    both = Standardiser.fit(torch.cat([modes.flatten(0, 1), body.flatten(0, 1)]))
+    both = Standardiser.fit(torch.cat([modes.flatten(0, 1), body]))
     count = modes.shape[1]
     return Standardiser(both.mean.expand(count, 3), both.scale.expand(count, 3)), both
 

@@ -63,7 +63,7 @@ def main(cfg: DictConfig) -> float:
     if cfg.dataset.get("format") == "published":
         reduced = published_dataset(plain["dataset"], cfg.reduction.num_modes)
     else:
-        reduced = reduce_dataset(Dataset.open(cfg.dataset.path), cfg.reduction)
+        reduced = reduce_dataset(Dataset.open(cfg.dataset.path, cfg.dataset.get("where")), cfg.reduction)
     return train(
         reduced,
         num_modes=cfg.reduction.num_modes,

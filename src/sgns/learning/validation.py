@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sgns.learning.body import BodyTrack, body_track
 from sgns.learning.context import context_of
-from sgns.learning.data import pad_start
+from sgns.learning.data import filled, pad_start
 from sgns.learning.dynamics import LatentDynamics
 
 if TYPE_CHECKING:
@@ -74,7 +74,8 @@ class ValidationRollouts:
         self.latent = stacked([run.latent[:, :num_modes] for run in runs])
         self.force = stacked([run.force for run in runs])
         tracks = [body_track(run.pose, run.body_points, body_nodes) for run in runs]
-        self.body = BodyTrack(*(stacked(parts) for parts in zip(*tracks, strict=True)))
+        self.body = BodyTrack(*(stacked(filled(parts)) for parts in zip(*tracks, strict=True)))
+        self.nodes = torch.tensor([track.position.shape[1] for track in tracks])
         self.context = torch.as_tensor(np.stack([context_of(run.scene, context) for run in runs]))
         self.history = history
         frame = torch.arange(longest)
@@ -121,7 +122,7 @@ class ValidationRollouts:
 
     def body_error(self, body: BodyTrack) -> float:
         """RMS distance of body nodes from where they are in truth, over all counted frames [m]."""
-        squares = (body.position - self.body.position).square().sum(-1).mean(-1)
+        squares = (body.position - self.body.position).square().sum(-1).nanmean(-1)
         error = float(torch.where(self.counted, squares, 0.0).sum() / self.counted.sum())
         return error**0.5 if np.isfinite(error) else float("inf")
 
@@ -129,6 +130,13 @@ class ValidationRollouts:
         self, dynamics: LatentDynamics, latent: Tensor, body: BodyTrack, device: torch.device
     ) -> tuple[Tensor, Tensor, BodyTrack]:
         """Latent positions [m], force [N] and body of an unrolling, computed on `device`, returned on the CPU."""
-        track = BodyTrack(*(part.to(device) for part in body))
-        path = dynamics.unroll(latent.to(device), track, self.context.to(device))
-        return path.latent.cpu(), path.force.cpu(), BodyTrack(*(part.cpu() for part in path.body))
+        found = BodyTrack(*(part.clone() for part in body))
+        states = torch.empty(*body.position.shape[:2], *latent.shape[2:], dtype=latent.dtype)
+        force = torch.empty(*body.position.shape[:2], 3, dtype=latent.dtype)
+        for count in self.nodes.unique():
+            of = torch.nonzero(self.nodes == count)[:, 0]
+            track = BodyTrack(*(part[of][:, :, :count].to(device) for part in body))
+            path = dynamics.unroll(latent[of].to(device), track, self.context[of].to(device))
+            states[of], force[of] = path.latent.cpu(), path.force.cpu()
+            found.position[of, :, :count] = path.body.position.cpu()
+        return states, force, found

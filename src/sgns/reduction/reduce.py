@@ -24,7 +24,7 @@ def main(cfg: DictConfig) -> float:
     """The `sgns reduce` command; returns the mean squared reconstruction error on the training runs [m²]."""
     from sgns.campaign import Dataset
 
-    dataset = Dataset.open(cfg.dataset.path)
+    dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
     reduced = reduce_dataset(dataset, cfg.reduction)
     basis, asked = reduced.basis, int(cfg.reduction.num_modes)
     validation = dataset.runs("validation")

@@ -100,7 +100,8 @@ def test_settings_of_a_command(command: str) -> None:
     )
     own = {
         "simulate": {"shard", "shards"},
-        "evaluate": {"split", "new_rollouts", "timing_repeats"},
+        "rollout": {"num_modes"},
+        "evaluate": {"split", "num_modes", "new_rollouts", "timing_repeats"},
         "check": {"files"},
     }
     assert set(cfg) - {"hydra"} <= {*keys.split(), "experiment"} | own.get(command, set())

@@ -13,7 +13,7 @@ from sgns.errors import UserError
 from sgns.evaluation import evaluate as evaluate_module
 from sgns.evaluation.evaluate import full_basis, single_thread, training_means
 from sgns.evaluation.report import write_report
-from sgns.poses import in_body_frame
+from sgns.poses import in_body_frame, in_world_frame
 from sgns.rollout import write_rollout
 from sgns.runs import Run, check_run
 
@@ -51,6 +51,10 @@ def test_whole_evaluation(dataset, basis, tmp_path):
     summary = json.loads((output / "metrics.json").read_text())
     assert summary["aggregate"]["skill_frozen"] == pytest.approx(result.total.skill())
     assert summary["wall_s_per_simulated_s"]["solver"] == pytest.approx(60.0 / 19.0)
+    with (output / "examples.csv").open(newline="", encoding="utf-8") as file:
+        examples = list(csv.DictReader(file))
+    assert [row["run"] for row in examples] == [row["run"] for row in rows]
+    assert float(examples[-1]["mse_network_m2"]) == pytest.approx(result.total.mse["network"])
     assert result.timing.repeats >= 3
     assert result.timing.decoding > result.timing.stepping > 0.0
     for run in result.runs:
@@ -63,7 +67,9 @@ def test_whole_evaluation(dataset, basis, tmp_path):
             run.scores.mse["network"] + run.scores.mse["reduction"], rel=1e-3
         )
     text = report.read_text(encoding="utf-8")
-    assert text.count("data:image/png;base64,") == len(list((output / "figures").glob("*.png"))) >= 8
+    assert text.count("data:image/png;base64,") == len(list((output / "figures").glob("*.png"))) >= 25
+    for heading in ("Force through time", "Torque through time", "Error by particle", "The whole bed"):
+        assert heading in text
     assert "never simulated" in text
 
 
@@ -97,6 +103,47 @@ def test_evaluating_again_gives_the_same_numbers(dataset, basis, tmp_path):
     first = evaluate(simulator(dataset, basis), dataset, tmp_path).total.row()
     second = evaluate(simulator(dataset, basis), dataset, tmp_path).total.row()
     assert first == pytest.approx(second, nan_ok=True)
+
+
+def test_runs_that_it_was_trained_on_are_no_test(dataset, basis, tmp_path, caplog):
+    seen = [path.stem for path in dataset.runs("train")]
+    again = replace(
+        dataset, splits=dataset.splits | {"test": [*dataset.runs("train")[:1], *dataset.runs("test")]}
+    )
+    result = evaluate(simulator(dataset, basis), again, tmp_path)
+    assert result.trained_on == seen[:1] and result.chosen_by == []
+    assert json.loads((tmp_path / "metrics.json").read_text())["evaluated_runs_trained_on"] == seen[:1]
+    with caplog.at_level("WARNING"):
+        evaluate_module.log_summary(result, tmp_path / "report.html")
+    assert "1 of the 3 evaluated runs bear the names" in caplog.text
+    caplog.clear()
+    clean = evaluate(simulator(dataset, basis), dataset, tmp_path)
+    with caplog.at_level("WARNING"):
+        evaluate_module.log_summary(clean, tmp_path / "report.html")
+    assert caplog.text == ""
+
+
+def test_body_is_taken_from_the_prediction(dataset, basis, tmp_path):
+    known = simulator(dataset, basis)
+    given = known.rollout
+
+    def sinks(poses, *args, **kw):
+        rollout = given(poses, *args, **kw)
+        sunk = poses + np.array([0.0, 0.0, -0.002, 0.0, 0.0, 0.0, 0.0])
+        return replace(rollout, poses=sunk, body_points=in_world_frame(sunk, kw.get("body_points", args[0])))
+
+    known.rollout = sinks
+    result = evaluate(known, dataset, tmp_path)
+    assert result.total.body_mse == pytest.approx(4e-6)
+    assert np.isnan(result.total.sinkage_mae)  # no wheel
+    assert "body misplaced" in write_report(result, tmp_path).read_text(encoding="utf-8")
+
+
+def test_damaged_summary_of_the_training_is_refused_before_anything_is_rolled_out(dataset, basis, tmp_path):
+    (tmp_path / "training.json").write_text("{")
+    with pytest.raises(UserError, match="not the summary of a training"):
+        evaluate(simulator(dataset, basis), dataset, tmp_path / "out", checkpoint=tmp_path / "best.ckpt")
+    assert not (tmp_path / "out").exists()
 
 
 def test_full_basis_is_found_beside_the_dataset(dataset, tmp_path):

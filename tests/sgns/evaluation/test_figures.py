@@ -1,25 +1,24 @@
-import io
 from types import SimpleNamespace
 
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib import image
+from pictures import pixels
 from synthetic import make_run
 
 from sgns.evaluation import figures
-from sgns.evaluation.figures import ForceHistory
-from sgns.evaluation.metrics import PositionErrors
-from sgns.evaluation.sideview import body_outline, hull, middle_slice, nice, side_views, view_times
+from sgns.evaluation.sideview import (
+    body_outline,
+    common_scales,
+    hull,
+    middle_slice,
+    nice,
+    side_view,
+    side_views,
+    view_times,
+)
 from sgns.evaluation.surface import surface_grid
 from sgns.runs import Run
-
-
-def pixels(figure):
-    """The drawn picture, shape (height, width, channels); fails if it is empty."""
-    picture = image.imread(io.BytesIO(figures.png(figure)))
-    assert picture[..., :3].std() > 0.01
-    return picture
 
 
 @pytest.fixture
@@ -28,17 +27,26 @@ def run(tmp_path):
         yield run
 
 
-def errors(scale=1.0, frames=6):
-    values = [scale * np.linspace(1e-6, 1e-4, frames)] * 7
-    return PositionErrors(np.arange(frames) / 60.0, *values)
-
-
 def test_side_views_of_one_and_of_two_runs(run):
     start = run.positions(slice(0, 1))[0].astype(np.float64)
     frames = view_times(run, 3)
     one = pixels(side_views({"network": run}, frames, start))
     two = pixels(side_views({"simulated (MPM)": run, "network": run}, frames, start))
     assert two.shape[1] > one.shape[1]
+
+
+def test_narrow_side_view_has_the_runs_above_each_other_with_one_scale(run):
+    start = run.positions(slice(0, 1))[0].astype(np.float64)
+    frames = view_times(run, 3)
+    scales = common_scales([run, run], frames, start)
+    figure = side_view({"simulated (MPM)": run, "network": run}, frames[-1], scales)
+    upper, lower = figure.axes[:2]
+    assert upper.get_xlim() == lower.get_xlim() == pytest.approx(scales.x_limits)
+    assert upper.collections[0].norm is lower.collections[0].norm is scales.speed
+    assert pixels(figure).shape[1] == round(figures.PICTURE_WIDTH * figures.DPI)
+    assert upper.get_position().y0 > lower.get_position().y1
+    strongest = max(np.linalg.norm(run.force[f, [0, 2]]) for f in frames)
+    assert scales.arrow * strongest < 0.3 * np.ptp(scales.x_limits)
 
 
 def test_side_view_of_a_run_without_force_motion_or_blade(tmp_path):
@@ -83,23 +91,6 @@ def test_middle_slice_and_nice_numbers():
     chosen = bed[middle_slice(bed)]
     assert np.abs(chosen[:, 1] - 0.5).max() < 0.2 and len(chosen) > 100
     assert [nice(v) for v in (0.1, 0.11, 27.0, 8.5)] == pytest.approx([0.1, 0.15, 30.0, 10.0])
-
-
-def test_force_histories_with_and_without_truth():
-    time = np.arange(10) / 60.0
-    force = np.random.default_rng(0).normal(size=(10, 3))
-    both = ForceHistory("a <b>", time, force, force + 1.0, start=time[3])
-    pixels(figures.force_figure([both, ForceHistory("new", time, force)], np.array([1.0, 0.0, 2.0])))
-    pixels(figures.force_figure([ForceHistory("new", time, force)]))
-
-
-@pytest.mark.parametrize("count", [1, 3, 5])
-def test_error_panels(count):
-    pixels(figures.error_figure({f"run{i}": errors() for i in range(count)}))
-
-
-def test_error_panel_of_a_prediction_without_error():
-    pixels(figures.error_figure({"run": errors(scale=0.0)}))
 
 
 def test_profile(run):

@@ -1,4 +1,5 @@
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from sgns.errors import UserError
 from sgns.evaluation.metrics import (
     PositionErrors,
     VectorErrors,
+    body_errors,
     mean_prediction,
     position_errors,
     skill,
@@ -109,6 +111,29 @@ def test_chunks_of_frames_do_not_change_anything(monkeypatch):
     pieces = compared(truth, prediction)
     for name in ("reduction", "network", "total", "frozen", "constant_velocity", "surface"):
         assert getattr(pieces, name) == pytest.approx(getattr(whole, name), rel=1e-12)
+    assert pieces.particles.reduction == pytest.approx(whole.particles.reduction, rel=1e-12)
+    assert pieces.particles.network == pytest.approx(whole.particles.network, rel=1e-12)
+
+
+def test_errors_by_particle_have_the_same_mean_as_those_by_frame():
+    basis = make_basis()
+    truth, walk = random_walk(), random_walk(seed=2)
+    prediction = basis.inverse(basis.transform(torch.from_numpy(walk))).numpy()
+    errors = compared(truth, prediction, basis)
+    assert errors.particles.reduction.shape == errors.particles.network.shape == (7,)
+    assert errors.particles.reduction.mean() == pytest.approx(errors.mse("reduction"))
+    assert errors.particles.network.mean() == pytest.approx(errors.mse("network"), rel=1e-5)
+
+
+def test_error_of_one_particle_by_hand():
+    basis = make_basis()
+    inside = basis.inverse(basis.transform(torch.from_numpy(random_walk()))).numpy()
+    off = inside.copy()
+    off[2:, 3, 1] += 0.3
+    particles = compared(inside, off, basis).particles
+    assert particles.network[3] == pytest.approx(0.3**2 / 3, rel=1e-4)
+    assert np.delete(particles.network, 3) == pytest.approx(0.0, abs=1e-12)
+    assert particles.reduction == pytest.approx(0.0, abs=1e-12)
 
 
 def test_surface_error_of_a_raised_bed():
@@ -160,6 +185,20 @@ def test_sign_of_mpe_does_not_depend_on_the_sign_of_the_force():
     truth = np.full((5, 3), [-10.0, 8.0, 10.0])
     assert VectorErrors.compare(truth, 1.2 * truth).mpe == pytest.approx([20.0, 20.0, 20.0])
     assert VectorErrors.compare(truth, 0.9 * truth).mpe == pytest.approx([-10.0, -10.0, -10.0])
+
+
+def test_body_errors_by_hand():
+    poses = np.zeros((5, 7))
+    moved = poses.copy()
+    moved[0, 0] = 9.0  # within the history: does not count
+    moved[2:, 2] = [-0.003, 0.003, -0.003]
+    moved[2:, 1] = 0.004
+    wheel = {"diameter": 0.15}
+    errors = body_errors(SimpleNamespace(pose=poses, scene=wheel), SimpleNamespace(pose=moved), 2)
+    assert errors.mse == pytest.approx(0.005**2)
+    assert errors.sinkage_mae == pytest.approx(0.003)
+    blade = body_errors(SimpleNamespace(pose=poses, scene={}), SimpleNamespace(pose=poses), 2)
+    assert blade.mse == 0.0 and math.isnan(blade.sinkage_mae)
 
 
 def test_sums_of_runs_equal_the_runs_joined():

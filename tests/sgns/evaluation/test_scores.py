@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 from surrogates import made_scores
@@ -22,3 +23,16 @@ def test_aggregate_of_one_run_is_that_run():
     one = made_scores("a", 1e-6, 4e-6, 1.2)
     row = aggregate([one], "a").row()
     assert {k: row[k] for k in row} == pytest.approx(one.row(), nan_ok=True)
+
+
+def test_sinkage_is_the_mean_of_the_wheels_only():
+    blade = made_scores("blade", 1e-6, 4e-6)
+    wheels = [
+        replace(blade, name=name, body_mse=mse, sinkage_mae=mae)
+        for name, mse, mae in (("a", 4e-6, 1e-3), ("b", 0.0, 3e-3))
+    ]
+    total = aggregate([blade, *wheels])
+    assert total.sinkage_mae == pytest.approx(2e-3)
+    assert total.row()["sinkage_mae_mm"] == pytest.approx(2.0)
+    assert total.row()["body_rmse_mm"] == pytest.approx(1e3 * math.sqrt(4e-6 / 3))
+    assert blade.row()["body_rmse_mm"] == 0.0 and math.isnan(blade.row()["sinkage_mae_mm"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -66,12 +68,27 @@ def test_batches_depend_on_seed_and_step_only(data) -> None:
     assert not torch.equal(other.noise, alone.noise)
 
 
-def test_an_epoch_shows_every_window_once(data) -> None:
+def test_every_window_is_drawn_equally_often(data) -> None:
     windows = windows_of(data)
-    # 52 windows in batches of 8: batches straddle epochs; two epochs are 13 batches.
-    seen = torch.cat([windows.batch(step, 8, still()).latent[:, -1] for step in range(13)])
+    seen = torch.cat([windows.batch(step, 64, still()).latent[:, -1] for step in range(130)])
     counts = torch.unique(seen.flatten(1), dim=0, return_counts=True)[1]
-    assert counts.tolist() == [2] * 52
+    # 160 each on average, with a deviation of 12.6 by chance.
+    assert len(counts) == 52 and 105 < counts.min() and counts.max() < 215
+
+
+def test_runs_with_other_numbers_of_points_are_kept_apart(data) -> None:
+    runs = data.runs("train")
+    runs[1] = replace(runs[1], body_points=runs[1].body_points[:, :6])
+    windows = TrainingWindows(runs, 4, 3, "points")
+    drawn = [windows.batch(step, 8, still()) for step in range(40)]
+    counts = [batch.body.position.shape[2] for batch in drawn]
+    assert set(counts) == {6, 15} and 3 <= counts.count(6) <= 20
+    assert all(bool(torch.isfinite(part).all()) for batch in drawn for part in batch.shown_body)
+    settings = ModelSettings(**(MODEL | {"body_nodes": "points"}))
+    for scales in ("per_mode", "pooled"):
+        dynamics = LatentDynamics(settings, 4)
+        fit_normalisation(dynamics, windows, 0.1, "velocity", scales, 0.01)
+        assert all(bool(torch.isfinite(value).all()) for value in dynamics.state_dict().values())
 
 
 def test_noise_is_a_walk_of_the_stated_size() -> None:

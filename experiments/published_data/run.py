@@ -1,0 +1,206 @@
+"""The presets on the runs that the paper's authors published, every run predicted by networks that have not seen it.
+
+    python experiments/published_data/run.py <folder with excavation/ and wheel/> --seconds 120
+
+Four folds; in each every preset is trained on the other runs for the same wall time on one thread, its learning rate
+falling over as many steps as fit into that time. Writes table.csv (a row per run and preset, and one for all) and
+figure.png beside this script; a training that is complete in `--output` is not repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import logging
+import multiprocessing
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from sgns.evaluation.published_scores import scored
+from sgns.evaluation.scores import aggregate
+from sgns.learning.training import train
+from sgns.published_dataset import published_dataset
+from sgns.rollout import single_thread
+from sgns.simulator import Simulator
+
+HERE = Path(__file__).parent
+FOLDS = 4
+KINDS = ("excavation", "wheel")
+PRESETS = ("paper", "released", "default")
+WARM_UP = 60  # steps that tell how long one takes
+
+
+def settings(preset: str, folder: Path, fold: int, overrides: list[str]) -> dict[str, Any]:
+    """All settings of `sgns train`, plain."""
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        config = compose(
+            "train",
+            [
+                f"preset={preset}",
+                "dataset=published",
+                f"dataset.path={folder}",
+                f"dataset.folds={FOLDS}",
+                f"dataset.fold={fold}",
+                "training.threads=1",
+                *overrides,
+            ],
+        )
+    config.output = ""
+    plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict)
+    return plain
+
+
+def trained(preset: str, folder: Path, fold: int, seconds: float, output: Path, overrides: list[str]) -> float:
+    """Train for about so many seconds; returns the seconds it took."""
+    record = output / "training.json"
+    if record.exists():
+        return float(json.loads(record.read_text())["seconds"])
+    config = settings(preset, folder, fold, overrides)
+    data = published_dataset(config["dataset"], config["reduction"]["num_modes"])
+
+    def run(steps: int, where: Path) -> float:
+        torch.manual_seed(0)
+        training = config["training"] | {"max_steps": steps, "validate_every": steps, "resume": False}
+        training["warmup_steps"] = min(training["warmup_steps"], steps // 10)
+        train(
+            data,
+            num_modes=config["reduction"]["num_modes"],
+            model=config["model"],
+            training=training,
+            output=where,
+            provenance={"preset": preset, "dataset": f"published {folder.name}"},
+        )
+        return float(json.loads((where / "training.json").read_text())["seconds"])
+
+    trial = output.with_name(f"{output.name}_trial")
+    run(2, trial)
+    short = run(2, trial)
+    rate = WARM_UP / max(run(WARM_UP + 2, trial) - short, 1e-3)
+    return run(max(50, int(seconds * rate)), output)
+
+
+def fold_rows(task: tuple[str, str, int, Path, float, Path, list[str]]) -> list[dict[str, Any]]:
+    """One preset on one fold of one kind."""
+    preset, kind, fold, folder, seconds, output, overrides = task
+    torch.set_num_threads(1)
+    where = output / f"{kind}_{preset}_{fold}"
+    took = trained(preset, folder / kind, fold, seconds, where, overrides)
+    simulator = Simulator.load(where / "last.ckpt")
+    config = settings(preset, folder / kind, fold, overrides)
+    data = published_dataset(config["dataset"], config["reduction"]["num_modes"])
+    rows = []
+    with single_thread():
+        for run in data.runs("test"):
+            began = time.perf_counter()
+            scores = scored(simulator, run, simulator.mean_force)
+            rows.append(
+                {
+                    "kind": kind,
+                    "preset": preset,
+                    "scores": scores,
+                    "training_s": took,
+                    "rollout_s": time.perf_counter() - began,
+                    "steps": simulator.card["settings"]["training"]["max_steps"],
+                    "batch": simulator.card["settings"]["training"]["batch_size"],
+                }
+            )
+    return rows
+
+
+def table_row(kind: str, preset: str, scores: Any, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The paper's columns, and beside them skill, baselines and unsigned errors."""
+    force, mean = scores.force, scores.mean_force
+    return {
+        "kind": kind,
+        "preset": preset,
+        "run": scores.name,
+        "mse_1e-4_m2": round(1e4 * scores.mse["network"], 4),
+        "frozen_1e-4_m2": round(1e4 * scores.mse["frozen"], 4),
+        "constant_velocity_1e-4_m2": round(1e4 * scores.mse["constant_velocity"], 4),
+        "skill_frozen": round(scores.skill(), 3),
+        "skill_constant_velocity": round(scores.skill("constant_velocity"), 3),
+        "forward_mpe_percent": round(float(force.mpe[0]), 1),
+        "vertical_mpe_percent": round(float(force.mpe[2]), 1),
+        "forward_abs_mpe_percent": round(scores.absolute_mpe["draft"], 1),
+        "vertical_abs_mpe_percent": round(scores.absolute_mpe["vertical"], 1),
+        "forward_mae_N": round(float(force.mae[0]), 2),
+        "vertical_mae_N": round(float(force.mae[2]), 2),
+        "force_nrmse": round(force.overall_nrmse, 3),
+        "mean_force_nrmse": round(mean.overall_nrmse, 3),
+        "training_s": round(float(np.mean([row["training_s"] for row in rows])), 1),
+        "steps": round(float(np.mean([row["steps"] for row in rows]))),
+        "samples": round(float(np.mean([row["steps"] * row["batch"] for row in rows]))),
+        "rollout_s": round(float(np.median([row["rollout_s"] for row in rows])), 3),
+    }
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Skill and force error of every run."""
+    figure, axes = plt.subplots(2, 2, figsize=(10, 6.4), layout="constrained")
+    for line, kind in zip(axes, KINDS, strict=True):
+        for shift, preset in enumerate(PRESETS):
+            found = [r for r in rows if r["kind"] == kind and r["preset"] == preset and r["run"] != "all runs"]
+            at = np.arange(len(found)) + 0.26 * (shift - 1)
+            skill = [max(r["skill_frozen"], -1.0) for r in found]
+            line[0].bar(at, skill, 0.24, label=preset)
+            line[1].bar(at, [min(r["force_nrmse"], 2.0) for r in found], 0.24, label=preset)
+        line[1].plot(
+            np.arange(len(found)), [min(r["mean_force_nrmse"], 2.0) for r in found], "k_", ms=14, label="mean force"
+        )
+        for axis, what in zip(line, ("skill against frozen (cut at -1)", "force NRMSE (cut at 2)"), strict=True):
+            axis.set_xticks(np.arange(len(found)), [r["run"].split("_")[-1] for r in found], fontsize=8)
+            axis.set_title(f"{kind}: {what}", fontsize=10)
+            axis.axhline(0.0, color="0.3", lw=0.8)
+            axis.grid(alpha=0.3, axis="y")
+    axes[0, 0].legend(fontsize=8)
+    axes[0, 1].legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("published", type=Path, help="folder with the authors' excavation/ and wheel/")
+    parser.add_argument("--seconds", type=float, default=120.0, help="training time of each network")
+    parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1))
+    parser.add_argument("--output", type=Path, default=Path("outputs/published_data"))
+    parser.add_argument("--presets", nargs="*", default=list(PRESETS))
+    parser.add_argument("--kinds", nargs="*", default=list(KINDS))
+    parser.add_argument("overrides", nargs="*", help="changes of the settings, for example model.history=2")
+    options = parser.parse_intermixed_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    tasks = [
+        (preset, kind, fold, options.published, options.seconds, options.output, options.overrides)
+        for kind in options.kinds
+        for preset in options.presets
+        for fold in range(FOLDS)
+    ]
+    with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
+        found = [row for rows in pool.map(fold_rows, tasks, chunksize=1) for row in rows]
+    rows = []
+    for kind in options.kinds:
+        for preset in options.presets:
+            own = [row for row in found if (row["kind"], row["preset"]) == (kind, preset)]
+            own.sort(key=lambda row: row["scores"].name)
+            rows += [table_row(kind, preset, row["scores"], [row]) for row in own]
+            rows.append(table_row(kind, preset, aggregate([row["scores"] for row in own]), own))
+            logging.info("%s", rows[-1])
+    with (HERE / "table.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    if set(options.presets) == set(PRESETS) and set(options.kinds) == set(KINDS):
+        draw(rows, HERE / "figure.png")
+
+
+if __name__ == "__main__":
+    main()

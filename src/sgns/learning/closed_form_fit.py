@@ -1,0 +1,230 @@
+"""Coefficients of `ClosedForm`: ridge regression (dynamic mode decomposition with control: Proctor, Brunton, Kutz
+2016, doi:10.1137/15M1013857) and sequentially thresholded least squares (SINDy: Brunton, Proctor, Kutz 2016,
+doi:10.1073/pnas.1517384113).
+
+Both need only the moments of monomials and outputs, summed once over all windows and noise draws. What one step
+cannot tell, the noise and the penalty, is chosen by rollouts of validation runs.
+
+Letters: r modes, p inputs, m monomials, o = 3r + 6 outputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from sgns.learning.closed_form import ClosedForm, normalised, polynomial_terms, raw_inputs
+from sgns.learning.data import Batch, TrainingWindows, generator, random_walk
+from sgns.learning.normalisation import Standardiser
+
+if TYPE_CHECKING:
+    from sgns.learning.validation import RolloutScore, ValidationRollouts
+
+__all__ = ["Moments", "Setting", "candidates", "choose", "fit", "moments", "ridge", "sparse", "unfitted"]
+
+# Windows whose monomials are in memory at once.
+_CHUNK = 2048
+# An input with less deviation than this after normalisation is fixed, or zero by symmetry: no use as a factor.
+_STILL = 0.01
+
+
+class Setting(NamedTuple):
+    """How coefficients are found.
+
+    Attributes:
+        noise: Deviation of the velocity noise on the history, share of each mode's velocity scale [1].
+        penalty: Of the squares of the coefficients, beside the mean square of the normalised outputs [1].
+        threshold: Smallest RMS of a term in a normalised output [1]; 0 keeps all terms.
+    """
+
+    noise: float
+    penalty: float
+    threshold: float = 0.0
+
+
+class Moments(NamedTuple):
+    """Means over windows.
+
+    Attributes:
+        gram: Products of monomials [1], shape (m, m).
+        target: Products of monomials and normalised outputs [1], shape (m, o).
+    """
+
+    gram: Tensor
+    target: Tensor
+
+
+def unfitted(windows: TrainingWindows, degree: int, floor: float = 0.01) -> ClosedForm:
+    """Polynomials with the statistics of the training windows and all coefficients zero.
+
+    They predict that nothing moves and that the force is the training runs' mean.
+
+    Args:
+        windows: The training windows.
+        degree: 1 or 2.
+        floor: Smallest scale as a share of the quantity's largest.
+    """
+    batch = windows.windows(windows.targets)
+    groups = raw_inputs(batch.history, batch.body)
+    # Velocities and motions keep their zero, which means rest.
+    centred = (True, False, True, True, False, False)
+    inputs = joined(
+        [Standardiser.fit(group, floor, keep) for group, keep in zip(groups, centred, strict=False)]
+    )
+    values = normalised(inputs, groups)
+    used = (values.std(0) > _STILL).nonzero().flatten()
+    bounds = torch.stack([values[:, used].amin(0), values[:, used].amax(0)])
+    velocity = (batch.latent[:, -1] - batch.latent[:, -2]).flatten(1)
+    outputs = joined(
+        [
+            Standardiser.fit(velocity, floor, centred=False),
+            Standardiser.fit(batch.force, floor),
+            Standardiser.fit(batch.torque, floor),
+        ]
+    )
+    terms = polynomial_terms(len(used), degree)
+    weights = torch.zeros(len(terms), len(outputs.mean), dtype=torch.float64)
+    return ClosedForm(windows.history, batch.latent.shape[2], inputs, used, bounds, outputs, terms, weights)
+
+
+def joined(parts: Sequence[Standardiser]) -> Standardiser:
+    """Statistics of quantities side by side."""
+    return Standardiser(torch.cat([p.mean for p in parts]), torch.cat([p.scale for p in parts]))
+
+
+def moments(model: ClosedForm, windows: TrainingWindows, noise: float = 0.0, draws: int = 2) -> Moments:
+    """Moments of a model's monomials and outputs; its coefficients do not matter.
+
+    Args:
+        model: Whose library and statistics to use.
+        windows: The training windows.
+        noise: As in `Setting`.
+        draws: How often all windows are taken, with other noise each time.
+    """
+    scale = noise * model.outputs.scale[: 3 * model.num_modes].unflatten(0, (-1, 3))
+    gram = torch.zeros(2 * model.weights.shape[:1], dtype=torch.float64)
+    target = torch.zeros_like(model.weights)
+    for draw in range(draws):
+        source = generator(windows.seed, draw, 1)
+        for rows in windows.targets.split(_CHUNK):
+            walk = random_walk(scale, (len(rows), windows.history), source)
+            batch = windows.windows(rows, walk)
+            monomials = model.monomials(batch.history, batch.body)
+            gram += monomials.T @ monomials
+            target += monomials.T @ wanted(model, batch)
+    return Moments(gram / (draws * len(windows)), target / (draws * len(windows)))
+
+
+def wanted(model: ClosedForm, batch: Batch) -> Tensor:
+    """Normalised outputs of a batch, shape (B, o): the true velocity whatever error the history has, so that errors of
+    the velocity are corrected and those of the position left, as the network is taught."""
+    velocity = (batch.latent[:, -1] - batch.latent[:, -2]).flatten(1)
+    return normalised(model.outputs, [velocity, batch.force, batch.torque])
+
+
+def ridge(known: Moments, penalty: float) -> Tensor:
+    """Least squares with a penalty on the squares of all coefficients but the constants', shape (m, o)."""
+    weight = torch.full((len(known.gram),), penalty, dtype=torch.float64)
+    weight[0] = 0.0
+    return solved(known.gram + weight.diag(), known.target)
+
+
+def solved(gram: Tensor, target: Tensor) -> Tensor:
+    """Solution of the normal equations; the smallest one where they do not determine it."""
+    factor, failed = torch.linalg.cholesky_ex(gram)
+    if int(failed):
+        return torch.linalg.lstsq(gram, target, driver="gelsd").solution
+    return torch.cholesky_solve(target, factor)
+
+
+def sparse(known: Moments, penalty: float, threshold: float, rounds: int = 10) -> Tensor:
+    """Ridge regression of each output, repeated without the terms that add little until none does.
+
+    Args:
+        known: Moments of the library.
+        penalty: As in `Setting`.
+        threshold: As in `Setting`.
+        rounds: Most repetitions.
+
+    Returns:
+        Coefficients, shape (m, o), most of them zero.
+    """
+    size = known.gram.diagonal().sqrt()
+    weight = torch.full_like(size, penalty)
+    weight[0] = 0.0
+    full = ridge(known, penalty)
+    found = torch.zeros_like(full)
+    for column, values in enumerate(full.unbind(1)):
+        kept = torch.arange(len(full))
+        for _ in range(rounds):
+            large = values.abs() * size[kept] > threshold
+            if bool(large.all()):
+                break
+            kept = kept[large]
+            gram = known.gram[kept][:, kept] + weight[kept].diag()
+            values = solved(gram, known.target[kept, column, None])[:, 0]
+        found[kept, column] = values
+    return found
+
+
+def coefficients(known: Moments, setting: Setting) -> Tensor:
+    """`sparse` where the setting has a threshold, else `ridge`, shape (m, o)."""
+    if setting.threshold:
+        return sparse(known, setting.penalty, setting.threshold)
+    return ridge(known, setting.penalty)
+
+
+def candidates(
+    known: Mapping[float, Moments], penalties: Sequence[float], threshold: float = 0.0
+) -> dict[Setting, Tensor]:
+    """Coefficients for every penalty and noise.
+
+    Args:
+        known: Moments of one model by noise.
+        penalties: As in `Setting`.
+        threshold: As in `Setting`.
+    """
+    settings = [Setting(noise, penalty, threshold) for noise in known for penalty in penalties]
+    return {setting: coefficients(known[setting.noise], setting) for setting in settings}
+
+
+def choose(
+    model: ClosedForm, found: Mapping[Setting, Tensor], rollouts: ValidationRollouts
+) -> tuple[Setting, Setting]:
+    """Give a model the best coefficients: of the modes by the skill of rollouts, then of force and torque by the
+    force error along the rollouts of these modes.
+
+    Args:
+        model: Its coefficients are replaced.
+        found: From `candidates`.
+        rollouts: Of the validation runs.
+
+    Returns:
+        The setting of the modes, and that of force and torque.
+    """
+
+    def score(motion: Setting, force: Setting) -> RolloutScore:
+        take(model, found[motion], found[force])
+        return rollouts.measure(model)  # type: ignore[arg-type]
+
+    motion = max(found, key=lambda setting: score(setting, setting).skill)
+    force = min(found, key=lambda setting: score(motion, setting).force_nrmse)
+    take(model, found[motion], found[force])
+    return motion, force
+
+
+def fit(windows: TrainingWindows, degree: int, motion: Setting, force: Setting) -> ClosedForm:
+    """A model of known settings, for instance those that `choose` found on a part of the runs."""
+    model = unfitted(windows, degree)
+    known = {noise: moments(model, windows, noise) for noise in {motion.noise, force.noise}}
+    take(model, *(coefficients(known[setting.noise], setting) for setting in (motion, force)))
+    return model
+
+
+def take(model: ClosedForm, motion: Tensor, force: Tensor) -> None:
+    """Coefficients of the modes from one matrix, those of force and torque from another."""
+    modes = 3 * model.num_modes
+    model.weights.copy_(torch.cat([motion[:, :modes], force[:, modes:]], dim=1))

@@ -1,0 +1,96 @@
+"""One function over one scene's items and over those of many, and programs of such kernels."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from mpm_warp import Effects
+from mpm_warp.contact import ContactLaw
+from mpm_warp.grid import grid_step
+from mpm_warp.launches import Launch, scene_kernel
+from mpm_warp.start import find_device
+from mpm_warp.transfer import transfer
+from mpm_warp.work import Program, Work, Worker
+
+
+@wp.struct
+class Pair:
+    to: wp.array(dtype=float)
+    factor: float
+
+
+def kernels():
+    @scene_kernel()
+    def add(i: int, pair: Pair, given: wp.array(dtype=float)):
+        if i >= given.shape[0]:
+            return
+        pair.to[i] = pair.to[i] + pair.factor * given[i]
+
+    @scene_kernel()
+    def double(i: int, to: wp.array(dtype=float)):
+        to[i] = 2.0 * to[i]
+
+    return add, double
+
+
+def scene(add, double, factor, numbers):
+    """Add `factor` times the numbers, double, add so many times, double."""
+    device, pair = find_device("cpu"), Pair()
+    pair.to, pair.factor = wp.zeros(len(numbers), dtype=float, device=device), factor
+    given = wp.array(numbers, dtype=float, device=device)
+    adds = Launch(add, len(numbers), [pair, given], device)
+    doubles = Launch(double, len(numbers), [pair.to], device)
+    return pair.to, Program([adds, doubles], [adds], [doubles])
+
+
+def test_programs_together_are_the_programs_alone():
+    """Of different sizes, numbers and steps."""
+    device, both = find_device("cpu"), kernels()
+    cases = [(1.0, [1.0, 2.0, 3.0], 2), (-0.5, [4.0], 5), (3.0, [1.0, 0.1], 1)]
+    alone, together = ([scene(*both, *case[:2]) for case in cases] for _ in range(2))
+    for (_, program), (*_, steps) in zip(alone, cases, strict=True):
+        Worker(device).do([Work(program, steps)])
+    Worker(device).do([Work(p, steps) for (_, p), (*_, steps) in zip(together, cases, strict=True)])
+    for (one, _), (two, _), (factor, numbers, steps) in zip(alone, together, cases, strict=True):
+        np.testing.assert_array_equal(one.numpy(), two.numpy())
+        np.testing.assert_allclose(two.numpy(), 2.0 * (2 + steps) * factor * np.array(numbers), rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_work_without_steps_does_nothing(count):
+    both = kernels()
+    found = [scene(*both, 1.0, [1.0, 2.0]) for _ in range(count)]
+    Worker(find_device("cpu")).do([Work(program, 0) for _, program in found])
+    assert all(not to.numpy().any() for to, _ in found)
+
+
+def test_those_who_have_no_steps_to_do_wait():
+    both, worker = kernels(), Worker(find_device("cpu"))
+    (one, first), (two, second) = (scene(*both, 1.0, [1.0]) for _ in range(2))
+    worker.do([Work(first, 1), Work(second, 0)])
+    assert (one.numpy()[0], two.numpy()[0]) == (6.0, 0.0)
+    worker.do([Work(first, 0), Work(second, 2)])
+    assert (one.numpy()[0], two.numpy()[0]) == (6.0, 8.0)
+
+
+def test_programs_of_other_kernels_are_done_apart():
+    add, double = kernels()
+    to, first = scene(add, double, 1.0, [1.0])
+    works = [Work(first, 1), Work(Program([Launch(double, 1, [to], find_device("cpu"))]), 1)]
+    Worker(find_device("cpu")).do(works)
+    assert to.numpy()[0] == 12.0
+    assert [work.shared_by for work in works] == [2, 2]
+
+
+def test_kernels_compile_for_a_gpu(tmp_path):
+    """Also where there is none: Warp brings CUDA's compiler."""
+    find_device("cpu")
+    if not (targets := wp.get_cuda_supported_archs()):
+        pytest.skip("this Warp was built without CUDA")
+    everything = Effects(fluidity=True, nonlocality=True)
+    particles = transfer(wp.float32, everything, ContactLaw(free=True), atomic=True)
+    nodes = grid_step(wp.float32, ("no_slip",) * 3)
+    kernels = [*vars(particles).values(), *vars(nodes).values()]
+    for kernel in kernels:
+        wp.compile_aot_module(kernel.together.module, arch=targets[0], module_dir=tmp_path, use_ptx=True)
+    assert len(list(tmp_path.glob("*.ptx"))) == len(kernels) == 7

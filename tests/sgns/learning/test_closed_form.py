@@ -1,0 +1,249 @@
+"""Polynomial latent dynamics: known systems are found, rollouts are steps, nothing runs away."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny import reduced
+
+from sgns.learning.body import BodyTrack
+from sgns.learning.closed_form import ClosedForm, normalised, polynomial_terms, raw_inputs
+from sgns.learning.closed_form_fit import (
+    Setting,
+    candidates,
+    choose,
+    coefficients,
+    fit,
+    moments,
+    ridge,
+    sparse,
+    unfitted,
+)
+from sgns.learning.data import TrainingWindows
+from sgns.learning.validation import ValidationRollouts
+
+HISTORY = 3
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return reduced(tmp_path_factory.mktemp("tiny"))
+
+
+def windows_of(runs, modes: int = 4) -> TrainingWindows:
+    return TrainingWindows(runs, modes, HISTORY, "pose")
+
+
+def with_known_law(data, law):
+    """Runs of random tool paths and random starts whose two modes, force and torque follow a law.
+
+    They are short and many: within a run the law ties the newest velocity to the other inputs, so that only the starts
+    tell which of them a step depends on.
+
+    Args:
+        data: Where the rest of a run comes from.
+        law: (latent history (3, 2, 3), displacement (3,)) -> velocity (2, 3), force (3,), torque (3,).
+    """
+    rng = np.random.default_rng(0)
+    runs = []
+    frames, pattern = 8, data.runs("train")[0]
+    for _ in range(220):
+        pose = np.zeros((frames, 7))
+        pose[:, 6] = 1.0
+        pose[:, :3] = np.cumsum(0.01 * rng.standard_normal((frames, 3)), axis=0)
+        latent = np.zeros((frames, 2, 3))
+        latent[0] = rng.standard_normal((2, 3))
+        force, torque = np.zeros((frames, 3)), np.zeros((frames, 3))
+        shown = [latent[0]] * HISTORY
+        for t in range(1, frames):
+            velocity, force[t], torque[t] = law(np.array(shown), pose[t, :3] - pose[t - 1, :3])
+            latent[t] = latent[t - 1] + velocity
+            shown = [*shown[1:], latent[t]]
+        runs.append(
+            replace(
+                pattern, latent=latent, pose=pose, force=force, torque=torque, time=np.arange(frames) / 60.0
+            )
+        )
+    return runs
+
+
+def linear_law(shown, step):
+    velocity = shown[-1] - shown[-2]
+    move = 0.3 * velocity[::-1] - 0.05 * shown[-1] + np.outer([1.0, -0.5], step)
+    return move, 100.0 * step + shown[-1, 0], 7.0 + shown[-1, 1] - 20.0 * step
+
+
+def sparse_law(shown, step):
+    """Two terms in each velocity, one of them a product."""
+    move = 0.5 * np.outer([1.0, -2.0], step) + 0.5 * shown[-1] * step[0]
+    return move, 100.0 * step, 50.0 * step
+
+
+def check_rollouts(model, runs) -> None:
+    """A law found exactly holds outside the range of the training runs, too."""
+    model.bounds.copy_(torch.tensor([[-torch.inf], [torch.inf]]))
+    rollouts = ValidationRollouts(runs, 2, HISTORY, "pose")
+    score = rollouts.measure(model)
+    assert min(score.skill, score.skill_at_rest) > 1 - 1e-9
+    assert max(score.force_nrmse, score.force_nrmse_at_rest) < 1e-5
+
+
+def test_terms_are_all_monomials_once() -> None:
+    assert polynomial_terms(3, 1).tolist() == [[0, 0], [0, 1], [0, 2], [0, 3]]
+    pairs = {tuple(pair) for pair in polynomial_terms(3, 2).tolist()}
+    assert pairs == {(i, j) for i in range(4) for j in range(i, 4)}
+    assert polynomial_terms(3, 2)[0].tolist() == [0, 0]
+
+
+def test_monomials_are_products_of_inputs(data) -> None:
+    windows = windows_of(data.runs("train"))
+    model = unfitted(windows, 2)
+    batch = windows.windows(windows.targets)
+    inputs = normalised(model.inputs, raw_inputs(batch.history, batch.body))[:, model.used]
+    # Inputs that never move are left out; the others are of order one.
+    assert (inputs.std(0) > 0.01).all() and len(model.used) < len(model.inputs.mean)
+    values = model.monomials(batch.history, batch.body)
+    for place, (i, j) in enumerate(model.terms.tolist()):
+        expected = torch.ones(len(inputs), dtype=torch.float64)
+        for factor in (i, j):
+            expected = expected * (inputs[:, factor - 1] if factor else 1.0)
+        torch.testing.assert_close(values[:, place], expected)
+
+
+def test_unfitted_stands_still_with_the_mean_force(data) -> None:
+    windows = windows_of(data.runs("train"))
+    batch = windows.windows(windows.targets[:5])
+    latent, force, torque = unfitted(windows, 2).advance(batch.history, batch.body)
+    assert torch.equal(latent, batch.history[:, -1])
+    for found, series in ((force, windows.force), (torque, windows.torque)):
+        mean = series[windows.targets].double().mean(0)
+        torch.testing.assert_close(found, mean.expand(5, 3))
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_ridge_finds_a_linear_system(data, degree) -> None:
+    runs = with_known_law(data, linear_law)
+    # Without a penalty the law is exact on runs that are held out, too.
+    model = fit(windows_of(runs[:-20], 2), degree, Setting(0.0, 0.0), Setting(0.0, 0.0))
+    check_rollouts(model, runs[-20:])
+
+
+def test_noise_is_on_the_inputs_and_not_on_the_targets(data) -> None:
+    windows = windows_of(data.runs("train"))
+    model = unfitted(windows, 1)
+    model.bounds.copy_(torch.tensor([[-torch.inf], [torch.inf]]))
+    clean, noisy = moments(model, windows, draws=1), moments(model, windows, noise=0.5, draws=40)
+    # Raw inputs are 12 positions, then 12 older and 12 newest velocities.
+    moving = [(place, int(raw)) for place, raw in enumerate(model.used, 1) if 24 <= raw < 36]
+    assert len(moving) > 4
+    for place, raw in moving:
+        added = (0.5 * model.outputs.scale[raw - 24] / model.inputs.scale[raw]) ** 2
+        torch.testing.assert_close(
+            noisy.gram[place, place] - clean.gram[place, place], added, rtol=0.2, atol=0.0
+        )
+    # With the constant, targets average to the same.
+    torch.testing.assert_close(noisy.target[0], clean.target[0])
+    again = moments(model, windows, noise=0.5, draws=40)
+    assert torch.equal(again.gram, noisy.gram)
+
+
+def test_penalty_draws_towards_the_mean(data) -> None:
+    windows = windows_of(data.runs("train"))
+    model = unfitted(windows, 2)
+    known = moments(model, windows)
+    sizes = [ridge(known, penalty)[1:].norm() for penalty in (1e-3, 1e-1, 1e1, 1e9)]
+    assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 1e-6
+    # The constant is free.
+    torch.testing.assert_close(ridge(known, 1e9)[0], known.target[0], rtol=1e-6, atol=1e-6)
+
+
+def test_sparse_finds_the_true_terms(data) -> None:
+    runs = with_known_law(data, sparse_law)
+    windows = windows_of(runs[:-20], 2)
+    model = unfitted(windows, 2)
+    known = moments(model, windows, draws=1)
+    model.weights.copy_(sparse(known, 0.0, 1e-4))
+    check_rollouts(model, runs[-20:])
+    # Inputs are the newest positions (6), velocities (12), the body's place (3) and its three displacements.
+    place = {int(raw): i + 1 for i, raw in enumerate(model.used)}
+    newest = 3 * 2 + 3 * 2 * 2 + 3 + 6 + 6
+    step = [place[newest + axis] for axis in range(3)]
+    terms = [tuple(pair) for pair in model.terms.tolist()]
+    for output in range(3):  # force: its own displacement and the mean, which is not zero
+        kept = {terms[i] for i in model.weights[:, 6 + output].nonzero().flatten()}
+        assert kept == {(0, 0), (0, step[output])}
+    for mode in range(2):
+        for axis in range(3):
+            kept = {terms[i] for i in model.weights[:, 3 * mode + axis].nonzero().flatten()}
+            # The product's positions have a mean, which the term of the step alone takes.
+            product = tuple(sorted((place[3 * mode + axis], step[0])))
+            assert kept == {(0, step[axis]), (0, step[0]), product}
+
+
+def test_a_threshold_above_everything_leaves_nothing(data) -> None:
+    windows = windows_of(data.runs("train"))
+    model = unfitted(windows, 1)
+    known = moments(model, windows)
+    assert not sparse(known, 1e-3, 1e3).any()
+    counts = [int(sparse(known, 1e-3, t).count_nonzero()) for t in (1e-12, 1e-2, 1e-1)]
+    assert counts == sorted(counts, reverse=True) and counts[0] > counts[-1] > 0
+    model.weights.copy_(sparse(known, 1e-3, 1e-1))
+    assert model.num_terms == counts[-1]
+    assert torch.equal(coefficients(known, Setting(0.0, 1e-3)), ridge(known, 1e-3))
+
+
+def test_unrolling_is_stepping(data) -> None:
+    windows = windows_of(data.runs("train"))
+    model = fit(windows, 2, Setting(0.3, 1e-2), Setting(0.1, 1e-1))
+    frames = torch.arange(10)
+    body = BodyTrack(*(part[frames][None] for part in windows.body))
+    latent, force, torque = model.unroll(windows.latent[None, :HISTORY], body)
+    states = list(windows.latent[:HISTORY])
+    for t in range(HISTORY, 10):
+        window = body.frames(slice(t - HISTORY + 1, t + 1))
+        z, f, m = model.advance(torch.stack(states[-HISTORY:])[None], window)
+        states.append(z[0])
+        assert torch.equal(f[0], force[0, t]) and torch.equal(m[0], torque[0, t])
+    assert torch.equal(torch.stack(states), latent[0])
+    assert not force[0, :HISTORY].any() and not torque[0, :HISTORY].any()
+
+
+def test_nothing_runs_away_outside_the_known_range(data) -> None:
+    windows = windows_of(data.runs("train"))
+    model = unfitted(windows, 2)
+    model.weights.copy_(10.0 * ridge(moments(model, windows), 1e-6))  # unstable
+    batch = windows.windows(windows.targets[:4])
+    body = BodyTrack(*(part[:, -1:].expand(-1, 300, -1, -1) for part in batch.body))
+    latent, force, _ = model.unroll(batch.history, body)
+    largest = model.monomials(batch.history, batch.body).shape[1] * float(
+        model.bounds.abs().amax().clamp_min(1.0) ** 2
+        * model.weights.abs().max()
+        * model.outputs.scale[:12].max()
+    )
+    assert float((latent[:, 1:] - latent[:, :-1]).abs().max()) <= largest + float(windows.latent.abs().max())
+    assert torch.isfinite(force).all()
+
+
+def test_settings_are_chosen_by_rollouts(data) -> None:
+    windows = windows_of(data.runs("train"))
+    rollouts = ValidationRollouts(data.runs("validation"), 4, HISTORY, "pose")
+    model = unfitted(windows, 1)
+    known = {noise: moments(model, windows, noise) for noise in (0.0, 0.3)}
+    found = candidates(known, (1e-3, 1e-1))
+    motion, force = choose(model, found, rollouts)
+    assert len(found) == 4
+    chosen = rollouts.measure(model)
+    for weights in found.values():
+        model.weights.copy_(weights)
+        assert rollouts.measure(model).skill <= chosen.skill
+    # The force is chosen along the chosen motion, from settings of its own.
+    modes = 3 * model.num_modes
+    for weights in found.values():
+        model.weights.copy_(torch.cat([found[motion][:, :modes], weights[:, modes:]], dim=1))
+        assert rollouts.measure(model).force_nrmse >= chosen.force_nrmse
+    again = fit(windows, 1, motion, force)
+    assert isinstance(again, ClosedForm)
+    torch.testing.assert_close(rollouts.measure(again).force, chosen.force)

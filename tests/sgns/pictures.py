@@ -1,0 +1,20 @@
+"""Looking at figures in tests."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from matplotlib import image
+from matplotlib.figure import Figure
+
+from sgns.evaluation import figures
+
+__all__ = ["pixels"]
+
+
+def pixels(figure: Figure) -> np.ndarray:
+    """The drawn picture, shape (height, width, channels); fails if it is empty."""
+    picture = image.imread(io.BytesIO(figures.png(figure)))
+    assert picture[..., :3].std() > 0.01
+    return picture
