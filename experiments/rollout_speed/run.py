@@ -294,9 +294,9 @@ def draw(rows: list[dict[str, object]]) -> None:
         names = [f"{row['network']}: {row['what']}" if prefix else str(row["what"]) for row in shown]
         values = [float(row[key]) for row in shown]
         colours = ["0.5" if "dense" in n or "plain" in n else "C0" for n in names]
-        axis.bar_label(axis.barh(names, values, color=colours), fmt=" %.3g", fontsize=7)
+        axis.bar_label(axis.barh(names, values, color=colours), fmt=" %.0f", fontsize=7)
         axis.set_title(title, fontsize=9)
-        axis.set_xlim(0, 1.15 * max(values))
+        axis.set_xlim(0, 1.2 * max(values))
         axis.tick_params(labelsize=7)
         axis.invert_yaxis()
     figure.savefig(HERE / "bars.png", dpi=130)
