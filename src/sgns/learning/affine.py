@@ -17,8 +17,8 @@ __all__ = ["affine", "prefers_onednn"]
 
 # Below this many multiplications a product is over before oneDNN has begun.
 _WORTH_IT = 2**22
-# A product over more rows than this is slow to reduce in transposed form.
-_ROWS_TRANSPOSED = 4096
+# Rows whose products with each other are summed at once: more fall out of the cache, and take many times as long.
+_ROWS_AT_ONCE = 2048
 _AVAILABLE = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
@@ -77,6 +77,6 @@ class _Affine(torch.autograd.Function):
             gradient = torch.ops.aten.threshold_backward(gradient, y[0], 0)
         rows, inputs = gradient.reshape(-1, gradient.shape[-1]), x.reshape(-1, x.shape[-1])
         to_x = product(gradient, weight.t().contiguous()) if ctx.needs_input_grad[0] else None
-        transposed = len(rows) <= _ROWS_TRANSPOSED
-        to_weight = product(rows.t(), inputs.t()) if transposed else rows.t() @ inputs
+        blocks = zip(rows.split(_ROWS_AT_ONCE), inputs.split(_ROWS_AT_ONCE), strict=True)
+        to_weight = sum(product(row.t(), value.t()) for row, value in blocks)
         return to_x, to_weight, rows.sum(0), None
