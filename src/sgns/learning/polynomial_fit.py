@@ -1,11 +1,11 @@
-"""Coefficients of `ClosedForm`: ridge regression (dynamic mode decomposition with control: Proctor, Brunton, Kutz
+"""Coefficients of `PolynomialDynamics`: ridge regression (dynamic mode decomposition with control: Proctor, Brunton, Kutz
 2016, doi:10.1137/15M1013857) and sequentially thresholded least squares (SINDy: Brunton, Proctor, Kutz 2016,
 doi:10.1073/pnas.1517384113).
 
 Both need only the moments of monomials and outputs, summed once over all windows and noise draws. What one step
 cannot tell, the noise and the penalty, is chosen by rollouts of validation runs.
 
-Letters: r modes, p inputs, m monomials, o = 3r + 6 outputs.
+Letters: B batch, r modes, p inputs, m monomials, f free axes of the body, o = 3r + f + 6 outputs.
 """
 
 from __future__ import annotations
@@ -16,14 +16,26 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from sgns.learning.closed_form import ClosedForm, normalised, polynomial_terms, raw_inputs
 from sgns.learning.data import Batch, TrainingWindows, generator, random_walk
 from sgns.learning.normalisation import Standardiser
+from sgns.learning.polynomial import PolynomialDynamics, normalised
+from sgns.learning.polynomial_settings import PolynomialSettings
 
 if TYPE_CHECKING:
     from sgns.learning.validation import RolloutScore, ValidationRollouts
 
-__all__ = ["Moments", "Setting", "candidates", "choose", "fit", "moments", "ridge", "sparse", "unfitted"]
+__all__ = [
+    "Moments",
+    "Setting",
+    "candidates",
+    "choose",
+    "moments",
+    "refitted",
+    "ridge",
+    "sparse",
+    "take",
+    "unfitted",
+]
 
 # Windows whose monomials are in memory at once.
 _CHUNK = 2048
@@ -57,37 +69,55 @@ class Moments(NamedTuple):
     target: Tensor
 
 
-def unfitted(windows: TrainingWindows, degree: int, floor: float = 0.01) -> ClosedForm:
+def unfitted(
+    windows: TrainingWindows,
+    settings: PolynomialSettings,
+    context: tuple[str, ...] = (),
+    predicts_body: bool = False,
+    floor: float = 0.01,
+) -> PolynomialDynamics:
     """Polynomials with the statistics of the training windows and all coefficients zero.
 
     They predict that nothing moves and that the force is the training runs' mean.
 
     Args:
         windows: The training windows.
-        degree: 1 or 2.
+        settings: What to build.
+        context: Keys of the scene whose numbers the windows hold.
+        predicts_body: Whether the body's height is predicted.
         floor: Smallest scale as a share of the quantity's largest.
     """
     batch = windows.windows(windows.targets)
-    groups = raw_inputs(batch.history, batch.body)
-    # Velocities and motions keep their zero, which means rest.
-    centred = (True, False, True, True, False, False)
-    inputs = joined(
-        [Standardiser.fit(group, floor, keep) for group, keep in zip(groups, centred, strict=False)]
-    )
+    modes = batch.latent.shape[2]
+    blank = PolynomialDynamics(settings, modes, context, predicts_body, ())
+    groups = blank.raw_inputs(batch.history, batch.body, batch.context)
+    # Velocities and motions keep their zero, which means rest. What is free of a body moves little beside what is
+    # prescribed, and the numbers of the context have nothing in common: no floor for these.
+    centred = (True, False, True, True, False, False, True, False, True)
+    floors = (floor,) * 6 + (0.0,) * 3
+    inputs = joined([Standardiser.fit(*of_group) for of_group in zip(groups, floors, centred, strict=True)])
     values = normalised(inputs, groups)
-    used = (values.std(0) > _STILL).nonzero().flatten()
-    bounds = torch.stack([values[:, used].amin(0), values[:, used].amax(0)])
-    velocity = (batch.latent[:, -1] - batch.latent[:, -2]).flatten(1)
-    outputs = joined(
-        [
-            Standardiser.fit(velocity, floor, centred=False),
-            Standardiser.fit(batch.force, floor),
-            Standardiser.fit(batch.torque, floor),
-        ]
-    )
-    terms = polynomial_terms(len(used), degree)
-    weights = torch.zeros(len(terms), len(outputs.mean), dtype=torch.float64)
-    return ClosedForm(windows.history, batch.latent.shape[2], inputs, used, bounds, outputs, terms, weights)
+    used = (values.std(0) > _STILL).nonzero()[:, 0]
+    model = PolynomialDynamics(settings, modes, context, predicts_body, used.tolist())
+    model.inputs = inputs
+    model.bounds = torch.stack([values[:, used].amin(0), values[:, used].amax(0)])
+    velocity, rise, force, torque = true_outputs(model, batch)
+    model.velocity = Standardiser.fit(velocity, floor, centred=False)
+    model.body_displacement = Standardiser.fit(rise, centred=False)
+    model.force = Standardiser.fit(force, floor)
+    model.torque = Standardiser.fit(torque, floor)
+    return model
+
+
+def true_outputs(model: PolynomialDynamics, batch: Batch) -> list[Tensor]:
+    """Velocities [m], the body's displacement along free axes [m], force [N] and torque [N m], each (B, width).
+
+    The true velocity whatever error the history has: errors of the velocity are corrected and those of the position
+    left, as the network is taught.
+    """
+    velocity = batch.latent[:, -1] - batch.latent[:, -2]
+    rise = batch.body.motion[:, -1, 0, :3][:, model.free]
+    return [velocity.flatten(1), rise, batch.force[:, 0], batch.torque[:, 0]]
 
 
 def joined(parts: Sequence[Standardiser]) -> Standardiser:
@@ -95,7 +125,9 @@ def joined(parts: Sequence[Standardiser]) -> Standardiser:
     return Standardiser(torch.cat([p.mean for p in parts]), torch.cat([p.scale for p in parts]))
 
 
-def moments(model: ClosedForm, windows: TrainingWindows, noise: float = 0.0, draws: int = 2) -> Moments:
+def moments(
+    model: PolynomialDynamics, windows: TrainingWindows, noise: float = 0.0, draws: int = 2
+) -> Moments:
     """Moments of a model's monomials and outputs; its coefficients do not matter.
 
     Args:
@@ -104,25 +136,22 @@ def moments(model: ClosedForm, windows: TrainingWindows, noise: float = 0.0, dra
         noise: As in `Setting`.
         draws: How often all windows are taken, with other noise each time.
     """
-    scale = noise * model.outputs.scale[: 3 * model.num_modes].unflatten(0, (-1, 3))
+    scale = noise * model.velocity.scale.unflatten(0, (-1, 3))
+    body_scale = torch.zeros(1, 3, dtype=torch.float64)
+    body_scale[:, model.free] = noise * model.body_displacement.scale
+    outputs = joined(model.outputs())
     gram = torch.zeros(2 * model.weights.shape[:1], dtype=torch.float64)
     target = torch.zeros_like(model.weights)
     for draw in range(draws):
         source = generator(windows.seed, draw, 1)
         for rows in windows.targets.split(_CHUNK):
-            walk = random_walk(scale, (len(rows), windows.history), source)
-            batch = windows.windows(rows, walk)
-            monomials = model.monomials(batch.history, batch.body)
+            shape = len(rows), windows.history
+            walks = random_walk(scale, shape, source), random_walk(body_scale, shape, source)
+            batch = windows.windows(rows, walks)
+            monomials = model.monomials(batch.history, batch.shown_body, batch.context)
             gram += monomials.T @ monomials
-            target += monomials.T @ wanted(model, batch)
+            target += monomials.T @ normalised(outputs, true_outputs(model, batch))
     return Moments(gram / (draws * len(windows)), target / (draws * len(windows)))
-
-
-def wanted(model: ClosedForm, batch: Batch) -> Tensor:
-    """Normalised outputs of a batch, shape (B, o): the true velocity whatever error the history has, so that errors of
-    the velocity are corrected and those of the position left, as the network is taught."""
-    velocity = (batch.latent[:, -1] - batch.latent[:, -2]).flatten(1)
-    return normalised(model.outputs, [velocity, batch.force, batch.torque])
 
 
 def ridge(known: Moments, penalty: float) -> Tensor:
@@ -192,7 +221,7 @@ def candidates(
 
 
 def choose(
-    model: ClosedForm, found: Mapping[Setting, Tensor], rollouts: ValidationRollouts
+    model: PolynomialDynamics, found: Mapping[Setting, Tensor], rollouts: ValidationRollouts
 ) -> tuple[Setting, Setting]:
     """Give a model the best coefficients: of the modes by the skill of rollouts, then of force and torque by the
     force error along the rollouts of these modes.
@@ -208,7 +237,7 @@ def choose(
 
     def score(motion: Setting, force: Setting) -> RolloutScore:
         take(model, found[motion], found[force])
-        return rollouts.measure(model)  # type: ignore[arg-type]
+        return rollouts.measure(model)
 
     motion = max(found, key=lambda setting: score(setting, setting).skill)
     force = min(found, key=lambda setting: score(motion, setting).force_nrmse)
@@ -216,15 +245,14 @@ def choose(
     return motion, force
 
 
-def fit(windows: TrainingWindows, degree: int, motion: Setting, force: Setting) -> ClosedForm:
-    """A model of known settings, for instance those that `choose` found on a part of the runs."""
-    model = unfitted(windows, degree)
-    known = {noise: moments(model, windows, noise) for noise in {motion.noise, force.noise}}
+def take(model: PolynomialDynamics, motion: Tensor, force: Tensor) -> None:
+    """Coefficients of everything that moves from one matrix, those of force and torque from another."""
+    model.weights.copy_(torch.cat([motion[:, :-6], force[:, -6:]], dim=1))
+
+
+def refitted(
+    model: PolynomialDynamics, windows: TrainingWindows, motion: Setting, force: Setting, draws: int = 2
+) -> None:
+    """Give a model the coefficients of settings that `choose` found on a part of these windows."""
+    known = {noise: moments(model, windows, noise, draws) for noise in {motion.noise, force.noise}}
     take(model, *(coefficients(known[setting.noise], setting) for setting in (motion, force)))
-    return model
-
-
-def take(model: ClosedForm, motion: Tensor, force: Tensor) -> None:
-    """Coefficients of the modes from one matrix, those of force and torque from another."""
-    modes = 3 * model.num_modes
-    model.weights.copy_(torch.cat([motion[:, :modes], force[:, modes:]], dim=1))
