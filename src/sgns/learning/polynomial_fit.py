@@ -1,5 +1,5 @@
-"""Coefficients of `PolynomialDynamics`: ridge regression (dynamic mode decomposition with control: Proctor, Brunton, Kutz
-2016, doi:10.1137/15M1013857) and sequentially thresholded least squares (SINDy: Brunton, Proctor, Kutz 2016,
+"""Coefficients of `PolynomialDynamics`: ridge regression (dynamic mode decomposition with control: Proctor, Brunton,
+Kutz 2016, doi:10.1137/15M1013857) and sequentially thresholded least squares (SINDy: Brunton, Proctor, Kutz 2016,
 doi:10.1073/pnas.1517384113).
 
 Both need only the moments of monomials and outputs, summed once over all windows and noise draws. What one step
@@ -143,10 +143,10 @@ def moments(
     gram = torch.zeros(2 * model.weights.shape[:1], dtype=torch.float64)
     target = torch.zeros_like(model.weights)
     for draw in range(draws):
-        source = generator(windows.seed, draw, 1)
+        source, body_source = (generator(windows.seed, draw, stream) for stream in (1, 2))
         for rows in windows.targets.split(_CHUNK):
             shape = len(rows), windows.history
-            walks = random_walk(scale, shape, source), random_walk(body_scale, shape, source)
+            walks = random_walk(scale, shape, source), random_walk(body_scale, shape, body_source)
             batch = windows.windows(rows, walks)
             monomials = model.monomials(batch.history, batch.shown_body, batch.context)
             gram += monomials.T @ monomials

@@ -69,7 +69,8 @@ class Surrogate(nn.Module):
         super().__init__()
         if basis.num_modes != dynamics.num_modes:
             raise UserError(
-                f"the basis has {basis.num_modes} modes and the {dynamics.settings.kind} {dynamics.num_modes}; they must agree"
+                f"the basis has {basis.num_modes} modes and the {dynamics.settings.kind} {dynamics.num_modes}; they "
+                "must agree"
             )
         self.dynamics = dynamics
         self.basis = basis

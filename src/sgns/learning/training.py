@@ -41,7 +41,7 @@ from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.validation import ValidationRollouts
 from sgns.poses import in_body_frame
 from sgns.reduction.reduced import ReducedDataset, ReducedRun, reduce_dataset
-from sgns.settings import check_fields, differences, flattened
+from sgns.settings import differences, flattened
 from sgns.wholefile import write_whole
 
 if TYPE_CHECKING:
@@ -102,8 +102,8 @@ def train(
         training: Values of `conf/training`.
         output: Folder for checkpoints and logs.
         seed: Of weights, noise and order.
-        device: "cpu" or "cuda".
-        start_from: Checkpoint whose weights and normalisation to start from.
+        device: "cpu" or "cuda"; polynomials know the first only.
+        start_from: Checkpoint whose weights and normalisation a network starts from.
         provenance: More plain values for the checkpoint.
 
     Returns:
@@ -139,17 +139,17 @@ def train(
 
     torch.manual_seed(seed)
     logger = TensorBoardLogger(output, name="", version="tensorboard", default_hp_metric=False)
-    began = time.perf_counter()
     if isinstance(settings, FitSettings):
         check_start(start_from, device)
         runs = reduced.runs("train")
+        began = time.perf_counter()
         fitted = fit_polynomial(
             runs, validation_runs, num_modes, model_settings, settings, moves_freely(runs), seed
         )
+        seconds = time.perf_counter() - began
+        surrogate, score, about = surrogate_of(fitted.dynamics, reduced, card), fitted.score, fitted.about()
         make_folder(output)
-        surrogate = surrogate_of(fitted.dynamics, reduced, card)
         surrogate.save(output / "best.ckpt")
-        score, about = fitted.score, fitted.about()
     else:
         surrogate, data = prepared(reduced, num_modes, model_settings, settings, seed, card, start_from)
         rollouts = ValidationRollouts(
@@ -163,10 +163,11 @@ def train(
         module = SurrogateTraining(surrogate, settings)
         with quiet_lightning():
             trainer = make_trainer(output, settings, device, callbacks, logger)
+            began = time.perf_counter()
             fit(trainer, module, data, output / "last.ckpt" if resumed else None)
+            seconds = time.perf_counter() - began
         score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
         about = {"steps": settings.max_steps}
-    seconds = time.perf_counter() - began
 
     metrics = {"skill": score.skill, "skill_at_rest": score.skill_at_rest, "force_nrmse": score.force_nrmse}
     if surrogate.dynamics.predicts_body:
