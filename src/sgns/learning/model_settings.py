@@ -73,7 +73,7 @@ class ModelSettings:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a checkpoint."""
-        return asdict(self)
+        return {"kind": self.kind} | asdict(self)
 
 
 def check_context(keys: Any) -> None:

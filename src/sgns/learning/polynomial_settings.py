@@ -39,7 +39,7 @@ class PolynomialSettings:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a checkpoint."""
-        return asdict(self)
+        return {"kind": self.kind} | asdict(self)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from tiny import reduced
 
+from sgns.errors import UserError
 from sgns.learning.body import BodyTrack
 from sgns.learning.data import TrainingWindows
 from sgns.learning.polynomial import PolynomialDynamics, normalised, polynomial_terms
@@ -258,3 +259,105 @@ def test_settings_are_chosen_by_rollouts(data) -> None:
     again = fit(windows, 1, motion, force)
     assert again.num_terms == model.num_terms
     torch.testing.assert_close(rollouts.measure(again).force, chosen.force)
+
+
+def wheels(data, count: int = 220, frames: int = 8):
+    """Short runs of wheels on random ways, whose height, two modes and force are linear in what is known before a
+    step, and in the load."""
+    rng = np.random.default_rng(1)
+    runs, pattern = [], data.runs("train")[0]
+    for _ in range(count):
+        load = float(rng.uniform(50.0, 150.0))
+        pose = np.zeros((frames, 7))
+        pose[:, 6] = 1.0
+        pose[:, 0] = np.cumsum(0.01 * rng.standard_normal(frames))
+        pose[0, 2] = 0.02 * rng.standard_normal()
+        latent = np.zeros((frames, 2, 3))
+        latent[0] = rng.standard_normal((2, 3))
+        force = np.zeros((frames, 3))
+        for t in range(1, frames):
+            before, last = max(t - 2, 0), t - 1
+            drive = pose[t, 0] - pose[t - 1, 0]
+            fall = pose[last, 2] - pose[before, 2]
+            rise = 0.4 * fall - 0.1 * pose[last, 2] + 0.3 * drive + 1e-3 * latent[last, 0, 2] - 2e-5 * load
+            velocity = latent[last] - latent[before]
+            latent[t] = latent[last] + 0.3 * velocity - 0.05 * latent[last] + fall + drive + 1e-4 * load
+            pose[t, 2] = pose[last, 2] + rise
+            force[t] = 30.0 * drive + latent[last, 1] + 500.0 * fall + 0.1 * load
+        runs.append(
+            replace(
+                pattern,
+                latent=latent,
+                pose=pose,
+                force=force,
+                torque=np.zeros((frames, 3)),
+                time=np.arange(frames) / 60.0,
+                scene={"kind": "wheel", "load": load},
+            )
+        )
+    return runs
+
+
+def fitted_wheel(runs, context) -> PolynomialDynamics:
+    windows = TrainingWindows(runs, 2, HISTORY, "pose", context=context)
+    model = unfitted(windows, PolynomialSettings(HISTORY, 1, ["load"]), tuple(context), predicts_body=True)
+    refitted(model, windows, Setting(0.0, 0.0), Setting(0.0, 0.0))
+    model.bounds.copy_(torch.tensor([[-torch.inf], [torch.inf]]))
+    return model
+
+
+def test_a_wheels_height_is_predicted_and_the_load_is_used(data) -> None:
+    runs = wheels(data)
+    rollouts = ValidationRollouts(runs[-20:], 2, HISTORY, "pose", ["load"])
+    score = rollouts.measure(fitted_wheel(runs[:-20], ["load"]))
+    assert min(score.skill, score.skill_at_rest) > 1 - 1e-9 and score.force_nrmse < 1e-5
+    assert score.body_rmse < 1e-7
+    # Not told the load, it has to guess.
+    ignorant = ValidationRollouts(runs[-20:], 2, HISTORY, "pose").measure(fitted_wheel(runs[:-20], []))
+    assert ignorant.body_rmse > 1e-4 and ignorant.force_nrmse > 1e-3
+
+
+def test_where_a_wheel_will_be_is_not_looked_at(data) -> None:
+    runs = wheels(data)
+    model = fitted_wheel(runs, ["load"])
+    windows = TrainingWindows(runs[:3], 2, HISTORY, "pose", context=["load"])
+    batch = windows.windows(windows.targets)
+    seen = model.advance(batch.history, batch.body, batch.context)
+    elsewhere = batch.body.moved_last(batch.body.motion[:, -1, :, :3] + torch.tensor([0.0, 0.0, 1.0]))
+    again = model.advance(batch.history, elsewhere, batch.context)
+    for one, other in zip(seen, again, strict=True):
+        assert torch.equal(one, other)
+    assert torch.equal(seen.displacement[..., :2], batch.body.motion[:, -1, :, :2])
+    with pytest.raises(UserError, match="this polynomial needs the scene's load"):
+        model.advance(batch.history, batch.body)
+
+
+def test_noise_moves_a_free_body_as_well(data) -> None:
+    windows = TrainingWindows(wheels(data, 40), 2, HISTORY, "pose", context=["load"])
+    model = unfitted(windows, PolynomialSettings(HISTORY, 1, ["load"]), ("load",), predicts_body=True)
+    model.bounds.copy_(torch.tensor([[-torch.inf], [torch.inf]]))
+    clean, noisy = (moments(model, windows, noise, draws=20) for noise in (0.0, 0.5))
+    # The newest past rise is the last input before the context; its noise is that of the newest velocity.
+    place = len(model.inputs.mean) - 2
+    column = 1 + model.used.tolist().index(place)
+    added = (0.5 * model.body_displacement.scale[0] / model.inputs.scale[place]) ** 2
+    found = noisy.gram[column, column] - clean.gram[column, column]
+    torch.testing.assert_close(found, added, rtol=0.1, atol=0.0)
+    torch.testing.assert_close(noisy.target[0], clean.target[0])
+
+
+def test_fewer_modes_are_the_others_at_their_mean(data) -> None:
+    windows = windows_of(data.runs("train"))
+    model = fit(windows, 2, Setting(0.1, 1e-2), Setting(0.1, 1e-2))
+    batch = windows.windows(windows.targets[:20])
+    held = batch.history.clone()
+    held[:, :, 2:] = model.inputs.mean[: 3 * 4].unflatten(0, (4, 3))[2:]
+    step = model.advance(held, batch.body)
+    fewer = model.with_modes(2)
+    assert (fewer.num_modes, fewer.history) == (2, HISTORY)
+    found = fewer.advance(held[:, :, :2], batch.body)
+    torch.testing.assert_close(found.latent, step.latent[:, :2])
+    torch.testing.assert_close(found.force, step.force)
+    assert torch.equal(model.with_modes(4).weights, model.weights)
+    with pytest.raises(UserError, match="cannot have 5; allowed: 1 to 4"):
+        model.with_modes(5)
