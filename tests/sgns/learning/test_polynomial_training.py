@@ -31,6 +31,11 @@ def run(data, output, model=POLYNOMIAL, training=FIT, **kw) -> float:
     return train(data, num_modes=4, model=model, training=training, output=output, seed=3, **kw)
 
 
+def without_validation(data, count: int):
+    """The dataset with the first training runs only."""
+    return replace(data, _runs={"train": data.runs("train")[:count], "validation": [], "test": []})
+
+
 def fitted(data, **changes):
     runs = data.runs("train")
     return fit_polynomial(
@@ -78,8 +83,7 @@ def test_a_complete_fit_is_not_repeated(data, tmp_path, monkeypatch) -> None:
 
 
 def test_without_validation_runs_a_third_chooses_and_all_are_fitted(data, tmp_path, caplog) -> None:
-    alone = replace(data, split=data.split | {"validation": []})
-    skill = run(alone, tmp_path)
+    skill = run(without_validation(data, 4), tmp_path)
     assert "every third training run" in caplog.text
     runs = data.runs("train")
     settings = PolynomialSettings(**POLYNOMIAL), FitSettings.from_dict(FIT)
@@ -101,8 +105,7 @@ def test_without_validation_runs_a_third_chooses_and_all_are_fitted(data, tmp_pa
 
 
 def test_one_run_alone_can_be_fitted(data, tmp_path) -> None:
-    alone = replace(data, split={"train": data.runs("train")[:1], "validation": [], "test": []})
-    assert run(alone, tmp_path) > 0.5
+    assert run(without_validation(data, 1), tmp_path) > 0.5
 
 
 def test_what_chooses_is_the_best_there_is(data) -> None:
