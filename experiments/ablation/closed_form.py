@@ -160,7 +160,11 @@ def own_rows(config: Any, settings: FitSettings, checkpoint: Path | None) -> Ite
 
 
 def fold_scores(
-    known: Sequence[ReducedRun], rollouts: ValidationRollouts, context: list[str], settings: FitSettings
+    known: Sequence[ReducedRun],
+    rollouts: ValidationRollouts,
+    context: list[str],
+    settings: FitSettings,
+    degrees: Sequence[int],
 ) -> Iterator[tuple[dict[str, Any], RolloutScore]]:
     """Baselines and ridge regressions of some runs with their scores on others.
 
@@ -173,19 +177,21 @@ def fold_scores(
         unfitted(everything, PolynomialSettings(HISTORY, 1, context), told, wheel), [rollouts]
     ):
         yield about, score
-    for degree, name in NAMES.items():
+    for degree in degrees:
         model = PolynomialSettings(HISTORY, degree, context)
         began = time.perf_counter()
         fitted = fit_polynomial(known, known[::3], PUBLISHED_MODES, model, settings, wheel)
         about = {
-            "model": f"{name} ridge",
+            "model": f"{NAMES[degree]} ridge",
             "library": len(fitted.dynamics.terms),
             "seconds": time.perf_counter() - began,
         }
         yield about, rollouts.measure(fitted.dynamics)
 
 
-def published_rows(folder: Path, context: list[str], settings: FitSettings) -> Iterator[dict[str, Any]]:
+def published_rows(
+    folder: Path, context: list[str], settings: FitSettings, degrees: Sequence[int]
+) -> Iterator[dict[str, Any]]:
     """Ridge regressions on the authors' runs, every run predicted by the models of the fold that leaves it out."""
     for kind, particles in PARTICLES.items():
         rows: dict[str, dict[str, Any]] = {}
@@ -197,7 +203,7 @@ def published_rows(folder: Path, context: list[str], settings: FitSettings) -> I
             known, left_out = dataset.runs("train"), dataset.runs("test")
             told = varying_context(known, context)
             rollouts = ValidationRollouts(left_out, PUBLISHED_MODES, HISTORY, "pose", told)
-            for about, score in fold_scores(known, rollouts, context, settings):
+            for about, score in fold_scores(known, rollouts, context, settings, degrees):
                 logging.info("%s, fold %d: %s, skill %.3f", kind, fold, about, score.skill)
                 name = about["model"]
                 # The settings differ from fold to fold: the table has the sums.
@@ -215,6 +221,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--checkpoint", type=Path, default=None, help="a network to show beside them")
     parser.add_argument("--published", type=Path, default=None, help="the authors' runs instead")
+    parser.add_argument(
+        "--degrees", type=int, nargs="+", choices=(1, 2), default=(1, 2), help="of the published runs' models"
+    )
     parser.add_argument("overrides", nargs="*", help="for example dataset=quick")
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -227,7 +236,10 @@ def main() -> None:
         name, found = "closed_form.csv", own_rows(config, settings, options.checkpoint)
     else:
         context = plain["model"]["context"]
-        name, found = "closed_form_published.csv", published_rows(options.published, context, settings)
+        name, found = (
+            "closed_form_published.csv",
+            published_rows(options.published, context, settings, options.degrees),
+        )
     rows = []
     for row in found:
         logging.info("%s", row)
