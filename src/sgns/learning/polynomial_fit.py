@@ -156,9 +156,9 @@ def moments(
 
 def ridge(known: Moments, penalty: float) -> Tensor:
     """Least squares with a penalty on the squares of all coefficients but the constants', shape (m, o)."""
-    weight = torch.full((len(known.gram),), penalty, dtype=torch.float64)
-    weight[0] = 0.0
-    return solved(known.gram + weight.diag(), known.target)
+    gram = known.gram.clone()
+    gram.diagonal()[1:] += penalty
+    return solved(gram, known.target)
 
 
 def solved(gram: Tensor, target: Tensor) -> Tensor:
