@@ -124,7 +124,7 @@ def scores(
         shared = time.perf_counter() - began
         for threshold in thresholds:
             began = time.perf_counter()
-            motion, force = choose(model, candidates(known, settings.penalties, threshold), others[0])
+            motion, _, force = choose(model, candidates(known, settings.penalties, threshold), others[0])
             about = {
                 "model": NAMES[degree] + (", sparse" if threshold else " ridge"),
                 "threshold": threshold,

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sgns.learning.validation import RolloutScore, ValidationRollouts
 
 __all__ = [
+    "Choice",
     "Moments",
     "Setting",
     "candidates",
@@ -55,6 +56,20 @@ class Setting(NamedTuple):
     noise: float
     penalty: float
     threshold: float = 0.0
+
+
+class Choice(NamedTuple):
+    """How the coefficients of each group of outputs are found.
+
+    Attributes:
+        motion: Of the modes.
+        body: Of a body's free axes.
+        force: Of force and torque.
+    """
+
+    motion: Setting
+    body: Setting
+    force: Setting
 
 
 class Moments(NamedTuple):
@@ -222,37 +237,35 @@ def candidates(
 
 def choose(
     model: PolynomialDynamics, found: Mapping[Setting, Tensor], rollouts: ValidationRollouts
-) -> tuple[Setting, Setting]:
-    """Give a model the best coefficients: of the modes by the skill of rollouts, then of force and torque by the
-    force error along the rollouts of these modes.
+) -> Choice:
+    """Give a model the best coefficients: of the modes by the skill of rollouts, then of a free body by its error
+    along the rollouts of these modes, then of force and torque by the force error along those of both.
 
     Args:
         model: Its coefficients are replaced.
         found: From `candidates`.
         rollouts: Of the validation runs.
-
-    Returns:
-        The setting of the modes, and that of force and torque.
     """
 
-    def score(motion: Setting, force: Setting) -> RolloutScore:
-        take(model, found[motion], found[force])
+    def score(*choice: Setting) -> RolloutScore:
+        take(model, *(found[setting] for setting in choice))
         return rollouts.measure(model)
 
-    motion = max(found, key=lambda setting: score(setting, setting).skill)
-    force = min(found, key=lambda setting: score(motion, setting).force_nrmse)
-    take(model, found[motion], found[force])
-    return motion, force
+    motion = body = max(found, key=lambda setting: score(setting, setting, setting).skill)
+    if model.predicts_body:
+        body = min(found, key=lambda setting: score(motion, setting, motion).body_rmse)
+    force = min(found, key=lambda setting: score(motion, body, setting).force_nrmse)
+    take(model, found[motion], found[body], found[force])
+    return Choice(motion, body, force)
 
 
-def take(model: PolynomialDynamics, motion: Tensor, force: Tensor) -> None:
-    """Coefficients of everything that moves from one matrix, those of force and torque from another."""
-    model.weights.copy_(torch.cat([motion[:, :-6], force[:, -6:]], dim=1))
+def take(model: PolynomialDynamics, motion: Tensor, body: Tensor, force: Tensor) -> None:
+    """Coefficients of the modes, of a free body, and of force and torque from a matrix each."""
+    modes = 3 * model.num_modes
+    model.weights.copy_(torch.cat([motion[:, :modes], body[:, modes:-6], force[:, -6:]], dim=1))
 
 
-def refitted(
-    model: PolynomialDynamics, windows: TrainingWindows, motion: Setting, force: Setting, draws: int = 2
-) -> None:
+def refitted(model: PolynomialDynamics, windows: TrainingWindows, choice: Choice, draws: int = 2) -> None:
     """Give a model the coefficients of settings that `choose` found on a part of these windows."""
-    known = {noise: moments(model, windows, noise, draws) for noise in {motion.noise, force.noise}}
-    take(model, *(coefficients(known[setting.noise], setting) for setting in (motion, force)))
+    known = {noise: moments(model, windows, noise, draws) for noise in {setting.noise for setting in choice}}
+    take(model, *(coefficients(known[setting.noise], setting) for setting in choice))

@@ -11,7 +11,7 @@ from sgns.errors import UserError
 from sgns.learning.context import varying_context
 from sgns.learning.data import TrainingWindows
 from sgns.learning.polynomial import PolynomialDynamics
-from sgns.learning.polynomial_fit import Setting, candidates, choose, moments, refitted, unfitted
+from sgns.learning.polynomial_fit import Choice, candidates, choose, moments, refitted, unfitted
 from sgns.learning.polynomial_settings import FitSettings, PolynomialSettings
 from sgns.learning.validation import RolloutScore, ValidationRollouts
 
@@ -28,22 +28,20 @@ class Fitted(NamedTuple):
 
     Attributes:
         dynamics: The polynomials.
-        motion: Noise and penalty of the modes and of a free body.
-        force: Noise and penalty of force and torque.
+        choice: Noise and penalty of each group of outputs.
         score: On the runs that chose these.
     """
 
     dynamics: PolynomialDynamics
-    motion: Setting
-    force: Setting
+    choice: Choice
     score: RolloutScore
 
     def about(self) -> dict[str, Any]:
         """What training.json says of it beside the score."""
-        return {
-            "coefficients": self.dynamics.num_terms,
-            "motion": {"noise": self.motion.noise, "penalty": self.motion.penalty},
-            "force": {"noise": self.force.noise, "penalty": self.force.penalty},
+        groups = ("motion", "body", "force") if self.dynamics.predicts_body else ("motion", "force")
+        chosen = {group: getattr(self.choice, group) for group in groups}
+        return {"coefficients": self.dynamics.num_terms} | {
+            group: {"noise": setting.noise, "penalty": setting.penalty} for group, setting in chosen.items()
         }
 
 
@@ -84,13 +82,13 @@ def fit_polynomial(
     known = {noise: moments(dynamics, windows, noise, settings.draws) for noise in settings.noises}
     log.info("%d windows, %d monomials of %d inputs", len(windows), len(dynamics.terms), len(dynamics.used))
     rollouts = ValidationRollouts(choosing, num_modes, model.history, model.body_nodes, context)
-    motion, force = choose(dynamics, candidates(known, settings.penalties), rollouts)
+    choice = choose(dynamics, candidates(known, settings.penalties), rollouts)
     score = rollouts.measure(dynamics)
     if len(fitting) < len(runs):
         windows = windows_of(runs)
         dynamics = blank(windows)
-        refitted(dynamics, windows, motion, force, settings.draws)
-    return Fitted(dynamics, motion, force, score)
+        refitted(dynamics, windows, choice, settings.draws)
+    return Fitted(dynamics, choice, score)
 
 
 def check_start(start_from: str | Path | None, device: str) -> None:

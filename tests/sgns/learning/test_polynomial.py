@@ -14,6 +14,7 @@ from sgns.learning.body import BodyTrack
 from sgns.learning.data import TrainingWindows
 from sgns.learning.polynomial import PolynomialDynamics, normalised, polynomial_terms
 from sgns.learning.polynomial_fit import (
+    Choice,
     Setting,
     candidates,
     choose,
@@ -22,6 +23,7 @@ from sgns.learning.polynomial_fit import (
     refitted,
     ridge,
     sparse,
+    take,
     unfitted,
 )
 from sgns.learning.polynomial_settings import PolynomialSettings
@@ -45,7 +47,7 @@ def blank(windows, degree: int) -> PolynomialDynamics:
 
 def fit(windows, degree: int, motion: Setting, force: Setting) -> PolynomialDynamics:
     model = blank(windows, degree)
-    refitted(model, windows, motion, force)
+    refitted(model, windows, Choice(motion, motion, force))
     return model
 
 
@@ -245,7 +247,7 @@ def test_settings_are_chosen_by_rollouts(data) -> None:
     model = blank(windows, 1)
     known = {noise: moments(model, windows, noise) for noise in (0.0, 0.3)}
     found = candidates(known, (1e-3, 1e-1))
-    motion, force = choose(model, found, rollouts)
+    motion, _, force = choose(model, found, rollouts)
     assert len(found) == 4
     chosen = rollouts.measure(model)
     for weights in found.values():
@@ -301,7 +303,7 @@ def wheels(data, count: int = 220, frames: int = 8):
 def fitted_wheel(runs, context) -> PolynomialDynamics:
     windows = TrainingWindows(runs, 2, HISTORY, "pose", context=context)
     model = unfitted(windows, PolynomialSettings(HISTORY, 1, ["load"]), tuple(context), predicts_body=True)
-    refitted(model, windows, Setting(0.0, 0.0), Setting(0.0, 0.0))
+    refitted(model, windows, Choice(*[Setting(0.0, 0.0)] * 3))
     model.bounds.copy_(torch.tensor([[-torch.inf], [torch.inf]]))
     return model
 
@@ -361,3 +363,17 @@ def test_fewer_modes_are_the_others_at_their_mean(data) -> None:
     assert torch.equal(model.with_modes(4).weights, model.weights)
     with pytest.raises(UserError, match="cannot have 5; allowed: 1 to 4"):
         model.with_modes(5)
+
+
+def test_a_free_body_is_chosen_by_its_own_error(data) -> None:
+    runs = wheels(data, 40)
+    windows = TrainingWindows(runs[:-5], 2, HISTORY, "pose", context=["load"])
+    model = unfitted(windows, PolynomialSettings(HISTORY, 1, ["load"]), ("load",), predicts_body=True)
+    rollouts = ValidationRollouts(runs[-5:], 2, HISTORY, "pose", ["load"])
+    found = candidates({noise: moments(model, windows, noise) for noise in (0.0, 1.0)}, (1e-4, 1.0))
+    choice = choose(model, found, rollouts)
+    best = rollouts.measure(model).body_rmse
+    for setting in found:
+        take(model, found[choice.motion], found[setting], found[choice.motion])
+        assert rollouts.measure(model).body_rmse >= best
+    assert best < rollouts.measure(unfitted(windows, model.settings, ("load",), True)).body_rmse

@@ -90,7 +90,7 @@ def test_without_validation_runs_a_third_chooses_and_all_are_fitted(data, tmp_pa
     without = fit_polynomial(runs[1:3], runs[::3], 4, *settings, predicts_body=False, seed=3)
     assert without.score.skill == skill
     # The same noise and penalty for all runs.
-    chosen = {"noises": [without.motion.noise], "penalties": [without.motion.penalty]}
+    chosen = {"noises": [without.choice.motion.noise], "penalties": [without.choice.motion.penalty]}
     everything = fit_polynomial(
         runs,
         data.runs("test"),
