@@ -19,34 +19,33 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from hydra import compose, initialize_config_module
-from torch import Tensor
+from omegaconf import OmegaConf
 
 from sgns.campaign import Dataset
-from sgns.learning.body import BodyTrack
-from sgns.learning.closed_form_fit import candidates, choose, fit, moments, unfitted
+from sgns.learning.context import varying_context
 from sgns.learning.data import TrainingWindows
+from sgns.learning.polynomial_fit import candidates, choose, moments, unfitted
+from sgns.learning.polynomial_settings import FitSettings, PolynomialSettings
+from sgns.learning.polynomial_training import fit_polynomial
+from sgns.learning.stepping import Dynamics
 from sgns.learning.surrogate import load_surrogate
+from sgns.learning.training import moves_freely
 from sgns.learning.validation import RolloutScore, ValidationRollouts
-from sgns.published import PublishedRun, read_published, wheel_case
+from sgns.published_dataset import PARTICLES, published_dataset
 from sgns.reduction.reduced import ReducedRun, reduce_dataset
 
 HERE = Path(__file__).parent
 HISTORY = 3  # d, as in conf/model
 NUM_MODES = (2, 4, 8)
-NOISES = (0.1, 0.3, 1.0)
-PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 THRESHOLDS = (0.01, 0.03, 0.1)
 # Degree and thresholds; a threshold of zero means ridge regression.
 MODELS = ((1, (0.0,)), (2, (0.0, *THRESHOLDS)))
-RIDGE = ((1, (0.0,)), (2, (0.0,)))
+NAMES = {1: "linear", 2: "quadratic"}
 
 FOLDS = 4
-# Soil particles of the published bases (which are not published themselves).
-PARTICLES = {"excavation": 4880, "wheel": 6005}
-BIN_SIZE = (0.8, 0.6, 0.15)  # of the excavation runs [m]; for the wheel no more than a shift of the origin
+PUBLISHED_MODES = 8
 
 
 class Totals:
@@ -103,61 +102,52 @@ def constant_velocity(rollouts: ValidationRollouts, still: RolloutScore) -> Roll
     return still._replace(skill=1 - moving / frozen)
 
 
-def scores(
-    windows: TrainingWindows,
-    validation: ValidationRollouts,
-    others: Sequence[ValidationRollouts],
-    models: Sequence[tuple[int, Sequence[float]]],
-    everything: TrainingWindows | None = None,
+def baselines(
+    model: Dynamics, others: Sequence[ValidationRollouts]
 ) -> Iterator[tuple[dict[str, Any], list[RolloutScore]]]:
-    """Every baseline and fitted model with its scores on some rollouts.
-
-    Args:
-        windows: What to fit to.
-        validation: What chooses the settings.
-        others: What the scores are of.
-        models: Degrees and thresholds.
-        everything: What to fit to again once the settings are chosen.
-    """
-    baseline = unfitted(everything or windows, 1)
-    still = [rollouts.measure(baseline) for rollouts in others]
+    """What needs no fit but the mean force, which polynomials without coefficients predict."""
+    still = [rollouts.measure(model) for rollouts in others]
     yield {"model": "frozen, mean force"}, still
     moving = [constant_velocity(rollouts, score) for rollouts, score in zip(others, still, strict=True)]
     yield {"model": "constant velocity, mean force"}, moving
-    for degree, thresholds in models:
+
+
+def scores(
+    windows: TrainingWindows, others: Sequence[ValidationRollouts], settings: FitSettings
+) -> Iterator[tuple[dict[str, Any], list[RolloutScore]]]:
+    """Every baseline and fitted model with its scores on some rollouts, the first of which choose the settings."""
+    yield from baselines(unfitted(windows, PolynomialSettings(HISTORY, 1, [])), others)
+    for degree, thresholds in MODELS:
         began = time.perf_counter()
-        model = unfitted(windows, degree)
-        known = {noise: moments(model, windows, noise) for noise in NOISES}
+        model = unfitted(windows, PolynomialSettings(HISTORY, degree, []))
+        known = {noise: moments(model, windows, noise, settings.draws) for noise in settings.noises}
         shared = time.perf_counter() - began
         for threshold in thresholds:
             began = time.perf_counter()
-            motion, force = choose(model, candidates(known, PENALTIES, threshold), validation)
-            chosen = fit(everything, degree, motion, force) if everything else model
+            motion, _, force = choose(model, candidates(known, settings.penalties, threshold), others[0])
             about = {
-                "model": ("linear", "quadratic")[degree - 1] + (", sparse" if threshold else " ridge"),
+                "model": NAMES[degree] + (", sparse" if threshold else " ridge"),
                 "threshold": threshold,
                 "noise": motion.noise,
                 "penalty": motion.penalty,
                 "force_noise": force.noise,
                 "force_penalty": force.penalty,
-                "library": len(chosen.terms),
-                "terms": chosen.num_terms,
+                "library": len(model.terms),
+                "terms": model.num_terms,
                 "seconds": round(shared + time.perf_counter() - began, 1),
             }
-            yield about, [rollouts.measure(chosen) for rollouts in others]
+            yield about, [rollouts.measure(model) for rollouts in others]
 
 
-def own_rows(overrides: Sequence[str], checkpoint: Path | None) -> Iterator[dict[str, Any]]:
+def own_rows(config: Any, settings: FitSettings, checkpoint: Path | None) -> Iterator[dict[str, Any]]:
     """All models at r = 2, 4, 8 on the validation and the test runs of a dataset."""
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        config = compose("train", list(overrides))
     reduced = reduce_dataset(Dataset.open(config.dataset.path), config.reduction)
     network = None if checkpoint is None else load_surrogate(checkpoint).dynamics
     for r in NUM_MODES:
         splits = ("validation", "test")
         rollouts = [ValidationRollouts(reduced.runs(split), r, HISTORY, "pose") for split in splits]
         windows = TrainingWindows(reduced.runs("train"), r, HISTORY, "pose")
-        found = list(scores(windows, rollouts[0], rollouts, MODELS))
+        found = list(scores(windows, rollouts, settings))
         if network is not None and (network.num_modes, network.history) == (r, HISTORY):
             found.append(({"model": "network"}, [one.measure(network) for one in rollouts]))
         for about, measured in found:
@@ -169,130 +159,87 @@ def own_rows(overrides: Sequence[str], checkpoint: Path | None) -> Iterator[dict
             yield row
 
 
-def planar_poses(run: PublishedRun, kind: str) -> np.ndarray:
-    """Poses of a body that turns about the lateral axis only, from its points, shape (T, 7).
+def fold_scores(
+    known: Sequence[ReducedRun],
+    rollouts: ValidationRollouts,
+    context: list[str],
+    settings: FitSettings,
+    degrees: Sequence[int],
+) -> Iterator[tuple[dict[str, Any], RolloutScore]]:
+    """Baselines and ridge regressions of some runs with their scores on others.
 
-    A blade's place is the middle of its lowest row and its direction that of a column; a wheel's are the mean of its
-    points and the direction of one of them.
+    Every third run chooses the settings for which the rest of them were fitted; then all of them are fitted.
     """
-    points = run.body_points
-    if kind == "excavation":
-        lowest = np.isclose(points[0, :, 2], points[0, :, 2].min(), atol=1e-3)
-        place = points[:, lowest].mean(axis=1)
-        arm = points[:, ~lowest].mean(axis=1) - place
-    else:
-        place = points.mean(axis=1)
-        arm = points[:, 0] - place
-    half = 0.5 * np.arctan2(arm[:, 0], arm[:, 2])
-    zero = np.zeros_like(half)
-    return np.column_stack([place, zero, np.sin(half), zero, np.cos(half)])
+    wheel = moves_freely(known)
+    told = tuple(varying_context(known, context))
+    everything = TrainingWindows(known, PUBLISHED_MODES, HISTORY, "pose", context=told)
+    for about, (score,) in baselines(
+        unfitted(everything, PolynomialSettings(HISTORY, 1, context), told, wheel), [rollouts]
+    ):
+        yield about, score
+    for degree in degrees:
+        model = PolynomialSettings(HISTORY, degree, context)
+        began = time.perf_counter()
+        fitted = fit_polynomial(known, known[::3], PUBLISHED_MODES, model, settings, wheel)
+        about = {
+            "model": f"{NAMES[degree]} ridge",
+            "library": len(fitted.dynamics.terms),
+            "seconds": time.perf_counter() - began,
+        }
+        yield about, rollouts.measure(fitted.dynamics)
 
 
-def published_runs(folder: Path, kind: str) -> tuple[list[ReducedRun], Tensor]:
-    """The authors' runs as reduced runs, and what else is known of each, shape (runs, k): of a wheel gravity
-    [m/s^2], friction angle [degrees], load [N] and diameter [m], of a blade nothing."""
-    runs = read_published(folder / kind, BIN_SIZE)
-    reduced = [
-        ReducedRun(
-            f"case_{run.case:03d}",
-            run.latent,
-            np.arange(len(run.latent)) / 60.0,
-            planar_poses(run, kind),
-            run.body_points,
-            run.force,
-            np.zeros_like(run.force),
-            {},
-        )
-        for run in runs
-    ]
-    context = [
-        [*run.context[0], *([wheel_case(run.case)["diameter"]] if kind == "wheel" else [])] for run in runs
-    ]
-    return reduced, torch.tensor(context, dtype=torch.float64)
-
-
-def with_context(body: BodyTrack, context: Tensor) -> BodyTrack:
-    """A track that also tells what is constant in a run, behind the orientation.
-
-    Args:
-        body: (..., N, ...).
-        context: Of every frame, shape (..., k).
-    """
-    told = context[..., None, :].expand(*body.orientation.shape[:-1], context.shape[-1])
-    return body._replace(orientation=torch.cat([body.orientation, told], dim=-1))
-
-
-def windows_of(runs: Sequence[ReducedRun], context: Tensor) -> TrainingWindows:
-    """Training windows that show the context."""
-    windows = TrainingWindows(runs, runs[0].latent.shape[1], HISTORY, "pose")
-    frames = torch.tensor([HISTORY - 1 + len(run.latent) for run in runs])
-    windows.body = with_context(windows.body, context.repeat_interleave(frames, dim=0))
-    return windows
-
-
-def rollouts_of(runs: Sequence[ReducedRun], context: Tensor) -> ValidationRollouts:
-    """Rollouts that show the context."""
-    rollouts = ValidationRollouts(runs, runs[0].latent.shape[1], HISTORY, "pose")
-    rollouts.body = with_context(rollouts.body, context[:, None])
-    rollouts.body_at_rest = with_context(rollouts.body_at_rest, context[:, None])
-    return rollouts
-
-
-def published_rows(folder: Path) -> Iterator[dict[str, Any]]:
-    """All models on the authors' runs, every run predicted by the models of the fold that leaves it out.
-
-    In a fold, every third of the other runs chooses the settings for which the rest of them were fitted; then all of
-    them are fitted.
-    """
+def published_rows(
+    folder: Path, context: list[str], settings: FitSettings, degrees: Sequence[int]
+) -> Iterator[dict[str, Any]]:
+    """Ridge regressions on the authors' runs, every run predicted by the models of the fold that leaves it out."""
     for kind, particles in PARTICLES.items():
-        runs, context = published_runs(folder, kind)
-        rows: dict[tuple[str, float], dict[str, Any]] = {}
-        totals: dict[tuple[str, float], Totals] = {}
+        rows: dict[str, dict[str, Any]] = {}
+        totals: dict[str, Totals] = {}
         for fold in range(FOLDS):
-            known = [i for i in range(len(runs)) if i % FOLDS != fold]
-            choosing = known[::3]
-            training, choice, test, everything = (
-                ([runs[i] for i in group], context[group])
-                for group in (
-                    [i for i in known if i not in choosing],
-                    choosing,
-                    list(range(fold, len(runs), FOLDS)),
-                    known,
-                )
+            dataset = published_dataset(
+                {"path": folder / kind, "folds": FOLDS, "fold": fold}, PUBLISHED_MODES
             )
-            rollouts = rollouts_of(*test)
-            for about, measured in scores(
-                windows_of(*training),
-                rollouts_of(*choice),
-                [rollouts],
-                RIDGE,
-                windows_of(*everything),
-            ):
-                logging.info("%s, fold %d: %s, skill %.3f", kind, fold, about, measured[0].skill)
-                key = (about["model"], about.get("threshold", 0.0))
+            known, left_out = dataset.runs("train"), dataset.runs("test")
+            told = varying_context(known, context)
+            rollouts = ValidationRollouts(left_out, PUBLISHED_MODES, HISTORY, "pose", told)
+            for about, score in fold_scores(known, rollouts, context, settings, degrees):
+                logging.info("%s, fold %d: %s, skill %.3f", kind, fold, about, score.skill)
+                name = about["model"]
                 # The settings differ from fold to fold: the table has the sums.
-                row = {"data": f"published {kind}", "num_modes": runs[0].latent.shape[1], "model": key[0]}
-                if "threshold" in about:
-                    seconds = rows.get(key, {}).get("seconds", 0.0) + about["seconds"]
-                    row |= {"threshold": key[1], "library": about["library"], "seconds": round(seconds, 1)}
-                rows[key] = row
-                totals.setdefault(key, Totals(particles)).add(rollouts, measured[0])
-        for key, row in rows.items():
-            yield row | totals[key].columns("test")
+                row = {"data": f"published {kind}", "num_modes": PUBLISHED_MODES, "model": name}
+                if "library" in about:
+                    seconds = rows.get(name, {}).get("seconds", 0.0) + about["seconds"]
+                    row |= {"threshold": 0.0, "library": about["library"], "seconds": round(seconds, 1)}
+                rows[name] = row
+                totals.setdefault(name, Totals(particles)).add(rollouts, score)
+        for name, row in rows.items():
+            yield row | totals[name].columns("test")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--checkpoint", type=Path, default=None, help="a network to show beside them")
     parser.add_argument("--published", type=Path, default=None, help="the authors' runs instead")
+    parser.add_argument(
+        "--degrees", type=int, nargs="+", choices=(1, 2), default=(1, 2), help="of the published runs' models"
+    )
     parser.add_argument("overrides", nargs="*", help="for example dataset=quick")
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     torch.set_num_threads(1)
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        config = compose("train", ["model=polynomial", *options.overrides])
+    plain = OmegaConf.to_container(config, resolve=True)
+    settings = FitSettings.from_dict(plain["training"])
     if options.published is None:
-        name, found = "closed_form.csv", own_rows(options.overrides, options.checkpoint)
+        name, found = "closed_form.csv", own_rows(config, settings, options.checkpoint)
     else:
-        name, found = "closed_form_published.csv", published_rows(options.published)
+        context = plain["model"]["context"]
+        name, found = (
+            "closed_form_published.csv",
+            published_rows(options.published, context, settings, options.degrees),
+        )
     rows = []
     for row in found:
         logging.info("%s", row)

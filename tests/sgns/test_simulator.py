@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from tiny import MODEL, TRAINING, reduced
+from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, reduced
 
 from sgns.errors import UserError
 from sgns.learning.training import train
@@ -14,16 +14,17 @@ from sgns.simulator import Simulator
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Reduced data and checkpoints, one for each kind of body node."""
+    """Reduced data and checkpoints: networks with each kind of body node, and polynomials."""
     folder = tmp_path_factory.mktemp("tiny")
     data = reduced(folder)
     for kind in ("pose", "points"):
         model = MODEL | {"body_nodes": kind}
         train(data, num_modes=4, model=model, training=TRAINING, output=folder / kind)
+    train(data, num_modes=4, model=POLYNOMIAL, training=FIT, output=folder / "polynomial")
     return data, folder
 
 
-@pytest.mark.parametrize("kind", ["pose", "points"])
+@pytest.mark.parametrize("kind", ["pose", "points", "polynomial"])
 def test_rollout_is_stepping(trained, kind) -> None:
     data, folder = trained
     run = data.runs("test")[0]
@@ -97,10 +98,11 @@ def test_soil_is_decoded_from_the_modes(trained) -> None:
     assert error <= np.abs(data.start_positions - data.basis.mean.numpy()).max() + 1e-9
 
 
-def test_reloading_gives_the_same_rollout_to_the_bit(trained) -> None:
+@pytest.mark.parametrize("kind", ["pose", "polynomial"])
+def test_reloading_gives_the_same_rollout_to_the_bit(trained, kind) -> None:
     data, folder = trained
     run = data.runs("test")[0]
-    first, second = (Simulator.load(folder / "pose" / "best.ckpt").rollout(run.pose) for _ in range(2))
+    first, second = (Simulator.load(folder / kind / "best.ckpt").rollout(run.pose) for _ in range(2))
     np.testing.assert_array_equal(first.latent, second.latent)
     np.testing.assert_array_equal(first.force, second.force)
 

@@ -15,9 +15,10 @@ from sgns.reduction.reduced import ReducedDataset, reduce_dataset
 # Matrices this small are slower on several threads, and results must not depend on the number of cores.
 torch.set_num_threads(1)
 
-__all__ = ["MODEL", "REDUCTION", "TRAINING", "make_dataset", "reduced"]
+__all__ = ["FIT", "MODEL", "POLYNOMIAL", "REDUCTION", "TRAINING", "make_dataset", "reduced"]
 
 MODEL: dict[str, Any] = {
+    "kind": "network",
     "history": 3,
     "body_nodes": "pose",
     "positions": True,
@@ -70,6 +71,15 @@ REDUCTION: dict[str, Any] = {
     "choose": "position",
     "tolerance": 1.0,
     "share": 0.99,
+}
+POLYNOMIAL: dict[str, Any] = {"kind": "polynomial", "history": 3, "degree": 2, "context": []}
+FIT: dict[str, Any] = {
+    "noises": [0.1, 0.3],
+    "penalties": [1e-3, 1e-1],
+    "draws": 2,
+    "normalisation_floor": 0.01,
+    "resume": "auto",
+    "threads": None,
 }
 
 

@@ -1,4 +1,5 @@
-"""The dynamics of the latent soil around a body: history and next tool motion in, next state and force out.
+"""The dynamics of the latent soil around a body as a graph network: history and next tool motion in, next state and
+force out.
 
 Shapes: B batch, d history positions, r modes, N body nodes, V = r + N nodes, K context numbers, T frames.
 """
@@ -10,7 +11,6 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from sgns.errors import UserError
 from sgns.learning.body import BodyTrack, free_axes, nearest_rigid
 from sgns.learning.graph import build_graph, edge_indices
 from sgns.learning.model_settings import ModelSettings
@@ -18,11 +18,12 @@ from sgns.learning.network import EncodeProcessDecode
 from sgns.learning.normalisation import Standardiser
 from sgns.learning.path_stepper import PathStepper
 from sgns.learning.prediction import Path, Prediction, Step
+from sgns.learning.stepping import Dynamics, unrolled
 
 __all__ = ["LatentDynamics", "Path", "Prediction", "Step"]
 
 
-class LatentDynamics(nn.Module):
+class LatentDynamics(Dynamics):
     """Graph network on modes and body nodes, with the statistics that make its inputs and outputs of order
     one.
 
@@ -33,6 +34,7 @@ class LatentDynamics(nn.Module):
         predicts_body: Whether the body moves as the soil lets it (see `free_axes`).
     """
 
+    settings: ModelSettings
     free: Tensor
 
     def __init__(
@@ -42,11 +44,7 @@ class LatentDynamics(nn.Module):
         context: tuple[str, ...] = (),
         predicts_body: bool = False,
     ) -> None:
-        super().__init__()
-        self.settings = settings
-        self.num_modes = num_modes
-        self.context_keys = tuple(context)
-        self.predicts_body = predicts_body
+        super().__init__(settings, num_modes, context, predicts_body)
         pose = settings.body_nodes == "pose"
         motion = 6 if pose else 3
         place = 3 if settings.positions else 0
@@ -80,22 +78,13 @@ class LatentDynamics(nn.Module):
         self.register_buffer("free", free_axes(predicts_body, settings.body_nodes), persistent=False)
         self._edges: dict[tuple[int, torch.device], Tensor] = {}
 
-    @property
-    def history(self) -> int:
-        """d, positions of history."""
-        return self.settings.history
-
     def with_modes(self, num_modes: int) -> LatentDynamics:
         """The same network on the first modes only; the weights are shared.
 
         Raises:
             UserError: More modes than it was trained with.
         """
-        if not 1 <= num_modes <= self.num_modes:
-            raise UserError(
-                f"the network was trained with {self.num_modes} modes and cannot have {num_modes}; allowed: 1 to "
-                f"{self.num_modes}"
-            )
+        self.check_modes(num_modes)
         fewer = copy.copy(self)
         fewer._modules = dict(self._modules)
         fewer.num_modes, fewer._edges = num_modes, {}
@@ -173,9 +162,7 @@ class LatentDynamics(nn.Module):
         told = torch.cat([own, weight[-1:].expand(nodes, -1)]).expand(batch, -1, -1)
         if not self.context_keys:
             return told
-        if context is None:
-            raise UserError(f"this network needs the scene's {', '.join(self.context_keys)}; give it a scene")
-        numbers = self.context.normalise(context)[:, None].expand(-1, modes + nodes, -1)
+        numbers = self.context.normalise(self.known_context(context))[:, None].expand(-1, modes + nodes, -1)
         return torch.cat([told, numbers], dim=-1)
 
     def force_contributions(self, prediction: Prediction) -> tuple[Tensor, Tensor]:
@@ -227,51 +214,24 @@ class LatentDynamics(nn.Module):
         return change + body.motion[:, -2, :, :3] if self.settings.predicts == "acceleration" else change
 
     def stepper(self, body_points: int, context: Tensor | None = None) -> PathStepper:
-        """Takes the steps of one path without gradients, much faster than `advance`, with the weights as they are now.
-
-        Args:
-            body_points: M.
-            context: Numbers of the run, shape (1, K); not needed when K is 0.
-        """
+        """As for all `Dynamics`, but much faster than `advance`."""
         return PathStepper(self, 1 if self.settings.body_nodes == "pose" else body_points, context)
 
     def unroll(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Path:
-        """Follow whole tool paths from a given history, feeding predictions back.
-
-        Args:
-            latent: The first d latent positions of each path [m], shape (B, d, r, 3).
-            body: The body at all T frames, (B, T, N, ...); what the network predicts of it is read in the first d
-                frames only.
-            context: As for `forward`.
-        """
-        d, frames = self.history, body.position.shape[1]
-        states = torch.empty(
-            (latent.shape[0], frames, *latent.shape[2:]), dtype=torch.float64, device=latent.device
-        )
-        states[:, :d] = latent
-        force = torch.zeros((latent.shape[0], frames, 3), dtype=torch.float64, device=latent.device)
-        torque = torch.zeros_like(force)
-        alone = latent.shape[0] == 1 and not torch.is_grad_enabled()
-        stepper = self.stepper(body.position.shape[-2], context) if alone else None
-        if stepper is not None and not self.predicts_body:
-            loads = stepper.follow(states[0], body)
-            force[0, d:] = loads[:, :3]
-            torque[0, d:] = loads[:, 3:] if self.settings.torque else self.torque.mean
-            return Path(states, force, torque, body)
+        """As for all `Dynamics`; one path alone by the fast stepper."""
+        if latent.shape[0] > 1 or torch.is_grad_enabled():
+            return super().unroll(latent, body, context)
+        stepper = self.stepper(body.position.shape[-2], context)
         if self.predicts_body:
-            body = body._replace(position=body.position.clone(), motion=body.motion.clone())
-        for t in range(d, frames):
-            window = body.frames(slice(t - d + 1, t + 1))
-            history = states[:, t - d : t]
-            step = (
-                self.advance(history, window, context)
-                if stepper is None
-                else stepper.advance(history, window)
-            )
-            states[:, t], force[:, t], torque[:, t] = step.latent, step.force, step.torque
-            if self.predicts_body:
-                body.motion[:, t, :, :3] = step.displacement
-                body.position[:, t] = body.position[:, t - 1] + step.displacement
+            return unrolled(stepper.advance, latent, body, self.predicts_body)
+        d, frames = self.history, body.position.shape[1]
+        states = torch.empty((1, frames, *latent.shape[2:]), dtype=torch.float64, device=latent.device)
+        states[:, :d] = latent
+        force = torch.zeros((1, frames, 3), dtype=torch.float64, device=latent.device)
+        torque = torch.zeros_like(force)
+        loads = stepper.follow(states[0], body)
+        force[0, d:] = loads[:, :3]
+        torque[0, d:] = loads[:, 3:] if self.settings.torque else self.torque.mean
         return Path(states, force, torque, body)
 
     def edge_index(self, modes: int, body_nodes: int, device: torch.device) -> Tensor:

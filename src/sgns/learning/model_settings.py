@@ -1,4 +1,4 @@
-"""What `conf/model` says of the network and of what it sees."""
+"""What `conf/model/default.yaml` says of the network and of what it sees."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sgns.learning.body import BODY_NODES
 from sgns.learning.graph import EDGES
 from sgns.learning.network import ACTIVATIONS
 
-__all__ = ["ModelSettings"]
+__all__ = ["ModelSettings", "check_context"]
 
 _LEAST = {
     "history": 2,
@@ -27,12 +27,13 @@ _WORDS = {
     "activation": tuple(ACTIVATIONS),
     "force": ("sum", "mean"),
     "predicts": ("acceleration", "velocity"),
+    "kind": ("network",),
 }
 
 
 @dataclass(frozen=True)
 class ModelSettings:
-    """The values of `conf/model`; see there for the meaning of each key."""
+    """The values of `conf/model/default.yaml`; see there for the meaning of each key."""
 
     history: int
     body_nodes: str
@@ -55,6 +56,7 @@ class ModelSettings:
     rigid: bool
     force: str
     torque: bool
+    kind: str = "network"
 
     def __post_init__(self) -> None:
         for key, low in _LEAST.items():
@@ -63,8 +65,7 @@ class ModelSettings:
         for key, allowed in _WORDS.items():
             if getattr(self, key) not in allowed:
                 raise UserError(f"model.{key} is {getattr(self, key)!r}; allowed: {', '.join(allowed)}")
-        if not isinstance(self.context, list) or not all(isinstance(key, str) for key in self.context):
-            raise UserError(f"model.context is {self.context!r}; it must be a list of keys of the scene")
+        check_context(self.context)
         if self.edge_scale is not None and not 0 < self.edge_scale < math.inf:
             raise UserError(
                 f"model.edge_scale is {self.edge_scale}; it must be a length above 0 [m], or null"
@@ -72,4 +73,10 @@ class ModelSettings:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a checkpoint."""
-        return asdict(self)
+        return {"kind": self.kind} | asdict(self)
+
+
+def check_context(keys: Any) -> None:
+    """Refuses a `model.context` that is no list of keys."""
+    if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
+        raise UserError(f"model.context is {keys!r}; it must be a list of keys of the scene")

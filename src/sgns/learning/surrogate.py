@@ -1,8 +1,9 @@
 """What a checkpoint holds: the latent dynamics with all that is needed to step a bed, and nothing to look up
 elsewhere.
 
-A checkpoint is Lightning's `.ckpt`, loaded with `weights_only`: tensors in its state dict (weights,
-normalisation, basis, common start, body points) and plain Python values, the card, as its hyperparameters.
+A checkpoint is laid out as Lightning's `.ckpt` and loaded with `weights_only`: tensors in its state dict (weights,
+normalisation, basis, common start, body points) and plain Python values, the card, as its hyperparameters. A
+network's is written by Lightning and also holds what is needed to go on training.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ import torch
 from torch import Tensor, nn
 
 from sgns.errors import UserError
-from sgns.learning.dynamics import LatentDynamics
-from sgns.learning.model_settings import ModelSettings
+from sgns.learning.kinds import dynamics_of
+from sgns.learning.stepping import Dynamics
 from sgns.reduction.basis import Basis
+from sgns.wholefile import whole_file
 
 __all__ = ["Surrogate", "load_surrogate", "read_checkpoint"]
 
@@ -43,7 +45,7 @@ class Surrogate(nn.Module):
     """Latent dynamics, the basis they live in, and where they start.
 
     Args:
-        dynamics: The network with its statistics.
+        dynamics: A network or polynomials, with their statistics.
         basis: Modes of the soil; as many as the dynamics has.
         start_positions: Common start of the soil at rest [m], shape (n, 3).
         body_points: Body points in the body frame [m], shape (M, 3).
@@ -58,7 +60,7 @@ class Surrogate(nn.Module):
 
     def __init__(
         self,
-        dynamics: LatentDynamics,
+        dynamics: Dynamics,
         basis: Basis,
         start_positions: Tensor,
         body_points: Tensor,
@@ -67,7 +69,8 @@ class Surrogate(nn.Module):
         super().__init__()
         if basis.num_modes != dynamics.num_modes:
             raise UserError(
-                f"the basis has {basis.num_modes} modes and the network {dynamics.num_modes}; they must agree"
+                f"the basis has {basis.num_modes} modes and the {dynamics.settings.kind} {dynamics.num_modes}; they "
+                "must agree"
             )
         self.dynamics = dynamics
         self.basis = basis
@@ -79,10 +82,7 @@ class Surrogate(nn.Module):
         self.card = dict(card) | {
             "format": _FORMAT,
             "format_version": _FORMAT_VERSION,
-            "model": dynamics.settings.to_dict(),
-            "num_modes": dynamics.num_modes,
-            "context": list(dynamics.context_keys),
-            "predicts_body": dynamics.predicts_body,
+            **dynamics.card(),
             "basis": state,
         }
 
@@ -90,6 +90,12 @@ class Surrogate(nn.Module):
     def frame_rate(self) -> float:
         """Steps per second [Hz]."""
         return float(self.card["frame_rate"])
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint without anything to go on training from."""
+        state = {f"{_PREFIX}{name}": value for name, value in self.state_dict().items()}
+        with whole_file(path) as temporary:
+            torch.save({"state_dict": state, "hyper_parameters": self.card}, temporary)
 
     @property
     def start_latent(self) -> Tensor:
@@ -144,13 +150,7 @@ def load_surrogate(path: str | Path) -> Surrogate:
     try:
         tensors = {name: state[f"basis_{name}"] for name in ("mean", "modes", "eigenvalues")}
         basis = Basis.from_state(card["basis"] | tensors, where=str(path))
-        dynamics = LatentDynamics(
-            ModelSettings(**card["model"]),
-            int(card["num_modes"]),
-            tuple(map(str, card["context"])),
-            bool(card["predicts_body"]),
-        )
-        surrogate = Surrogate(dynamics, basis, state["start_positions"], state["body_points"], card)
+        surrogate = Surrogate(dynamics_of(card), basis, state["start_positions"], state["body_points"], card)
         surrogate.load_state_dict(state)
         surrogate.frame_rate  # noqa: B018  (present and a number)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:

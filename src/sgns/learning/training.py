@@ -1,7 +1,7 @@
 """`sgns train`: fit the latent dynamics to a dataset's reduced runs.
 
-`output` holds `best.ckpt` (highest validation skill), `last.ckpt` (to go on from), `tensorboard/` and, once
-complete, `training.json`. The same command with the same `output` goes on where it stopped, or answers from
+`output` holds `best.ckpt` (highest validation skill), of a network `last.ckpt` (to go on from), `tensorboard/` and,
+once complete, `training.json`. The same command with the same `output` goes on where it stopped, or answers from
 what is there.
 """
 
@@ -29,15 +29,19 @@ from sgns.errors import UserError
 from sgns.learning.context import varying_context
 from sgns.learning.data import TrainingWindows, WindowDataModule
 from sgns.learning.dynamics import LatentDynamics
+from sgns.learning.kinds import model_settings
 from sgns.learning.model_settings import ModelSettings
 from sgns.learning.monitoring import RolloutValidation, StepProgress
+from sgns.learning.polynomial_settings import FitSettings, PolynomialSettings
+from sgns.learning.polynomial_training import check_start, fit_polynomial
 from sgns.learning.statistics import fit_normalisation
+from sgns.learning.stepping import Dynamics
 from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.validation import ValidationRollouts
 from sgns.poses import in_body_frame
 from sgns.reduction.reduced import ReducedDataset, ReducedRun, reduce_dataset
-from sgns.settings import check_fields, differences, flattened
+from sgns.settings import differences, flattened
 from sgns.wholefile import write_whole
 
 if TYPE_CHECKING:
@@ -57,9 +61,9 @@ def main(cfg: DictConfig) -> float:
     from sgns.published_dataset import published_dataset
 
     plain = OmegaConf.to_container(cfg, resolve=True)
-    threads = TrainingSettings.from_dict(plain["training"]).threads
-    if threads is not None:
-        torch.set_num_threads(threads)  # for the reduction, too
+    _, settings = checked_settings(plain["model"], plain["training"])
+    if settings.threads is not None:
+        torch.set_num_threads(settings.threads)  # for the reduction, too
     if cfg.dataset.get("format") == "published":
         reduced = published_dataset(plain["dataset"], cfg.reduction.num_modes)
     else:
@@ -99,8 +103,8 @@ def train(
         training: Values of `conf/training`.
         output: Folder for checkpoints and logs.
         seed: Of weights, noise and order.
-        device: "cpu" or "cuda".
-        start_from: Checkpoint whose weights and normalisation to start from.
+        device: "cpu" or "cuda"; polynomials know the first only.
+        start_from: Checkpoint whose weights and normalisation a network starts from.
         provenance: More plain values for the checkpoint.
 
     Returns:
@@ -109,15 +113,10 @@ def train(
     Raises:
         UserError: Bad settings, a loss that is not finite, or an `output` of another training.
     """
-    settings = TrainingSettings.from_dict(training)
-    check_fields(ModelSettings, model, "model")
-    model_settings = ModelSettings(**model)
+    model_settings, settings = checked_settings(model, training)
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
-    validation_runs = reduced.runs("validation")
-    if not validation_runs:
-        log.warning("the validation split is empty; the checkpoint is chosen by rollouts of training runs")
-        validation_runs = reduced.runs("train")[:4]
+    validation_runs = reduced.runs("validation") or stand_ins(reduced.runs("train"), model_settings.kind)
     card = {
         "settings": {
             "num_modes": num_modes,
@@ -136,42 +135,52 @@ def train(
     resumed = what_is_there(output, card["settings"], settings.resume)
     if resumed == "complete":
         summary = json.loads((output / "training.json").read_text())
-        log.info(
-            "%s is complete: %d steps, validation skill %.3f", output, summary["steps"], summary["skill"]
-        )
+        log.info("%s is complete: validation skill %.3f", output, summary["skill"])
         return float(summary["skill"])
 
     torch.manual_seed(seed)
-    surrogate, data = prepared(reduced, num_modes, model_settings, settings, seed, card, start_from)
-    rollouts = ValidationRollouts(
-        validation_runs,
-        num_modes,
-        model_settings.history,
-        model_settings.body_nodes,
-        surrogate.dynamics.context_keys,
-    )
-    callbacks = [RolloutValidation(rollouts, output, settings), StepProgress(settings.max_steps)]
-    module = SurrogateTraining(surrogate, settings)
-    with quiet_lightning():
-        trainer = make_trainer(output, settings, device, callbacks)
+    logger = TensorBoardLogger(output, name="", version="tensorboard", default_hp_metric=False)
+    if isinstance(settings, FitSettings):
+        check_start(start_from, device)
+        runs = reduced.runs("train")
         began = time.perf_counter()
-        fit(trainer, module, data, output / "last.ckpt" if resumed else None)
+        fitted = fit_polynomial(
+            runs, validation_runs, num_modes, model_settings, settings, moves_freely(runs), seed
+        )
         seconds = time.perf_counter() - began
+        surrogate, score, about = surrogate_of(fitted.dynamics, reduced, card), fitted.score, fitted.about()
+        make_folder(output)
+        surrogate.save(output / "best.ckpt")
+    else:
+        surrogate, data = prepared(reduced, num_modes, model_settings, settings, seed, card, start_from)
+        rollouts = ValidationRollouts(
+            validation_runs,
+            num_modes,
+            model_settings.history,
+            model_settings.body_nodes,
+            surrogate.dynamics.context_keys,
+        )
+        callbacks = [RolloutValidation(rollouts, output, settings), StepProgress(settings.max_steps)]
+        module = SurrogateTraining(surrogate, settings)
+        with quiet_lightning():
+            trainer = make_trainer(output, settings, device, callbacks, logger)
+            began = time.perf_counter()
+            fit(trainer, module, data, output / "last.ckpt" if resumed else None)
+            seconds = time.perf_counter() - began
+        score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
+        about = {"steps": settings.max_steps}
 
-    score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
     metrics = {"skill": score.skill, "skill_at_rest": score.skill_at_rest, "force_nrmse": score.force_nrmse}
     if surrogate.dynamics.predicts_body:
         metrics["body_rmse"] = score.body_rmse
-    trainer.logger.log_hyperparams(
+    logger.log_hyperparams(
         hyperparameters(card["settings"]), {f"final/{key}": value for key, value in metrics.items()}
     )
-    trainer.logger.finalize("success")
-    summary = {"steps": settings.max_steps, **metrics, "seconds": round(seconds, 1)}
+    logger.finalize("success")
+    summary = {**about, **metrics, "seconds": round(seconds, 1)}
     write_whole(output / "training.json", json.dumps(summary, indent=2) + "\n")
     log.info(
-        "trained %d steps in %.0f s; best checkpoint on %d validation runs: skill %.3f (from "
-        "rest %.3f), force NRMSE %.3f; %s",
-        settings.max_steps,
+        "trained in %.0f s; %d validation runs: skill %.3f (from rest %.3f), force NRMSE %.3f; %s",
         seconds,
         len(validation_runs),
         score.skill,
@@ -188,6 +197,33 @@ def hyperparameters(settings: Mapping[str, Any]) -> dict[str, bool | int | float
         key: value if isinstance(value, (bool, int, float, str)) else str(value)
         for key, value in flattened(settings).items()
     }
+
+
+def checked_settings(
+    model: Mapping[str, Any], training: Mapping[str, Any]
+) -> tuple[ModelSettings, TrainingSettings] | tuple[PolynomialSettings, FitSettings]:
+    """Of the kind that `model.kind` says; refuses those of another."""
+    settings = model_settings(model)
+    if isinstance(settings, PolynomialSettings):
+        return settings, FitSettings.from_dict(training)
+    return settings, TrainingSettings.from_dict(training)
+
+
+def stand_ins(runs: list[ReducedRun], kind: str) -> list[ReducedRun]:
+    """Training runs that do what validation runs would."""
+    if kind == "polynomial":
+        log.warning("the validation split is empty; every third training run chooses noise and penalty")
+        return runs[::3]
+    log.warning("the validation split is empty; the checkpoint is chosen by rollouts of training runs")
+    return runs[:4]
+
+
+def surrogate_of(dynamics: Dynamics, reduced: ReducedDataset, card: dict[str, Any]) -> Surrogate:
+    """Dynamics with the basis, the start and the body points of a dataset."""
+    first = reduced.runs("train")[0]
+    points = torch.as_tensor(in_body_frame(first.pose[0], first.body_points[0]))
+    basis = reduced.basis.sliced(dynamics.num_modes)
+    return Surrogate(dynamics, basis, torch.as_tensor(reduced.start_positions), points, card)
 
 
 def prepared(
@@ -224,10 +260,7 @@ def prepared(
                 "checkpoint=null"
             )
         dynamics = given.dynamics.requires_grad_(True).train()
-    points = torch.as_tensor(in_body_frame(runs[0].pose[0], runs[0].body_points[0]))
-    surrogate = Surrogate(
-        dynamics, reduced.basis.sliced(num_modes), torch.as_tensor(reduced.start_positions), points, card
-    )
+    surrogate = surrogate_of(dynamics, reduced, card)
     return surrogate, WindowDataModule(windows, settings.batch_size, noise)
 
 
@@ -254,9 +287,10 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
             (output / name).unlink(missing_ok=True)
         shutil.rmtree(output / "tensorboard", ignore_errors=True)
         return ""
-    if not (output / "last.ckpt").exists():
+    found = [output / name for name in ("last.ckpt", "best.ckpt") if (output / name).exists()]
+    if not found:
         return ""
-    there = read_checkpoint(output / "last.ckpt")["hyper_parameters"].get("settings", {})
+    there = read_checkpoint(found[0])["hyper_parameters"].get("settings", {})
     if different := differences(there, asked):
         key, (old, new) = next(iter(different.items()))
         more = f" (and {len(different) - 1} more)" if len(different) > 1 else ""
@@ -264,30 +298,40 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
             f"{output} holds a training with other settings: {key} is {old!r} there and {new!r} here{more}; "
             "use another output, or training.resume=false to overwrite it"
         )
-    complete = all((output / name).exists() for name in names)
-    return "complete" if complete else "partial"
+    if (output / "best.ckpt").exists() and (output / "training.json").exists():
+        return "complete"
+    return "partial" if (output / "last.ckpt").exists() else ""
 
 
-def make_trainer(
-    output: Path, settings: TrainingSettings, device: str, callbacks: list[L.Callback]
-) -> L.Trainer:
-    """Lightning's trainer: by steps, one device, no validation loop of its own (see `RolloutValidation`)."""
-    if device not in ("cpu", "cuda"):
-        raise UserError(f"device is {device!r}; allowed: cpu, cuda")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise UserError("device is cuda but torch finds no CUDA device; use device=cpu")
+def make_folder(output: Path) -> None:
+    """Make the folder of the results."""
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(
             f"cannot make the folder {output}: {error.strerror}; choose another output"
         ) from error
+
+
+def make_trainer(
+    output: Path,
+    settings: TrainingSettings,
+    device: str,
+    callbacks: list[L.Callback],
+    logger: TensorBoardLogger,
+) -> L.Trainer:
+    """Lightning's trainer: by steps, one device, no validation loop of its own (see `RolloutValidation`)."""
+    if device not in ("cpu", "cuda"):
+        raise UserError(f"device is {device!r}; allowed: cpu, cuda")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device is cuda but torch finds no CUDA device; use device=cpu")
+    make_folder(output)
     return L.Trainer(
         accelerator="gpu" if device == "cuda" else "cpu",
         devices=1,
         max_steps=settings.max_steps,
         max_epochs=-1,
-        logger=TensorBoardLogger(output, name="", version="tensorboard", default_hp_metric=False),
+        logger=logger,
         callbacks=callbacks,
         log_every_n_steps=settings.log_every,
         gradient_clip_val=settings.gradient_clip,

@@ -1,4 +1,4 @@
-"""How well the network follows the validation runs, all at once: what a checkpoint is chosen by.
+"""How well the dynamics follow the validation runs, all at once: what a checkpoint is chosen by.
 
 Letters: B runs, T frames of the longest run, d history positions, r modes.
 """
@@ -15,7 +15,7 @@ from torch import Tensor
 from sgns.learning.body import BodyTrack, body_track
 from sgns.learning.context import context_of
 from sgns.learning.data import filled, pad_start
-from sgns.learning.dynamics import LatentDynamics
+from sgns.learning.stepping import Dynamics
 
 if TYPE_CHECKING:
     from sgns.reduction.reduced import ReducedRun
@@ -52,7 +52,7 @@ class ValidationRollouts:
         num_modes: r.
         history: d.
         body_nodes: "pose" or "points".
-        context: Keys of the scene whose numbers the network is told.
+        context: Keys of the scene whose numbers the dynamics are told.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class ValidationRollouts:
             *(torch.stack([pad_start(one, self.padding) for one in part]) for part in self.body)
         )
 
-    def measure(self, dynamics: LatentDynamics) -> RolloutScore:
+    def measure(self, dynamics: Dynamics) -> RolloutScore:
         """Roll every run out twice, from d true frames and from rest."""
         device = next(dynamics.parameters()).device
         given, start = self.latent[:, : self.history], self.latent[:, :1].expand(-1, self.history, -1, -1)
@@ -127,7 +127,7 @@ class ValidationRollouts:
         return error**0.5 if np.isfinite(error) else float("inf")
 
     def rolled(
-        self, dynamics: LatentDynamics, latent: Tensor, body: BodyTrack, device: torch.device
+        self, dynamics: Dynamics, latent: Tensor, body: BodyTrack, device: torch.device
     ) -> tuple[Tensor, Tensor, BodyTrack]:
         """Latent positions [m], force [N] and body of an unrolling, computed on `device`, returned on the CPU."""
         found = BodyTrack(*(part.clone() for part in body))

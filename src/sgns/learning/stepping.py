@@ -1,0 +1,171 @@
+"""The interface that both kinds of latent dynamics have, the network's and the polynomials': steps, and paths of them.
+
+Shapes: B batch, d history positions, r modes, N body nodes, K context numbers, T frames.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from sgns.errors import UserError
+from sgns.learning.body import BodyTrack
+from sgns.learning.model_settings import ModelSettings
+from sgns.learning.normalisation import Standardiser
+from sgns.learning.polynomial_settings import PolynomialSettings
+from sgns.learning.prediction import Path, Step
+
+__all__ = ["Dynamics", "Stepper", "unrolled"]
+
+
+class Stepper(Protocol):
+    """Takes the steps of one path, whose context it knows."""
+
+    def advance(self, latent: Tensor, body: BodyTrack) -> Step:
+        """One step; latent (1, d, r, 3) and body (1, d, N, ...) as for `Dynamics.advance`."""
+
+
+class Dynamics(nn.Module):
+    """History of the modes and motion of the body in, next state and force out.
+
+    Args:
+        settings: What was built.
+        num_modes: r.
+        context: Keys of the scene whose numbers are told, K of them.
+        predicts_body: Whether the body moves as the soil lets it (see `free_axes`).
+    """
+
+    settings: ModelSettings | PolynomialSettings
+    force: Standardiser
+
+    def __init__(
+        self,
+        settings: ModelSettings | PolynomialSettings,
+        num_modes: int,
+        context: tuple[str, ...],
+        predicts_body: bool,
+    ) -> None:
+        super().__init__()
+        self.settings = settings
+        self.num_modes = num_modes
+        self.context_keys = tuple(context)
+        self.predicts_body = predicts_body
+
+    @property
+    def history(self) -> int:
+        """d, positions of history."""
+        return self.settings.history
+
+    def card(self) -> dict[str, Any]:
+        """Plain values from which the same dynamics can be built, to be filled from a state dict."""
+        return {
+            "model": self.settings.to_dict(),
+            "num_modes": self.num_modes,
+            "context": list(self.context_keys),
+            "predicts_body": self.predicts_body,
+        }
+
+    @abstractmethod
+    def with_modes(self, num_modes: int) -> Dynamics:
+        """The same dynamics of the first modes only.
+
+        Raises:
+            UserError: More modes than it was trained with.
+        """
+
+    @abstractmethod
+    def advance(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Step:
+        """Take one step of every window in a batch.
+
+        Args:
+            latent: The last d latent positions, oldest first [m], float64, shape (B, d, r, 3).
+            body: The d frames that end with the *next* one, the frame to be predicted; (B, d, N, ...). Where it is
+                then, and how it gets there along the free axes, is not looked at.
+            context: Numbers of the runs, shape (B, K); not needed when K is 0.
+        """
+
+    def stepper(self, body_points: int, context: Tensor | None = None) -> Stepper:
+        """Takes the steps of one path without gradients, with the weights as they are now.
+
+        Args:
+            body_points: M.
+            context: Numbers of the run, shape (1, K); not needed when K is 0.
+        """
+        return OwnStepper(self, context)
+
+    def unroll(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Path:
+        """Follow whole tool paths from a given history, feeding predictions back.
+
+        Args:
+            latent: The first d latent positions of each path [m], shape (B, d, r, 3).
+            body: The body at all T frames, (B, T, N, ...); what is predicted of it is read in the first d frames only.
+            context: As for `advance`.
+        """
+        return unrolled(
+            lambda history, window: self.advance(history, window, context), latent, body, self.predicts_body
+        )
+
+    def check_modes(self, num_modes: int) -> None:
+        """For `with_modes`."""
+        if not 1 <= num_modes <= self.num_modes:
+            raise UserError(
+                f"the {self.settings.kind} was trained with {self.num_modes} modes and cannot have {num_modes}; "
+                f"allowed: 1 to {self.num_modes}"
+            )
+
+    def known_context(self, context: Tensor | None) -> Tensor:
+        """The context, where there is one to be known."""
+        if context is None:
+            raise UserError(
+                f"this {self.settings.kind} needs the scene's {', '.join(self.context_keys)}; give it a scene"
+            )
+        return context
+
+
+class OwnStepper:
+    """`Dynamics.advance` for one path.
+
+    Args:
+        dynamics: Whose.
+        context: Numbers of the run, shape (1, K).
+    """
+
+    def __init__(self, dynamics: Dynamics, context: Tensor | None) -> None:
+        self.dynamics = dynamics
+        self.context = context
+
+    def advance(self, latent: Tensor, body: BodyTrack) -> Step:
+        """See `Stepper`."""
+        with torch.inference_mode():
+            return self.dynamics.advance(latent, body, self.context)
+
+
+def unrolled(
+    advance: Callable[[Tensor, BodyTrack], Step], latent: Tensor, body: BodyTrack, predicts_body: bool
+) -> Path:
+    """Whole paths by steps that see what the steps before said.
+
+    Args:
+        advance: Takes a step from d latent positions (B, d, r, 3) and the body (B, d, N, ...).
+        latent: As for `Dynamics.unroll`.
+        body: As for `Dynamics.unroll`.
+        predicts_body: Whether the body goes where the steps say.
+    """
+    d, frames = latent.shape[1], body.position.shape[1]
+    states = latent.new_empty((latent.shape[0], frames, *latent.shape[2:]), dtype=torch.float64)
+    states[:, :d] = latent
+    force = latent.new_zeros((latent.shape[0], frames, 3), dtype=torch.float64)
+    torque = torch.zeros_like(force)
+    if predicts_body:
+        body = body._replace(position=body.position.clone(), motion=body.motion.clone())
+    for t in range(d, frames):
+        step = advance(states[:, t - d : t], body.frames(slice(t - d + 1, t + 1)))
+        states[:, t], force[:, t], torque[:, t] = step.latent, step.force, step.torque
+        if predicts_body:
+            body.motion[:, t, :, :3] = step.displacement
+            body.position[:, t] = body.position[:, t - 1] + step.displacement
+    return Path(states, force, torque, body)
