@@ -235,9 +235,12 @@ class LatentDynamics(Dynamics):
         return Path(states, force, torque, body)
 
     def edge_index(self, modes: int, body_nodes: int, device: torch.device) -> Tensor:
+        """Senders and receivers, made once."""
         key = (body_nodes, device)
         if key not in self._edges:
-            self._edges[key] = edge_indices(
-                modes, body_nodes, self.settings.edges, self.settings.self_loops, device
-            )
+            # What is made in inference mode could not be trained with later.
+            with torch.inference_mode(False):
+                self._edges[key] = edge_indices(
+                    modes, body_nodes, self.settings.edges, self.settings.self_loops, device
+                )
         return self._edges[key]

@@ -302,5 +302,7 @@ class EncodeProcessDecode(nn.Module):
     def pairs(self, edge_index: Tensor, node_count: int) -> Pairs:
         """The edges as sums; looked at once per `edge_index` object."""
         if self._pairs is None or self._edge_index is not edge_index:
-            self._edge_index, self._pairs = edge_index, pairs_of(edge_index, node_count)
+            # What is made in inference mode could not be trained with later.
+            with torch.inference_mode(False):
+                self._edge_index, self._pairs = edge_index, pairs_of(edge_index, node_count)
         return self._pairs

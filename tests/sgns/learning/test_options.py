@@ -104,6 +104,15 @@ def test_later_steps_of_the_horizon_start_from_predictions(data) -> None:
     torch.testing.assert_close(module.losses(batch)["force"].double(), sum(force) / 2, rtol=1e-4, atol=0)
 
 
+@pytest.mark.parametrize("edges", ["complete", "star"])
+def test_a_rollout_does_not_stand_in_the_way_of_training(data, edges) -> None:
+    module, windows = module_of(data, {"edges": edges})
+    batch = windows.training_windows.batch(0, 8, windows.noise)
+    with torch.inference_mode():
+        module.surrogate.dynamics.advance(batch.history, batch.shown_body)
+    module.losses(batch)["change"].backward()
+
+
 def parameters(preset: str, modes: int = 8, **changes) -> int:
     """Weights of a preset's network for a blade."""
     with initialize_config_module("sgns.conf", version_base="1.3"):
