@@ -83,20 +83,22 @@ def test_a_complete_fit_is_not_repeated(data, tmp_path, monkeypatch) -> None:
 
 
 def test_without_validation_runs_a_third_chooses_and_all_are_fitted(data, tmp_path, caplog) -> None:
-    skill = run(without_validation(data, 4), tmp_path)
+    quadratic = FIT | {"linear": False}
+    skill = run(without_validation(data, 4), tmp_path, training=quadratic)
     assert "every third training run" in caplog.text
     runs = data.runs("train")
-    settings = PolynomialSettings(**POLYNOMIAL), FitSettings.from_dict(FIT)
+    settings = PolynomialSettings(**POLYNOMIAL), FitSettings.from_dict(quadratic)
     without = fit_polynomial(runs[1:3], runs[::3], 4, *settings, predicts_body=False, seed=3)
     assert without.score.skill == skill
     # The same noise and penalty for all runs.
-    chosen = {"noises": [without.choice.motion.noise], "penalties": [without.choice.motion.penalty]}
+    motion = without.choice.motion
+    chosen = {"noises": [motion.noise], "penalties": [motion.penalty]}
     everything = fit_polynomial(
         runs,
         data.runs("test"),
         4,
         settings[0],
-        FitSettings.from_dict(FIT | chosen),
+        FitSettings.from_dict(quadratic | chosen),
         predicts_body=False,
         seed=3,
     )
