@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset, reduced
 
 import sgns.learning.training as module
-from sgns.cli import commands
 from sgns.errors import UserError
 from sgns.learning.polynomial import PolynomialDynamics
 from sgns.learning.polynomial_settings import FitSettings, PolynomialSettings
@@ -146,14 +147,15 @@ def test_what_polynomials_have_no_use_for(data, tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_the_commands(tmp_path: Path, monkeypatch, capfd) -> None:
+def test_the_commands(tmp_path: Path, monkeypatch) -> None:
     make_dataset(tmp_path / "data", frames=20, n=300)
     monkeypatch.chdir(tmp_path)
     dataset = ["dataset=quick", "dataset.path=data"]
 
     def call(*arguments: str) -> tuple[int, str]:
-        monkeypatch.setattr("sys.argv", ["sgns", *arguments])
-        return commands.main(), capfd.readouterr().err
+        command = [sys.executable, "-m", "sgns", *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+        return done.returncode, done.stderr
 
     train_it = ["train", *dataset, "model=polynomial", "reduction.num_modes=4", "training.threads=1"]
     assert call(*train_it, "output=out")[0] == 0
