@@ -231,7 +231,7 @@ def main() -> None:
     with initialize_config_module("sgns.conf", version_base="1.3"):
         config = compose("train", ["model=polynomial", *options.overrides])
     plain = OmegaConf.to_container(config, resolve=True)
-    settings = FitSettings.from_dict(plain["training"])
+    settings = FitSettings.from_dict(plain["training"] | {"linear": False})
     if options.published is None:
         name, found = "closed_form.csv", own_rows(config, settings, options.checkpoint)
     else:

@@ -76,6 +76,7 @@ POLYNOMIAL: dict[str, Any] = {"kind": "polynomial", "history": 3, "degree": 2, "
 FIT: dict[str, Any] = {
     "noises": [0.1, 0.3],
     "penalties": [1e-3, 1e-1],
+    "linear": True,
     "draws": 2,
     "normalisation_floor": 0.01,
     "resume": "auto",

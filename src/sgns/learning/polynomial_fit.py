@@ -51,11 +51,13 @@ class Setting(NamedTuple):
         noise: Deviation of the velocity noise on the history, share of each mode's velocity scale [1].
         penalty: Of the squares of the coefficients, beside the mean square of the normalised outputs [1].
         threshold: Smallest RMS of a term in a normalised output [1]; 0 keeps all terms.
+        linear: Whether products of inputs are left out.
     """
 
     noise: float
     penalty: float
     threshold: float = 0.0
+    linear: bool = False
 
 
 class Choice(NamedTuple):
@@ -78,10 +80,12 @@ class Moments(NamedTuple):
     Attributes:
         gram: Products of monomials [1], shape (m, m).
         target: Products of monomials and normalised outputs [1], shape (m, o).
+        linear: How many monomials, the first ones, are no products of inputs: p + 1.
     """
 
     gram: Tensor
     target: Tensor
+    linear: int
 
 
 def unfitted(
@@ -166,7 +170,8 @@ def moments(
             monomials = model.monomials(batch.history, batch.shown_body, batch.context)
             gram += monomials.T @ monomials
             target += monomials.T @ normalised(outputs, true_outputs(model, batch))
-    return Moments(gram / (draws * len(windows)), target / (draws * len(windows)))
+    count = draws * len(windows)
+    return Moments(gram / count, target / count, len(model.used) + 1)
 
 
 def ridge(known: Moments, penalty: float) -> Tensor:
@@ -216,13 +221,18 @@ def sparse(known: Moments, penalty: float, threshold: float, rounds: int = 10) -
 
 def coefficients(known: Moments, setting: Setting) -> Tensor:
     """`sparse` where the setting has a threshold, else `ridge`, shape (m, o)."""
+    if setting.linear:
+        n = known.linear
+        found = torch.zeros_like(known.target)
+        found[:n] = ridge(Moments(known.gram[:n, :n], known.target[:n], n), setting.penalty)
+        return found
     if setting.threshold:
         return sparse(known, setting.penalty, setting.threshold)
     return ridge(known, setting.penalty)
 
 
 def candidates(
-    known: Mapping[float, Moments], penalties: Sequence[float], threshold: float = 0.0
+    known: Mapping[float, Moments], penalties: Sequence[float], threshold: float = 0.0, linear: bool = False
 ) -> dict[Setting, Tensor]:
     """Coefficients for every penalty and noise.
 
@@ -230,8 +240,11 @@ def candidates(
         known: Moments of one model by noise.
         penalties: As in `Setting`.
         threshold: As in `Setting`.
+        linear: Whether those without products of inputs are among them, too.
     """
     settings = [Setting(noise, penalty, threshold) for noise in known for penalty in penalties]
+    if linear:
+        settings += [setting._replace(linear=True) for setting in settings]
     return {setting: coefficients(known[setting.noise], setting) for setting in settings}
 
 

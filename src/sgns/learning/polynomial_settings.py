@@ -48,6 +48,7 @@ class FitSettings:
 
     noises: list[float]
     penalties: list[float]
+    linear: bool
     draws: int
     normalisation_floor: float
     resume: str | bool

@@ -39,10 +39,12 @@ class Fitted(NamedTuple):
     def about(self) -> dict[str, Any]:
         """What training.json says of it beside the score."""
         groups = ("motion", "body", "force") if self.dynamics.predicts_body else ("motion", "force")
-        chosen = {group: getattr(self.choice, group) for group in groups}
-        return {"coefficients": self.dynamics.num_terms} | {
-            group: {"noise": setting.noise, "penalty": setting.penalty} for group, setting in chosen.items()
-        }
+        found: dict[str, Any] = {"coefficients": self.dynamics.num_terms}
+        for group in groups:
+            setting = getattr(self.choice, group)
+            degree = 1 if setting.linear else self.dynamics.settings.degree
+            found[group] = {"degree": degree, "noise": setting.noise, "penalty": setting.penalty}
+        return found
 
 
 def fit_polynomial(
@@ -82,7 +84,9 @@ def fit_polynomial(
     known = {noise: moments(dynamics, windows, noise, settings.draws) for noise in settings.noises}
     log.info("%d windows, %d monomials of %d inputs", len(windows), len(dynamics.terms), len(dynamics.used))
     rollouts = ValidationRollouts(choosing, num_modes, model.history, model.body_nodes, context)
-    choice = choose(dynamics, candidates(known, settings.penalties), rollouts)
+    linear = settings.linear and model.degree > 1
+    found = candidates(known, settings.penalties, linear=linear)
+    choice = choose(dynamics, found, rollouts)
     score = rollouts.measure(dynamics)
     if len(fitting) < len(runs):
         windows = windows_of(runs)

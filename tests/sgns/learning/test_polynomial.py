@@ -377,3 +377,15 @@ def test_a_free_body_is_chosen_by_its_own_error(data) -> None:
         take(model, found[choice.motion], found[setting], found[choice.motion])
         assert rollouts.measure(model).body_rmse >= best
     assert best < rollouts.measure(unfitted(windows, model.settings, ("load",), True)).body_rmse
+
+
+def test_without_products_is_the_linear_fit(data) -> None:
+    windows = windows_of(data.runs("train"))
+    quadratic, linear = blank(windows, 2), blank(windows, 1)
+    setting = Setting(0.1, 1e-2, linear=True)
+    found = coefficients(moments(quadratic, windows, 0.1), setting)
+    alone = ridge(moments(linear, windows, 0.1), 1e-2)
+    torch.testing.assert_close(found[: len(alone)], alone)
+    assert not found[len(alone) :].any()
+    known = {0.1: moments(quadratic, windows, 0.1)}
+    assert len(candidates(known, (1e-2, 1.0), linear=True)) == 2 * len(candidates(known, (1e-2, 1.0)))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset, reduced
 
 import sgns.learning.training as module
-from sgns.cli import commands
 from sgns.errors import UserError
 from sgns.learning.polynomial import PolynomialDynamics
 from sgns.learning.polynomial_settings import FitSettings, PolynomialSettings
@@ -83,20 +84,22 @@ def test_a_complete_fit_is_not_repeated(data, tmp_path, monkeypatch) -> None:
 
 
 def test_without_validation_runs_a_third_chooses_and_all_are_fitted(data, tmp_path, caplog) -> None:
-    skill = run(without_validation(data, 4), tmp_path)
+    quadratic = FIT | {"linear": False}
+    skill = run(without_validation(data, 4), tmp_path, training=quadratic)
     assert "every third training run" in caplog.text
     runs = data.runs("train")
-    settings = PolynomialSettings(**POLYNOMIAL), FitSettings.from_dict(FIT)
+    settings = PolynomialSettings(**POLYNOMIAL), FitSettings.from_dict(quadratic)
     without = fit_polynomial(runs[1:3], runs[::3], 4, *settings, predicts_body=False, seed=3)
     assert without.score.skill == skill
     # The same noise and penalty for all runs.
-    chosen = {"noises": [without.choice.motion.noise], "penalties": [without.choice.motion.penalty]}
+    motion = without.choice.motion
+    chosen = {"noises": [motion.noise], "penalties": [motion.penalty]}
     everything = fit_polynomial(
         runs,
         data.runs("test"),
         4,
         settings[0],
-        FitSettings.from_dict(FIT | chosen),
+        FitSettings.from_dict(quadratic | chosen),
         predicts_body=False,
         seed=3,
     )
@@ -144,14 +147,15 @@ def test_what_polynomials_have_no_use_for(data, tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_the_commands(tmp_path: Path, monkeypatch, capfd) -> None:
+def test_the_commands(tmp_path: Path, monkeypatch) -> None:
     make_dataset(tmp_path / "data", frames=20, n=300)
     monkeypatch.chdir(tmp_path)
     dataset = ["dataset=quick", "dataset.path=data"]
 
     def call(*arguments: str) -> tuple[int, str]:
-        monkeypatch.setattr("sys.argv", ["sgns", *arguments])
-        return commands.main(), capfd.readouterr().err
+        command = [sys.executable, "-m", "sgns", *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+        return done.returncode, done.stderr
 
     train_it = ["train", *dataset, "model=polynomial", "reduction.num_modes=4", "training.threads=1"]
     assert call(*train_it, "output=out")[0] == 0
