@@ -273,7 +273,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("kind", choices=list(DATASETS))
     parser.add_argument("--steps", type=int, default=3000)
-    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1])
     parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1))
     parser.add_argument("--only", nargs="*", help="names of variants")
     parser.add_argument("--output", type=Path, default=Path("outputs/ablation"))
@@ -286,7 +286,7 @@ def main() -> None:
     reduce_dataset(Dataset.open(config["dataset"]["path"]), config["reduction"])
     tasks = [
         (options.kind, name, variants[name], seed, options.steps, options.output)
-        for seed in range(options.seeds)
+        for seed in options.seeds
         for name in names
     ]
     rows: dict[str, list[dict[str, Any]]] = {}

@@ -156,7 +156,7 @@ def cost_subspace(path: Path, name: str, repeats: int) -> dict[str, Any]:
     window = data.training_windows.windows(data.training_windows.targets[100:101])
 
     def step() -> None:
-        losses = module.losses(data.training_windows.batch(0, BATCH, data.noise_scale))
+        losses = module.losses(data.training_windows.batch(0, BATCH, data.noise))
         optimiser.zero_grad()
         sum(training.loss[key] * value for key, value in losses.items()).backward()
         torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
@@ -164,7 +164,7 @@ def cost_subspace(path: Path, name: str, repeats: int) -> dict[str, Any]:
 
     return rates(
         step,
-        lambda: surrogate.dynamics.advance(window.history, window.body),
+        lambda: surrogate.dynamics.advance(window.history, window.shown_body),
         float(reduced.frame_rate),
         20 * repeats,
         sum(p.numel() for p in surrogate.dynamics.network.parameters()),

@@ -28,6 +28,10 @@ log = logging.getLogger(__name__)
 
 def _base_scene(settings: dict[str, Any]) -> dict[str, Any]:
     """The scene a campaign names and changes, with the command's own overrides of scene.* and material.* on top."""
+    if settings.get("scene") is None:
+        raise UserError(
+            f"dataset={settings['name']} has no scene: its runs come from elsewhere and are not simulated"
+        )
     overrides = HydraConfig.get().overrides.task
     if any(o.startswith("scene=") for o in overrides):
         raise UserError(f"dataset={settings['name']} brings its own scene; leave out scene=")

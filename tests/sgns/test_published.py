@@ -204,3 +204,9 @@ def test_training_and_judging_from_the_command_line(tmp_path):
     assert done.returncode == 0 and "was trained on all of these runs" in done.stdout + done.stderr
     done = sgns(tmp_path, *judge, f"dataset.path={tmp_path}")
     assert done.returncode == 2 and "it needs metadata.json" in done.stderr
+
+
+def test_published_runs_are_not_simulated(tmp_path):
+    done = sgns(tmp_path, "simulate", "dataset=published")
+    assert done.returncode == 2
+    assert "dataset=published has no scene: its runs come from elsewhere" in done.stderr

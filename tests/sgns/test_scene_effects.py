@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -111,7 +112,12 @@ def test_runs_of_a_dataset_decide_for_themselves(tmp_path, caplog):
 
 def test_each_set_of_effects_is_compiled_once(tmp_path, monkeypatch):
     compiled = []
-    monkeypatch.setattr(campaign_runs, "Solver", lambda scene, effects, *_: compiled.append(effects))
+
+    def solver(scene, effects, *_):
+        compiled.append(effects)
+        return SimpleNamespace(frames=lambda: iter([None]))
+
+    monkeypatch.setattr(campaign_runs, "Solver", solver)
     c = fast_and_slow(tmp_path, {})
     campaign_runs._compile(c, list(c.scenes), "cpu")
     assert sorted(effects.rate_dependence for effects in compiled) == [False, True]

@@ -12,9 +12,7 @@ from tqdm import tqdm
 
 from sgns.errors import UserError
 from sgns.full_space.dynamics import FullSpaceDynamics
-from sgns.full_space.windows import FullSpaceWindows
-from sgns.learning.body import BodyTrack
-from sgns.learning.data import Batch
+from sgns.full_space.windows import FullSpaceBatch, FullSpaceWindows
 from sgns.learning.normalisation import Standardiser
 from sgns.learning.trainee import TrainingSettings
 
@@ -55,7 +53,7 @@ def fit_normalisation(
     chosen = torch.linspace(0, len(windows) - 1, min(samples, len(windows))).long().unique().tolist()
     read = [windows.window(index) for index in chosen]
     dynamics.velocity = Standardiser.fit(
-        torch.cat([(w.latent[0, -1] - w.latent[0, -2]) for w in read]), floor, centred=False
+        torch.cat([(w.position[0, -1] - w.position[0, -2]) for w in read]), floor, centred=False
     )
     noise_scale = noise * dynamics.velocity.scale
     clean = Standardiser.fit(torch.cat([w.acceleration[0] for w in read]), floor, centred=False)
@@ -67,21 +65,14 @@ def fit_normalisation(
     return noise_scale
 
 
-def losses(dynamics: FullSpaceDynamics, batch: Batch) -> tuple[Tensor, Tensor]:
+def losses(dynamics: FullSpaceDynamics, batch: FullSpaceBatch) -> tuple[Tensor, Tensor]:
     """Squared errors of the normalised acceleration, mean over particles, and of the normalised force.
 
     Args:
         dynamics: On any device.
         batch: From `FullSpaceWindows`; taken to that device.
     """
-    device = dynamics.bin_size.device
-    batch = Batch(
-        latent=batch.latent.to(device),
-        noise=batch.noise.to(device),
-        body=BodyTrack(*(part.to(device) for part in batch.body)),
-        force=batch.force.to(device),
-        torque=batch.torque.to(device),
-    )
+    batch = batch.to(dynamics.bin_size.device)
     prediction = dynamics(batch.history, batch.body)
     acceleration = prediction.acceleration - dynamics.acceleration.normalise(batch.acceleration)
     force = dynamics.force.normalise(dynamics.force_contributions(prediction).sum(-2))
@@ -112,7 +103,7 @@ def train(
     for step in bar:
         began = time.perf_counter()
         found = losses(dynamics, windows.batch(step, settings.batch_size, noise_scale))
-        loss = settings.loss["acceleration"] * found[0] + settings.loss["force"] * found[1]
+        loss = settings.loss["change"] * found[0] + settings.loss["force"] * found[1]
         if not bool(torch.isfinite(loss)):
             raise UserError(
                 f"the loss is {float(loss.detach())} at step {step}; lower training.learning_rate"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,11 +16,43 @@ from torch import Tensor
 
 from sgns.errors import UserError
 from sgns.learning.body import BodyTrack, body_track
-from sgns.learning.data import Batch, random_walk
+from sgns.learning.data import random_walk
 from sgns.poses import in_world_frame
 from sgns.runs import Run
 
-__all__ = ["FullSpaceRun", "FullSpaceWindows"]
+__all__ = ["FullSpaceBatch", "FullSpaceRun", "FullSpaceWindows"]
+
+
+class FullSpaceBatch(NamedTuple):
+    """Windows of one optimisation step; as `sgns.learning.data.Batch`, with particles in the place of modes.
+
+    Attributes:
+        position: Clean positions, the target last [m], float64, shape (B, d + 1, n, 3).
+        noise: Offset added to the history [m], float64, shape (B, d, n, 3).
+        body: The d frames that end with the target's, (B, d, N, ...).
+        force: At the target frame [N], shape (B, 3).
+    """
+
+    position: Tensor
+    noise: Tensor
+    body: BodyTrack
+    force: Tensor
+
+    @property
+    def history(self) -> Tensor:
+        """What the network is shown: the noisy history [m], shape (B, d, n, 3)."""
+        return self.position[:, :-1] + self.noise
+
+    @property
+    def acceleration(self) -> Tensor:
+        """The target [m], shape (B, n, 3): it undoes the noise of the velocity and keeps that of the position."""
+        shown = self.history
+        return self.position[:, -1] + self.noise[:, -1] - 2 * shown[:, -1] + shown[:, -2]
+
+    def to(self, device: torch.device) -> FullSpaceBatch:
+        """The batch on another device."""
+        body = BodyTrack(*(part.to(device) for part in self.body))
+        return FullSpaceBatch(self.position.to(device), self.noise.to(device), body, self.force.to(device))
 
 
 class FullSpaceRun:
@@ -32,7 +65,6 @@ class FullSpaceRun:
     Attributes:
         track: The body at all T frames.
         force: By the soil on the body [N], shape (T, 3), float64.
-        torque: About the centre of mass [N m], likewise.
         bin_size: Lx, Ly, Lz [m], shape (3,), float64.
     """
 
@@ -43,7 +75,7 @@ class FullSpaceRun:
             if points.shape[1] == 0:
                 raise UserError(f"{path} has no body points; give body nodes of your own")
             self.track = body_track(run.pose, points, "points")
-            self.force, self.torque = torch.as_tensor(run.force), torch.as_tensor(run.torque)
+            self.force = torch.as_tensor(run.force)
             self.bin_size = torch.tensor(run.scene["bed"]["size"], dtype=torch.float64)
             self.arrangement_hash, self.frame_rate = run.arrangement_hash, run.frame_rate
             self.particle_count = run.particle_count
@@ -96,21 +128,15 @@ class FullSpaceWindows:
         """The number of windows."""
         return len(self.targets)
 
-    def window(self, index: int) -> Batch:
+    def window(self, index: int) -> FullSpaceBatch:
         """One window without noise, B = 1."""
         run, target = self.targets[index]
         frames = np.maximum(np.arange(target - self.history, target + 1), 0)
         soil = run.soil(frames)[None]
         body = BodyTrack(*(part[None] for part in run.track.frames(torch.from_numpy(frames[1:]))))
-        return Batch(
-            latent=soil,
-            noise=torch.zeros_like(soil[:, :-1]),
-            body=body,
-            force=run.force[None, target],
-            torque=run.torque[None, target],
-        )
+        return FullSpaceBatch(soil, torch.zeros_like(soil[:, :-1]), body, run.force[None, target])
 
-    def batch(self, step: int, size: int, noise_scale: Tensor) -> Batch:
+    def batch(self, step: int, size: int, noise_scale: Tensor) -> FullSpaceBatch:
         """The batch of a step, a function of (seed, step) and nothing else.
 
         Args:
@@ -124,8 +150,6 @@ class FullSpaceWindows:
         drawn = torch.randint(len(self), (size,), generator=source).tolist()
         windows = [self.window(index) for index in drawn]
         body = BodyTrack(*(torch.cat(parts) for parts in zip(*(w.body for w in windows), strict=True)))
-        soil, force, torque = (
-            torch.cat([getattr(w, name) for w in windows]) for name in ("latent", "force", "torque")
-        )
+        soil, force = (torch.cat([getattr(w, name) for w in windows]) for name in ("position", "force"))
         noise = random_walk(noise_scale.expand(soil.shape[2], 3), (size, self.history), source)
-        return Batch(latent=soil, noise=noise, body=body, force=force, torque=torque)
+        return FullSpaceBatch(soil, noise, body, force)

@@ -41,7 +41,7 @@ def untrained(windows: FullSpaceWindows) -> FullSpaceDynamics:
 
 def test_order_of_particles_and_of_body_nodes_does_not_matter(windows) -> None:
     dynamics, window = untrained(windows), windows.window(8)
-    order = torch.randperm(window.latent.shape[2], generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(window.position.shape[2], generator=torch.Generator().manual_seed(0))
     turned = BodyTrack(*(part.flip(2) for part in window.body))
     with torch.inference_mode():
         following, force = dynamics.advance(window.history, window.body)

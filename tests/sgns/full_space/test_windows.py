@@ -24,7 +24,7 @@ def test_a_window_is_frames_of_the_file(paths) -> None:
     assert len(windows) == 5 + 6
     window = windows.window(5 + 3)  # the second run's frame 4
     with Run(paths[1]) as run:
-        torch.testing.assert_close(window.latent[0], torch.from_numpy(run.positions(slice(1, 5))).double())
+        torch.testing.assert_close(window.position[0], torch.from_numpy(run.positions(slice(1, 5))).double())
         torch.testing.assert_close(window.force[0], torch.from_numpy(run.force[4]))
         torch.testing.assert_close(window.body.position[0], torch.from_numpy(run.body_points[2:5]))
         np.testing.assert_allclose(
@@ -35,7 +35,7 @@ def test_a_window_is_frames_of_the_file(paths) -> None:
 def test_a_run_starts_from_rest(paths) -> None:
     windows = FullSpaceWindows([FullSpaceRun(path) for path in paths], history=3)
     window = windows.window(0)
-    assert bool((window.latent[0, :3] == window.latent[0, 0]).all())
+    assert bool((window.position[0, :3] == window.position[0, 0]).all())
     assert float(window.body.motion[0, :2].abs().max()) == 0.0
 
 
