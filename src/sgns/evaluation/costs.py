@@ -46,7 +46,9 @@ def trained(checkpoint: Path, card: dict[str, Any]) -> dict[str, float]:
         return {}
     try:
         summary = json.loads(file.read_text(encoding="utf-8"))
-        found = {"training_steps": int(summary["steps"]), "training_seconds": float(summary["seconds"])}
+        found = {"training_seconds": float(summary["seconds"])}
+        if "steps" in summary:  # polynomials are fitted without any
+            found["training_steps"] = int(summary["steps"])
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{file} is not the summary of a training ({type(error).__name__}: {error}); remove it or train again"

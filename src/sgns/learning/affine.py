@@ -54,6 +54,9 @@ def prefers_onednn(x: Tensor, weight: Tensor) -> bool:
 
 def product(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
     """oneDNN's x Wᵀ + b with its ReLU; float32 on the CPU only."""
+    # Of a matrix with gaps between its rows, such as a part of another one, oneDNN takes a thousand times as long.
+    if not (weight.is_contiguous() or weight.t().is_contiguous()):
+        weight = weight.contiguous()
     return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu" if relu else "none", [], "")
 
 
