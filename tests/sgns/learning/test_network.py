@@ -142,3 +142,16 @@ def test_parameter_count_is_that_of_five_mlps() -> None:
     network = EncodeProcessDecode(30, 4, 9)
     expected = mlp(30, 128) + mlp(4, 128) + mlp(3 * 128, 128) + mlp(2 * 128, 128) + mlp(128, 9)
     assert sum(p.numel() for p in network.parameters()) == expected
+
+
+def test_messages_of_two_sets_of_edges_add_up() -> None:
+    torch.manual_seed(0)
+    step = InteractionNetwork(5, 8, 2).double()
+    nodes, edges, index = torch.randn(6, 5).double(), torch.randn(30, 5).double(), edge_indices(5, 1)
+
+    def summed(which: torch.Tensor) -> torch.Tensor:
+        messages = step.edge_updater(index[:, which], nodes=nodes, edges=edges[which])
+        return step.propagate(index[:, which], edges=messages, size=(6, 6))
+
+    some = torch.rand(30) < 0.5
+    torch.testing.assert_close(summed(some) + summed(~some), summed(torch.ones(30, dtype=torch.bool)))
