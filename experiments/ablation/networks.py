@@ -3,10 +3,10 @@
     python experiments/ablation/networks.py blade --workers 3
     python experiments/ablation/networks.py wheel --workers 3
 
-Trains every variant, one change against preset=default each, for the same number of steps and several seeds on one
-thread, and rolls the validation and test runs of dataset=quick (blade) or dataset=quick_wheel (wheel) out. Writes
-<name>.csv beside this script: medians over seeds, with least and most. A training that is complete in `--output` is not
-repeated.
+Trains every variant, one change each against preset=default with model.predicts=acceleration (`base`; the default then),
+for the same number of steps on one thread, and rolls the validation and test runs of dataset=quick (blade) or dataset=quick_wheel (wheel) out. Writes
+<kind>.csv beside this script: medians over seeds, with least and most. A training that is complete in `--output` is
+not repeated.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ DATASETS = {"blade": "quick", "wheel": "quick_wheel"}
 POINTS = "model.body_nodes=points"
 
 BLADE = {
-    "default": [],
+    "base": [],
     "no next motion": ["model.next_motion=false"],
     "no positions": ["model.positions=false"],
     "modes share a vector": ["model.identity=type"],
@@ -70,7 +70,7 @@ BLADE = {
     "work and energy": ["+work=0.1"],
 }
 WHEEL = {
-    "default": [],
+    "base": [],
     "no context": ["model.context=[]"],
     "velocity": ["model.predicts=velocity"],
     "no next motion": ["model.next_motion=false"],
@@ -124,6 +124,7 @@ def settings(kind: str, overrides: Sequence[str], steps: int) -> dict[str, Any]:
                 f"training.max_steps={steps}",
                 f"training.validate_every={max(1, steps // 8)}",
                 "training.threads=1",
+                "model.predicts=acceleration",
                 *overrides,
             ],
         )
@@ -146,7 +147,7 @@ def task_rows(task: tuple[str, str, list[str], int, int, Path]) -> list[dict[str
     else:
         found = [(reduced, trained(config, reduced, seed, where))]
     rows = [row(kind, name, seed, found, config)]
-    if name == "fewer modes at times" or (kind == "blade" and name == "default"):
+    if name == "fewer modes at times" or (kind == "blade" and name == "base"):
         rows += [row(kind, f"{name}, rolled out with {r}", seed, found, config, modes=r) for r in (4, 2)]
     if name == "body points":
         rows += [row(kind, f"{name}, {n} at rollout", seed, found, config, points=n) for n in (6, 30)]
