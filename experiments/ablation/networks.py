@@ -3,10 +3,10 @@
     python experiments/ablation/networks.py blade --workers 3
     python experiments/ablation/networks.py wheel --workers 3
 
-Trains every variant, one change each against preset=default with model.predicts=acceleration (`base`; the default then),
-for the same number of steps on one thread, and rolls the validation and test runs of dataset=quick (blade) or dataset=quick_wheel (wheel) out. Writes
-<kind>.csv beside this script: medians over seeds, with least and most. A training that is complete in `--output` is
-not repeated.
+Trains every variant, one change each against preset=default with model.predicts=acceleration (`base`), for the same
+number of steps on one thread, and rolls the validation and test runs of dataset=quick (blade) or dataset=quick_wheel
+(wheel) out. Writes <kind>.csv beside this script: medians over seeds, with least and most. A training that is complete
+in `--output` is not repeated.
 """
 
 from __future__ import annotations
