@@ -213,6 +213,10 @@ _FIXED = (
 )
 
 
+# What follows from a number that a network may be told.
+_FOLLOWING = {"friction_angle": ("static_friction", "limit_friction")}
+
+
 def unlearned(known: Mapping[str, Any], asked: Mapping[str, Any], told: Sequence[str] = ()) -> list[str]:
     """What a scene changes that the training runs' scene fixes and neither path nor context can tell the network.
 
@@ -224,10 +228,14 @@ def unlearned(known: Mapping[str, Any], asked: Mapping[str, Any], told: Sequence
     Returns:
         `key value (trained with value)` for every such key of blade, wheel, material and gravity.
     """
+    covered = {name for key in told for name in (key.split(".")[-1], *_FOLLOWING.get(key, ()))}
     return [
         f"{key} {b} (trained with {a})"
         for key, (a, b) in differences(known, asked).items()
-        if key.split(".")[0] in _FIXED and key.split(".")[-1] not in told and a is not None and b is not None
+        if key.split(".")[0] in _FIXED
+        and key.split(".")[-1] not in covered
+        and a is not None
+        and b is not None
     ]
 
 

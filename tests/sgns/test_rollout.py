@@ -127,3 +127,8 @@ def test_changes_that_the_network_cannot_feel_are_named():
         "blade.width 0.2 (trained with 0.4)",
     ]
     assert unlearned(known, known | {"depth": 0.3}) == []
+    assert unlearned(known, asked, ["gravity"]) == ["blade.width 0.2 (trained with 0.4)"]
+    # What follows from a number that is told need not be told.
+    soil = {"friction_angle": 30.0, "material": {"static_friction": 0.577}}
+    other = {"friction_angle": 37.0, "material": {"static_friction": 0.754}}
+    assert len(unlearned(soil, other)) == 2 and unlearned(soil, other, ["friction_angle"]) == []
