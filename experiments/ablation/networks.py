@@ -52,6 +52,7 @@ BLADE = {
     "history 2": ["model.history=2"],
     "history 6": ["model.history=6"],
     "velocity": ["model.predicts=velocity"],
+    "velocity, noise 0.3": ["model.predicts=velocity", "training.noise=0.3"],
     "horizon 2": ["training.horizon=2"],
     "horizon 4": ["training.horizon=4"],
     "star": ["model.edges=star"],
