@@ -147,8 +147,9 @@ def main() -> None:
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         true = exact(options.dataset, options.runs)
-        plan = [(m, options.runs) for m in METHODS] + [("sgns", n) for n in options.long]
-        plan += [(METHODS[1], n) for n in options.long[:1]]
+        plan = [(m, options.runs) for m in METHODS]
+        plan += [(m, n) for n in options.long[:1] for m in METHODS[:2]]  # side by side, as the first three
+        plan += [("sgns", n) for n in options.long[1:]]
         for method, runs in plan:
             out = Path(temporary) / "modes.npy"
             load = os.getloadavg()[0]
