@@ -61,6 +61,9 @@ COMMANDS = {
         "folder",
         ("dataset.path", "checkpoint"),
     ),
+    "frontier": Command(
+        "sgns.frontier.frontier", "measure what accuracy costs in time; table, figures and page", "folder"
+    ),
     "check": Command("sgns.check", "read run files through and list what is wrong with them", None),
 }
 

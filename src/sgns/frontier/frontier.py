@@ -1,0 +1,42 @@
+"""`sgns frontier`: measure what accuracy costs in time, and gather it into a table, figures and a page."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+from sgns.errors import UserError
+from sgns.frontier.study import AXES, Study
+
+__all__ = ["main"]
+
+log = logging.getLogger(__name__)
+
+# Axis → module and function that measures the points of a study that are missing.
+MEASURES = {
+    "solver": ("sgns.frontier.solver_points", "measure_solver"),
+    "reduction": ("sgns.frontier.reduction_points", "measure_reduction"),
+    "surrogate": ("sgns.frontier.surrogate_points", "measure_surrogates"),
+}
+
+
+def main(cfg: DictConfig) -> None:
+    """The command."""
+    study = Study.from_settings(OmegaConf.to_container(cfg.study, resolve=True), Path(cfg.output))
+    for axis in axes_of(cfg.axis):
+        module, function = MEASURES[axis]
+        getattr(importlib.import_module(module), function)(study)
+
+
+def axes_of(asked: str | None) -> tuple[str, ...]:
+    """The axes that one command measures."""
+    if asked is None or asked == "all":
+        return AXES
+    if asked == "none":
+        return ()
+    if asked not in AXES:
+        raise UserError(f"axis is {asked!r}; allowed: {', '.join(AXES)}, all, none (only gather)")
+    return (asked,)

@@ -1,0 +1,201 @@
+"""What is kept of a run so that it can be compared with runs of the same scene on other beds of particles.
+
+Forces, torques and poses are kept in every frame. The soil is kept a few times a second, in two forms that do not
+depend on which particles stand for it:
+
+- its displacement around the points of a lattice: the mean displacement of the particles that started there, each
+  weighted with its nearness (1 at the point, 0 one lattice spacing away along any axis);
+- its surface: the highest particle, half a particle spacing added, in vertical columns.
+
+Letters: T frames, n particles, K observed frames, P lattice points.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpm_warp import Scene
+from sgns.errors import UserError
+from sgns.evaluation.surface import SurfaceGrid, height_map
+from sgns.runs import Run
+from sgns.wholefile import whole_file
+
+__all__ = ["Observation", "Observer", "observe_run", "observed_frames", "read_observation"]
+
+LATTICE = 0.02  # of displacements, coarse enough for the coarsest beds of a study [m]
+COLUMN = 0.03  # edge of a column of the surface [m]
+TIMES_PER_SECOND = 4  # that the soil is observed
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One run, whoever made it.
+
+    Attributes:
+        time: of the frames [s], shape (T,).
+        force: by the soil on the body [N], shape (T, 3); frame 0 is at rest.
+        torque: about its centre of mass [N m], shape (T, 3).
+        pose: of the body, shape (T, 7).
+        soil_time: when the soil was observed [s], shape (K,).
+        moved: displacement of the soil around the lattice points since the start [m], shape (K, P, 3), float32.
+        surface: height of the columns [m], shape (K, nx, ny); NaN where a column is empty.
+    """
+
+    time: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    pose: np.ndarray
+    soil_time: np.ndarray
+    moved: np.ndarray
+    surface: np.ndarray
+
+    def save(self, file: Path) -> None:
+        """Write it, complete or not at all."""
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(file) as temporary, temporary.open("wb") as stream:
+            np.savez_compressed(stream, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+    @property
+    def finite(self) -> bool:
+        """Whether soil and force stayed finite all the time."""
+        return bool(np.isfinite(self.force).all() and np.isfinite(self.moved).all())
+
+
+def read_observation(file: Path) -> Observation:
+    """What `Observation.save` wrote.
+
+    Raises:
+        UserError: it is missing or damaged.
+    """
+    try:
+        with np.load(file) as content:
+            return Observation(**{f.name: content[f.name] for f in fields(Observation)})
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise UserError(
+            f"{file} is not an observed run ({error}); remove it and its point to make it again"
+        ) from error
+
+
+def observed_frames(frame_count: int, frame_rate: float) -> np.ndarray:
+    """Frames in which the soil is looked at: the first, and then `TIMES_PER_SECOND` times a second."""
+    every = max(1, round(frame_rate / TIMES_PER_SECOND))
+    return np.arange(0, frame_count, every)
+
+
+class Observer:
+    """Collects an observation frame by frame.
+
+    Args:
+        scene: what is simulated; says where the bin is.
+        start: positions of the particles at time 0 [m], shape (n, 3).
+    """
+
+    def __init__(self, scene: Scene, start: np.ndarray) -> None:
+        self._start = np.asarray(start, dtype=np.float64)
+        size = np.asarray(scene.bed.size)
+        self._points = _NearPoints(self._start, size)
+        x, y = (np.linspace(0.0, edge, max(1, round(edge / COLUMN)) + 1) for edge in size[:2])
+        self._columns = SurfaceGrid(x, y)
+        # Half the edge of the cube that belongs to one particle, whatever share of them is here.
+        self._above = 0.5 * (scene.soil_volume / len(self._start)) ** (1.0 / 3.0)
+        self._frames: dict[str, list[Any]] = {f.name: [] for f in fields(Observation)}
+
+    def add(self, time: float, force: np.ndarray, torque: np.ndarray, pose: np.ndarray) -> None:
+        """A frame: its time [s], force [N], torque [N m] and the pose of the body."""
+        for key, value in (("time", time), ("force", force), ("torque", torque), ("pose", pose)):
+            self._frames[key].append(np.array(value, dtype=np.float64))
+
+    def add_soil(self, time: float, position: np.ndarray) -> None:
+        """The particles in a frame in which the soil is to be observed [m], shape (n, 3)."""
+        position = np.asarray(position, dtype=np.float64)
+        self._frames["soil_time"].append(time)
+        self._frames["moved"].append(self._points.mean(position - self._start).astype(np.float32))
+        self._frames["surface"].append(height_map(position, self._columns) + self._above)
+
+    def finish(self) -> Observation:
+        """All that was seen."""
+        return Observation(**{key: np.array(values) for key, values in self._frames.items()})
+
+
+class _NearPoints:
+    """Means over the particles near the points of a regular lattice in the bin."""
+
+    def __init__(self, start: np.ndarray, size: np.ndarray) -> None:
+        counts = np.maximum(1, np.round(size / LATTICE)).astype(int)
+        spacing = size / counts
+        place = (start + np.array([0.0, 0.0, size[2]])) / spacing - 0.5
+        low = np.floor(place).astype(int)
+        index, weight = [], []
+        for corner in itertools.product((0, 1), repeat=3):
+            node = low + corner
+            share = np.prod(np.maximum(0.0, 1.0 - np.abs(place - node)), axis=1)
+            share[((node < 0) | (node >= counts)).any(axis=1)] = 0.0
+            index.append(np.ravel_multi_index(tuple(np.clip(node, 0, counts - 1).T), tuple(counts)))
+            weight.append(share)
+        self._index, self._weight = np.concatenate(index), np.concatenate(weight)
+        self._count = int(np.prod(counts))
+        self._total = np.bincount(self._index, self._weight, self._count)
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """Of a vector of each particle (n, 3), shape (P, 3); NaN where no particle is near."""
+        sums = [
+            np.bincount(self._index, self._weight * np.tile(values[:, axis], 8), self._count)
+            for axis in range(3)
+        ]
+        with np.errstate(invalid="ignore"):
+            return np.stack(sums, axis=1) / self._total[:, None]
+
+
+def observe_run(run: Run, scene: Scene | None = None) -> Observation:
+    """The observation of a run file, a simulation's or a rollout's.
+
+    Args:
+        run: the file, open.
+        scene: if it is not the one the file names.
+    """
+    frames = observed_frames(run.frame_count, run.frame_rate)
+    return observe_arrays(
+        scene or Scene.from_dict(run.scene),
+        run.time,
+        run.force,
+        run.torque,
+        run.pose,
+        frames,
+        (run.positions(int(frame))[0] for frame in frames),
+    )
+
+
+def observe_arrays(
+    scene: Scene,
+    time: np.ndarray,
+    force: np.ndarray,
+    torque: np.ndarray,
+    pose: np.ndarray,
+    frames: np.ndarray,
+    positions: Iterable[np.ndarray],
+) -> Observation:
+    """The observation of a run that is in memory.
+
+    Args:
+        scene: what was simulated.
+        time: of all frames [s], shape (T,).
+        force: [N], shape (T, 3).
+        torque: [N m], shape (T, 3).
+        pose: of the body, shape (T, 7).
+        frames: numbers of the frames in which the soil is known, `observed_frames`, the first of them 0.
+        positions: particles in each of these frames [m], (n, 3) each.
+    """
+    observer: Observer | None = None
+    for frame, position in zip(frames, positions, strict=True):
+        observer = observer or Observer(scene, position)
+        observer.add_soil(float(time[frame]), position)
+    assert observer is not None
+    for values in zip(time, force, torque, pose, strict=True):
+        observer.add(*values)
+    return observer.finish()

@@ -1,0 +1,197 @@
+"""One operating point: a way to get the motion of the soil, what it costs and how wrong it is. One row of a table."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from sgns.errors import UserError
+from sgns.wholefile import whole_file
+
+__all__ = ["KINDS", "Point", "read_points", "write_points"]
+
+KINDS = ("solver", "reduction", "surrogate", "full space")
+
+
+@dataclass(frozen=True)
+class Point:
+    """One row of points.csv. A number that is not known, or has no meaning for this kind of point, is NaN.
+
+    Errors are against the most accurate run of the study (row `reference`), pooled over the study's cases of the
+    scene (comparison.py); they are filled in when points are gathered, all other fields when a point is measured.
+    """
+
+    study: str
+    """quick, full or the name of a study of one's own."""
+    scene: str
+    """cut, wheel, ...: points of one scene are on one figure."""
+    kind: str
+    """One of `KINDS`."""
+    axis: str
+    """What is varied: dx, stiffness, an effect, r, width, ...; `reference` for the most accurate run."""
+    label: str
+    """Unique within scene and kind; stands in figures."""
+    settings: str = ""
+    """The overrides that make it, as they are written on the command line."""
+    note: str = ""
+    """What a reader must know, such as `left the range: not finite from frame 31 on`."""
+    paper: bool = False
+    """An operating point of the paper."""
+
+    # --- size ---
+    particles: float = math.nan
+    """That are computed or decoded, the mirrored half included."""
+    modes: float = math.nan
+    """r."""
+    parameters: float = math.nan
+    """Learned numbers."""
+
+    # --- cost: medians of repeats, warm ---
+    wall_s_per_simulated_s: float = math.nan
+    wall_s_per_simulated_s_low: float = math.nan
+    """The fastest repeat."""
+    wall_s_per_simulated_s_high: float = math.nan
+    """The slowest repeat."""
+    processor_s_per_simulated_s: float = math.nan
+    decoded_wall_s_per_simulated_s: float = math.nan
+    """With the positions of all particles in every frame, where they are not computed anyway."""
+    repeats: float = math.nan
+    """How many repeats, or stretches of one run, the median is of."""
+    workload_wall_s_per_simulated_s: float = math.nan
+    """The reference workload (timing.py), measured just before and after, on the same core."""
+    ratio: float = math.nan
+    """wall_s_per_simulated_s / workload_wall_s_per_simulated_s."""
+    includes: str = ""
+    """What is in the time."""
+    processor: str = ""
+    threads: float = math.nan
+    device: str = ""
+
+    # --- errors against the reference; low and high: the best and the worst case (solver) or case and seed ---
+    force_nrmse: float = math.nan
+    force_nrmse_low: float = math.nan
+    force_nrmse_high: float = math.nan
+    draft_nrmse: float = math.nan
+    draft_mean_error: float = math.nan
+    """(mean - mean of the reference) / mean of the reference, signed."""
+    vertical_nrmse: float = math.nan
+    vertical_mean_error: float = math.nan
+    torque_nrmse: float = math.nan
+    position_rmse_mm: float = math.nan
+    position_rmse_mm_low: float = math.nan
+    position_rmse_mm_high: float = math.nan
+    surface_rmse_mm: float = math.nan
+    """Of the last frame."""
+    surface_rmse_mm_low: float = math.nan
+    surface_rmse_mm_high: float = math.nan
+    sinkage_error_mm: float = math.nan
+    """Mean absolute error of the height of a body that is free."""
+    force_nrmse_q1: float = math.nan
+    """In the first quarter of the run; q2 to q4 likewise."""
+    force_nrmse_q2: float = math.nan
+    force_nrmse_q3: float = math.nan
+    force_nrmse_q4: float = math.nan
+    position_rmse_mm_q1: float = math.nan
+    """At the end of the first quarter of the run; q2 to q4 likewise."""
+    position_rmse_mm_q2: float = math.nan
+    position_rmse_mm_q3: float = math.nan
+    position_rmse_mm_q4: float = math.nan
+
+    # --- of surrogates: errors against the solver that made the training runs, over its test runs ---
+    own_runs: float = math.nan
+    own_force_nrmse: float = math.nan
+    own_draft_mean_error: float = math.nan
+    own_position_rmse_mm: float = math.nan
+    own_surface_rmse_mm: float = math.nan
+    own_sinkage_error_mm: float = math.nan
+    frozen_rmse_mm: float = math.nan
+    """Nothing moves: the baseline of skill_frozen."""
+    skill_frozen: float = math.nan
+    skill_constant_velocity: float = math.nan
+    mean_force_nrmse: float = math.nan
+    """The mean force of the training runs: the baseline of own_force_nrmse."""
+    training_s: float = math.nan
+    """Processor seconds."""
+    training_samples: float = math.nan
+    """Windows seen, repetitions counted."""
+    training_runs: float = math.nan
+    energy: float = math.nan
+    """Share of the displacement energy that the modes hold, held-out runs."""
+
+    command: str = ""
+    """That measured it."""
+    machine: str = ""
+    version: str = ""
+    """Of the package."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise UserError(f"a point is of kind {self.kind!r}; allowed: {', '.join(KINDS)}")
+
+    def with_values(self, **values: Any) -> Point:
+        """A copy with some fields changed."""
+        return replace(self, **values)
+
+    def row(self) -> dict[str, Any]:
+        """Plain values by column, numbers to five digits, empty where not known."""
+        return {key: _written(value) for key, value in asdict(self).items()}
+
+    @classmethod
+    def from_row(cls, row: dict[str, Any]) -> Point:
+        """The point of a row of text or plain values; columns that are not known are left out.
+
+        Raises:
+            UserError: a value is not what its column holds.
+        """
+        values: dict[str, Any] = {}
+        for field in fields(cls):
+            given = row.get(field.name)
+            if given is None or given == "":
+                continue
+            try:
+                values[field.name] = _KINDS_OF_VALUE[str(field.type)](given)
+            except (ValueError, KeyError) as error:
+                raise UserError(f"{field.name} is {given!r}, which is not a {field.type}") from error
+        try:
+            return cls(**values)
+        except TypeError as error:
+            raise UserError(f"a row of operating points lacks columns: {error}") from None
+
+
+_KINDS_OF_VALUE = {"str": str, "float": float, "bool": lambda v: {"True": True, "False": False}[str(v)]}
+
+
+def _written(value: Any) -> Any:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.5g}"
+    return value
+
+
+def write_points(file: Path, points: Iterable[Point]) -> None:
+    """A CSV file with one line per point, complete or not at all; columns that no point fills are there, too."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(file) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, [field.name for field in fields(Point)], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(point.row() for point in points)
+
+
+def read_points(file: Path) -> list[Point]:
+    """The points of a CSV file.
+
+    Raises:
+        UserError: it cannot be read or is no such table.
+    """
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"cannot read {file}: {error}; make it: sgns frontier") from None
+    try:
+        return [Point.from_row(row) for row in rows]
+    except UserError as error:
+        raise UserError(f"{file} is no table of operating points: {error}") from None
