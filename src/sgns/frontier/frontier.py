@@ -9,6 +9,8 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from sgns.errors import UserError
+from sgns.frontier.gather import gathered
+from sgns.frontier.page import write_study
 from sgns.frontier.study import AXES, Study
 
 __all__ = ["main"]
@@ -29,6 +31,8 @@ def main(cfg: DictConfig) -> None:
     for axis in axes_of(cfg.axis):
         module, function = MEASURES[axis]
         getattr(importlib.import_module(module), function)(study)
+    page = write_study(study, gathered(study))
+    log.info("%s and the table and figures beside it", page)
 
 
 def axes_of(asked: str | None) -> tuple[str, ...]:

@@ -1,0 +1,200 @@
+"""Error over time of all points of a scene, with the front that none beats."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from sgns.frontier.gather import effective_error, front, usable
+from sgns.frontier.labels import place_labels
+from sgns.frontier.point import Point
+
+__all__ = ["COLUMNS", "known", "scene_figure", "through_time_figure", "training_figure"]
+
+COLUMNS = {
+    "force_nrmse": "force, NRMSE [-]",
+    "position_rmse_mm": "displacement of the soil, RMSE [mm]",
+    "surface_rmse_mm": "surface at the end, RMSE [mm]",
+    "sinkage_error_mm": "sinkage, mean absolute error [mm]",
+}
+STYLES = {
+    "solver": ("o", "#0072b2"),
+    "surrogate": ("^", "#d55e00"),
+    "full space": ("s", "#009e73"),
+    "reduction": ("D", "#cc79a7"),
+}
+DPI = 110
+
+
+def known(points: Sequence[Point], column: str) -> list[Point]:
+    """Usable points whose error is known."""
+    return [point for point in points if usable(point) and not math.isnan(getattr(point, column))]
+
+
+def scene_figure(points: Sequence[Point], column: str, bands: Mapping[str, float], title: str) -> bytes:
+    """Error over wall time per simulated second, as PNG.
+
+    Args:
+        points: of one scene.
+        column: which error.
+        bands: how wrong the reference may be, by column.
+        title: over the figure.
+    """
+    shown = known(points, column)
+    figure = Figure(figsize=(13, 8.5), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.set(xscale="log", yscale="log", title=title)
+    plain_numbers(axes)
+    axes.set_xlabel(
+        "wall seconds per simulated second, one core (median of repeats; bar: fastest to slowest)"
+    )
+    axes.set_ylabel(f"{COLUMNS[column]}, against the most accurate run (bar: best to worst case)")
+    references = [p for p in points if p.axis == "reference" and not math.isnan(p.wall_s_per_simulated_s)]
+    draw_points(axes, shown, column)
+    band = bands.get(column, 0.0)
+    set_limits(axes, [*shown, *references], column, band)
+    axes.axvline(1.0, color="k", ls="--", lw=1, zorder=1)
+    low, high = axes.get_ylim()
+    axes.text(1.0, high, " real time ", ha="right", va="top", rotation=90, fontsize=8)
+    if band:
+        axes.axhspan(low, band, color="0.92", zorder=0)
+        axes.text(
+            axes.get_xlim()[0],
+            band,
+            "  below: within the reference's own error",
+            fontsize=8,
+            va="top",
+            color="0.35",
+        )
+    best = front(points, column, bands)
+    axes.step(
+        [p.wall_s_per_simulated_s for p in best],
+        [effective_error(p, column, bands) for p in best],
+        where="post",
+        color="k",
+        lw=1.2,
+        zorder=2,
+        label="front: nothing faster is as good",
+    )
+    labelled = [
+        (p.wall_s_per_simulated_s, getattr(p, column), f"★ {p.label}" if p.paper else p.label) for p in shown
+    ]
+    for point in references:
+        axes.axvline(point.wall_s_per_simulated_s, color="0.5", ls=":", lw=1)
+        labelled.append((point.wall_s_per_simulated_s, max(band, low * 1.3), f"reference: {point.label}"))
+    axes.legend(loc="lower left", fontsize=8)
+    figure.canvas.draw()
+    # The legend's place is taken, too.
+    place_labels(axes, *zip(*labelled, strict=True))
+    return png(figure)
+
+
+def draw_points(axes: Axes, points: Sequence[Point], column: str) -> None:
+    """Markers by kind with their bars; the paper's own points are stars."""
+    for kind, (marker, colour) in STYLES.items():
+        for paper in (False, True):
+            chosen = [p for p in points if p.kind == kind and p.paper == paper]
+            if not chosen:
+                continue
+            x = [p.wall_s_per_simulated_s for p in chosen]
+            y = [getattr(p, column) for p in chosen]
+            bars = {"xerr": [spread(p, "wall_s_per_simulated_s") for p in chosen]}
+            if hasattr(chosen[0], f"{column}_low"):
+                bars["yerr"] = [spread(p, column) for p in chosen]
+            axes.errorbar(
+                x,
+                y,
+                **{key: list(zip(*values, strict=True)) for key, values in bars.items()},
+                fmt="*" if paper else marker,
+                ms=15 if paper else 6,
+                color=colour,
+                ecolor=(colour, 0.35),
+                elinewidth=0.5,
+                zorder=4,
+                mec="k" if paper else "white",
+                mew=0.8 if paper else 0.4,
+                label=f"{kind}, the paper's" if paper else kind,
+            )
+
+
+def plain_numbers(axes: Axes) -> None:
+    """0.2 in place of 2 × 10⁻¹, at 1, 2 and 5 of every decade of y."""
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(lambda value, _: f"{value:g}")
+
+
+def spread(point: Point, column: str) -> tuple[float, float]:
+    """How far the bar reaches below and above; nothing where it is not known."""
+    middle, low, high = (getattr(point, f"{column}{end}") for end in ("", "_low", "_high"))
+    below, above = middle - low, high - middle
+    return (0.0 if math.isnan(below) else max(below, 0.0), 0.0 if math.isnan(above) else max(above, 0.0))
+
+
+def set_limits(axes: Axes, points: Sequence[Point], column: str, band: float) -> None:
+    """Room for labels around all points and the band."""
+    x = [p.wall_s_per_simulated_s for p in points] + [1.0]
+    y = [getattr(p, column) for p in points if getattr(p, column) > 0.0] + ([band] if band else [])
+    axes.set_xlim(min(x) / 2.5, max(x) * 3.0)
+    axes.set_ylim(min(y) / 1.8, max(y) * 1.5)
+
+
+def through_time_figure(points: Sequence[Point], title: str) -> bytes:
+    """Errors of force and displacement at the quarters of the run, as PNG."""
+    figure = Figure(figsize=(11, 4.5), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=10)
+    panels = figure.subplots(1, 2)
+    for axes, column in zip(panels, ("force_nrmse", "position_rmse_mm"), strict=True):
+        for number, point in enumerate(points):
+            values = [getattr(point, f"{column}_q{quarter}") for quarter in (1, 2, 3, 4)]
+            marker = STYLES[point.kind][0]
+            axes.plot((1, 2, 3, 4), values, f"{marker}-", color=f"C{number % 10}", ms=5, label=point.label)
+        axes.set(xticks=(1, 2, 3, 4), xlabel="quarter of the run", ylabel=COLUMNS[column], yscale="log")
+        plain_numbers(axes)
+        axes.grid(alpha=0.3)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper", fontsize=7)
+    return png(figure)
+
+
+def training_figure(points: Sequence[Point], title: str) -> bytes:
+    """What training time buys: errors against the solver that made the runs, over processor time, as PNG."""
+    figure = Figure(figsize=(13, 5.5), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=10)
+    panels = figure.subplots(1, 2)
+    columns = {"own_force_nrmse": "mean_force_nrmse", "own_position_rmse_mm": "frozen_rmse_mm"}
+    for axes, (column, baseline) in zip(panels, columns.items(), strict=True):
+        shown = [p for p in points if p.training_s > 0 and getattr(p, column) > 0]
+        if not shown:
+            continue
+        x, y = [p.training_s for p in shown], [getattr(p, column) for p in shown]
+        axes.set(xscale="log", yscale="log", xlabel="training, processor seconds")
+        plain_numbers(axes)
+        axes.set_ylabel("force, NRMSE [-]" if "force" in column else "particle positions, RMSE [mm]")
+        axes.plot(x, y, "^", color=STYLES["surrogate"][1], ms=5)
+        line = [getattr(p, baseline) for p in shown if getattr(p, baseline) > 0]
+        if line:
+            axes.axhline(line[0], color="0.5", ls=":", lw=1)
+            name = "the mean force of the training runs" if "force" in column else "nothing moves"
+            axes.text(min(x) / 1.4, line[0], f" {name}", fontsize=7, va="bottom", color="0.35")
+        axes.set_xlim(min(x) / 1.5, max(x) * 3.0)
+        axes.set_ylim(min(y) / 1.5, max([*y, *line]) * 1.5)
+        figure.canvas.draw()
+        place_labels(axes, x, y, [p.label for p in shown], 6.0)
+    return png(figure)
+
+
+def png(figure: Figure) -> bytes:
+    """The picture."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()
