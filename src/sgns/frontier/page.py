@@ -153,7 +153,7 @@ def made(study: Study, points: Sequence[Point]) -> str:
         "study": study.name,
         "machine": "; ".join(machines),
         "commands": "; ".join(sorted({p.command for p in points if p.command})),
-        "package": "; ".join(sorted({p.version for p in points if p.version})),
+        "package": "; ".join(sorted({f"{p.version} {p.commit}".strip() for p in points if p.version})),
         "points": str(len(points)),
         "timing": "medians of repeats on one core and one thread, warm: kernels were compiled and files in memory "
         "before the clock started. The solver's repeats are stretches of its runs.",
@@ -177,8 +177,8 @@ def rendered(study: Study, parts: Sequence[tuple[str, str, str]]) -> str:
     contents = "".join(f'<a href="#{anchor}">{escape(heading)}</a> ' for anchor, heading, _ in parts)
     words = (
         "Settings of the solver and surrogates on one scale: the wall time of a simulated second on one core against "
-        "the error beside the most accurate run that was affordable. Read off which point is fast enough and good enough; "
-        "sgns advise answers the same question on the command line."
+        "the error beside the most accurate run that was affordable. Read off which point is fast enough and good "
+        "enough; sgns advise answers the same question on the command line."
     )
     return f"""<!DOCTYPE html>
 <html lang="en">

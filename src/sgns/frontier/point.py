@@ -36,7 +36,8 @@ class Point:
     label: str
     """Unique within scene and kind; stands in figures."""
     settings: str = ""
-    """The overrides that make it, as they are written on the command line."""
+    """The overrides that make it as they are written on the command line: of `sgns simulate` for the solver, of
+    `sgns train` for surrogates (dataset and length of the training among them)."""
     note: str = ""
     """What a reader must know, such as `left the range: not finite from frame 31 on`."""
     paper: bool = False
@@ -127,6 +128,8 @@ class Point:
     machine: str = ""
     version: str = ""
     """Of the package."""
+    commit: str = ""
+    """Of the code that measured it, where that was a checkout."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

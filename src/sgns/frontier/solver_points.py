@@ -10,13 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from mpm_warp import Solver, SolverStopped
-from sgns import __version__
 from sgns.claim import claimed
-from sgns.evaluation.provenance import command_line, cpu_model
 from sgns.frontier.observation import Observation, Observer, observed_frames
 from sgns.frontier.point import Point
 from sgns.frontier.study import PointSettings, Study, StudyScene
-from sgns.frontier.timing import Workload, composed_scene, cost_fields, one_core
+from sgns.frontier.timing import Workload, composed_scene, cost_fields, made_here, one_core
 from sgns.scene_effects import asked_effects, decided
 
 __all__ = ["measure_solver"]
@@ -57,9 +55,7 @@ def measured(
         settings=shlex.join([f"scene={scene.settings['scene']}", *settings.set]),
         paper=settings.paper,
         includes=INCLUDES,
-        command=command_line(),
-        machine=cpu_model(),
-        version=__version__,
+        **made_here(),
     )
     before = workload.measure()
     walls, processor, observations = [], [], {}

@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import os
 import statistics
+import subprocess
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,10 +22,11 @@ from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 
 from mpm_warp import Frame, Scene, Solver, effects_for
-from sgns.evaluation.provenance import cpu_model
+from sgns import __version__
+from sgns.evaluation.provenance import command_line, cpu_model
 from sgns.scenes import scene_from_config
 
-__all__ = ["Workload", "composed_scene", "cost_fields", "one_core"]
+__all__ = ["Workload", "composed_scene", "cost_fields", "made_here", "one_core"]
 
 FRAMES = 8  # of one measurement of the workload
 STRETCHES = 2  # of which the median is taken, before and after each
@@ -99,3 +103,29 @@ def cost_fields(
         "threads": 1.0,
         "device": "cpu",
     }
+
+
+def made_here() -> dict[str, str]:
+    """The columns of `Point` that say how and where it is measured."""
+    return {
+        "command": command_line(),
+        "machine": cpu_model(),
+        "version": __version__,
+        "commit": commit(),
+    }
+
+
+@cache
+def commit() -> str:
+    """Short name of the commit this package runs from; empty if it is no checkout."""
+    try:
+        asked = subprocess.run(
+            ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=10,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return asked.stdout.strip() if asked.returncode == 0 else ""
