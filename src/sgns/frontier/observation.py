@@ -30,7 +30,7 @@ __all__ = ["Observation", "Observer", "observe_run", "observed_frames", "read_ob
 
 LATTICE = 0.02  # of displacements, coarse enough for the coarsest beds of a study [m]
 COLUMN = 0.03  # edge of a column of the surface [m]
-TIMES_PER_SECOND = 4  # that the soil is observed
+TIMES_PER_SECOND = 5  # that the soil is observed
 
 
 @dataclass(frozen=True)
