@@ -5,10 +5,10 @@ BIN := .venv/bin
 READY := .venv/.sgns-ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint clean
+.PHONY: help setup demo frontier test lint clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo "  settings: PYTHON=python3.12 (3.10 to 3.13), TORCH='torch==2.13.0' (what pip installs first)"
 
 setup: $(READY) ## make .venv and install the package with what tests and lint need
@@ -26,6 +26,14 @@ $(READY): pyproject.toml
 
 demo: setup ## from scenes to a report with pictures: simulate, train, roll out, evaluate
 	$(BIN)/python -m sgns.demo
+
+# The solver's points on one core, reductions and surrogates on another; the last command gathers.
+frontier: setup ## what accuracy costs in time: the quick study, about a quarter of an hour on two cores
+	$(BIN)/sgns simulate dataset=quick
+	$(BIN)/sgns frontier study=quick axis=solver & solver=$$!; \
+	$(BIN)/sgns frontier study=quick axis=reduction && $(BIN)/sgns frontier study=quick axis=surrogate; \
+	learned=$$?; wait $$solver && exit $$learned
+	$(BIN)/sgns frontier study=quick axis=none
 
 test: setup ## run the tests
 	$(BIN)/python -m pytest

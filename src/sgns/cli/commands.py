@@ -64,6 +64,7 @@ COMMANDS = {
     "frontier": Command(
         "sgns.frontier.frontier", "measure what accuracy costs in time; table, figures and page", "folder"
     ),
+    "advise": Command("sgns.frontier.advise", "name the setting that is good and fast enough", None),
     "check": Command("sgns.check", "read run files through and list what is wrong with them", None),
 }
 

@@ -83,9 +83,9 @@ def read_observation(file: Path) -> Observation:
 
 
 def observed_frames(frame_count: int, frame_rate: float) -> np.ndarray:
-    """Frames in which the soil is looked at: the first, and then `TIMES_PER_SECOND` times a second."""
+    """Frames in which the soil is looked at: the first, then `TIMES_PER_SECOND` times a second, and the last."""
     every = max(1, round(frame_rate / TIMES_PER_SECOND))
-    return np.arange(0, frame_count, every)
+    return np.union1d(np.arange(0, frame_count, every), frame_count - 1)
 
 
 class Observer:

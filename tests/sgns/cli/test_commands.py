@@ -102,6 +102,8 @@ def test_settings_of_a_command(command: str) -> None:
         "simulate": {"shard", "shards"},
         "rollout": {"num_modes"},
         "evaluate": {"split", "num_modes", "new_rollouts", "timing_repeats"},
+        "frontier": {"study", "axis"},
+        "advise": {"task", "error", "time", "particles", "against", "table"},
         "check": {"files"},
     }
     assert set(cfg) - {"hydra"} <= {*keys.split(), "experiment"} | own.get(command, set())

@@ -1,0 +1,215 @@
+"""`sgns advise`: which setting of the solver, or which surrogate, is good enough and fast enough."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from sgns.errors import UserError
+from sgns.frontier.gather import effective_error, usable
+from sgns.frontier.point import Point, read_points
+
+__all__ = ["STEP", "Wish", "advice", "main"]
+
+log = logging.getLogger(__name__)
+
+STEP = 1.0 / 60.0
+"""Simulated time of one step: what `time` is the wall time of [s]."""
+
+# Key of `error` → column, what one of its units is of the key's, and words. Lengths are metres in settings.
+ERRORS = {
+    "force": ("force_nrmse", 1.0, "force NRMSE", ""),
+    "position": ("position_rmse_mm", 1e3, "displacement of the soil", " mm"),
+    "surface": ("surface_rmse_mm", 1e3, "surface at the end", " mm"),
+    "sinkage": ("sinkage_error_mm", 1e3, "sinkage", " mm"),
+}
+OWN = {
+    "force": "own_force_nrmse",
+    "position": "own_position_rmse_mm",
+    "surface": "own_surface_rmse_mm",
+    "sinkage": "own_sinkage_error_mm",
+}
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a person needs.
+
+    Attributes:
+        scene: whose points are looked at.
+        errors: column of `Point` → largest error, in the column's unit.
+        time: longest wall time of a step of `STEP` [s], or None.
+        particles: whether the positions of all particles are wanted in every step.
+        bands: column → how wrong the reference itself may be.
+        columns: key of `error` → the column it is about.
+    """
+
+    scene: str
+    errors: Mapping[str, float]
+    time: float | None
+    particles: bool
+    bands: Mapping[str, float]
+    columns: Mapping[str, str]
+
+    def step_time(self, point: Point) -> float:
+        """Wall time of a step of a point [s]; NaN if it is not known."""
+        seconds = point.wall_s_per_simulated_s
+        if self.particles and point.kind != "solver":
+            seconds = point.decoded_wall_s_per_simulated_s
+        return seconds * STEP
+
+    def excess(self, point: Point) -> float:
+        """The largest of what a point does over what is allowed; 1 or less: it is good enough."""
+        shares = [effective_error(point, column, self.bands) / limit for column, limit in self.errors.items()]
+        if self.time is not None:
+            shares.append(self.step_time(point) / self.time)
+        return math.nan if any(map(math.isnan, shares)) else max(shares)
+
+
+def chosen(points: Sequence[Point], wish: Wish) -> tuple[Point, bool]:
+    """The point to use and whether it meets the wish.
+
+    Of those that meet it the fastest, or with a time alone the one with the smallest error of the force; if none does,
+    the one that misses it by the smallest factor.
+
+    Raises:
+        UserError: no point of the scene has the errors asked for.
+    """
+    there = [p for p in points if p.scene == wish.scene and usable(p) and not math.isnan(wish.excess(p))]
+    if not there:
+        raise UserError(
+            f"no operating point of task={wish.scene} has all the numbers asked for; its kinds of error are "
+            f"in points.csv"
+        )
+    good = [p for p in there if wish.excess(p) <= 1.0]
+    if good and wish.errors:
+        return min(good, key=lambda p: p.wall_s_per_simulated_s), True
+    if good:
+        with_force = [p for p in good if not math.isnan(p.force_nrmse)] or good
+        return min(with_force, key=lambda p: (p.force_nrmse, p.wall_s_per_simulated_s)), True
+    return min(there, key=lambda p: (wish.excess(p), p.wall_s_per_simulated_s)), False
+
+
+def advice(points: Sequence[Point], wish: Wish) -> list[str]:
+    """The answer in lines."""
+    point, met = chosen(points, wish)
+    lines = [f"{'use' if met else 'nothing meets this; closest'}: {point.kind}, {point.label}"]
+    lines += [f"  {line}" for line in commands(point)]
+    step = wish.step_time(point)
+    cost = f"{1e3 * step:.3g} ms per step of 1/60 s"
+    if point.kind != "solver":
+        cost += ", positions of all particles included" if wish.particles else ", particles not decoded"
+    lines.append(
+        f"  costs {cost} on one core of {point.machine} ({point.ratio:.3g} of the reference workload)"
+    )
+    for key, (_, _, words, unit) in ERRORS.items():
+        column = wish.columns[key]
+        value = effective_error(point, column, wish.bands)
+        if math.isnan(value):
+            continue
+        within = value <= wish.bands.get(column, 0.0)
+        limit = wish.errors.get(column)
+        said = f"  {words}: {value:.3g}{unit}"
+        said += " (within the reference's own error)" if within else ""
+        said += f", asked for {limit:.3g}{unit}" if limit is not None else ""
+        lines.append(said)
+        if limit is not None and limit < wish.bands.get(column, 0.0):
+            lines.append(
+                f"    the reference itself is only known to {wish.bands[column]:g}{unit}: nothing can be shown to "
+                "be better"
+            )
+    reference = next((p for p in points if p.scene == wish.scene and p.axis == "reference"), None)
+    against = f"against the solver at {reference.label}" if reference else "against the study's reference"
+    if wish.columns == OWN:
+        against = "against the solver that made the training runs, over its test runs"
+    measured = f"version {point.version}" + (f", commit {point.commit}" if point.commit else "")
+    lines.append(
+        f"  rests on study {point.study}, scene {point.scene}: errors {against}; measured with {measured}"
+    )
+    if point.note:
+        lines.append(f"  note: {point.note}")
+    return lines
+
+
+def commands(point: Point) -> list[str]:
+    """What to type for a point."""
+    if point.kind == "solver":
+        return [f"sgns simulate {point.settings} output=run.h5"]
+    if point.kind == "surrogate":
+        return [
+            f"sgns train {point.settings} output=outputs/advised",
+            "sgns rollout checkpoint=outputs/advised/best.ckpt scene=... output=rollout.h5",
+        ]
+    return [point.settings] if point.settings else []
+
+
+def main(cfg: DictConfig) -> float:
+    """The command; returns the wall time of a step [s]."""
+    points = read_points(table(cfg.table))
+    wish = wished(OmegaConf.to_container(cfg, resolve=True), points)
+    for line in advice(points, wish):
+        log.info("%s", line)
+    return wish.step_time(chosen(points, wish)[0])
+
+
+def table(asked: str | None) -> Path:
+    """The file asked for, or the one that ships with the package."""
+    return Path(asked) if asked else Path(str(files("sgns.frontier").joinpath("table.csv")))
+
+
+def wished(cfg: Mapping[str, Any], points: Sequence[Point]) -> Wish:
+    """The wish in the settings of the command.
+
+    Raises:
+        UserError: a limit is no number above 0, nothing is asked for, or the table has no such scene.
+    """
+    scenes = list(dict.fromkeys(p.scene for p in points))
+    if cfg["task"] not in scenes:
+        raise UserError(f"task is {cfg['task']!r}; the table has {', '.join(scenes) or 'none'}")
+    if not isinstance(cfg["error"], Mapping) or (wrong := set(cfg["error"]) - set(ERRORS)):
+        raise UserError(f"error has no key {min(wrong)!r}; allowed: {', '.join(ERRORS)}")
+    if cfg["against"] not in ("reference", "training"):
+        raise UserError(f"against is {cfg['against']!r}; allowed: reference, training")
+    if not isinstance(cfg["particles"], bool):
+        raise UserError(f"particles is {cfg['particles']!r}; allowed: true, false")
+    own = cfg["against"] == "training"
+    columns = OWN if own else {key: error[0] for key, error in ERRORS.items()}
+    limits = {}
+    for key, value in cfg["error"].items():
+        if value is not None:
+            limits[columns[key]] = ERRORS[key][1] * positive(f"error.{key}", value)
+    time = None if cfg["time"] is None else positive("time", cfg["time"])
+    if not limits and time is None:
+        raise UserError(
+            "nothing is asked for; give error.force=0.2, error.position=0.005 (m), time=0.01 (s), ..."
+        )
+    study = next(p.study for p in points if p.scene == cfg["task"])
+    return Wish(
+        cfg["task"], limits, time, cfg["particles"], {} if own else bands(study, cfg["task"]), columns
+    )
+
+
+def positive(key: str, value: Any) -> float:
+    """A number above 0."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
+        raise UserError(f"{key} is {value!r}; it must be a number above 0")
+    return float(value)
+
+
+def bands(study: str, scene: str) -> dict[str, float]:
+    """How wrong the reference of a study that ships with the package may be, by column; empty for others."""
+    file = files("sgns.conf").joinpath(f"study/{study}.yaml")
+    if not file.is_file():
+        return {}
+    settings = yaml.safe_load(file.read_text(encoding="utf-8"))
+    return {
+        key: float(value) for key, value in (settings["scenes"].get(scene, {}).get("bands") or {}).items()
+    }

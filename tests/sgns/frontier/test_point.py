@@ -1,0 +1,42 @@
+"""Rows of the table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sgns.errors import UserError
+from sgns.frontier.point import Point, read_points, write_points
+
+
+def test_points_come_back_from_a_table_to_five_digits(tmp_path: Path) -> None:
+    points = [
+        Point("full", "cut", "solver", "dx", 'dx 20, "a"', paper=True, force_nrmse=0.123456789),
+        Point("full", "wheel", "surrogate", "r", "r = 8", training_runs=36.0, note="x, y"),
+    ]
+    write_points(tmp_path / "points.csv", points)
+    back = read_points(tmp_path / "points.csv")
+    assert [p.label for p in back] == [p.label for p in points]
+    assert back[0].paper and not back[1].paper
+    assert back[0].force_nrmse == pytest.approx(0.12346) and back[1].note == "x, y"
+    assert back[0].training_runs != back[0].training_runs  # NaN: not known
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        ("study,scene\nfull,cut\n", "lacks columns"),
+        ("study,scene,kind,axis,label\nfull,cut,magic,dx,a\n", "allowed: solver"),
+        ("study,scene,kind,axis,label,ratio\nfull,cut,solver,dx,a,fast\n", "ratio is 'fast'"),
+    ],
+)
+def test_a_file_that_is_no_table_is_refused_in_one_line(tmp_path: Path, content: str, line: str) -> None:
+    (tmp_path / "a.csv").write_text(content)
+    with pytest.raises(UserError, match=line):
+        read_points(tmp_path / "a.csv")
+
+
+def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"cannot read .*b\.csv"):
+        read_points(tmp_path / "b.csv")
