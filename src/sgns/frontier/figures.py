@@ -15,7 +15,14 @@ from sgns.frontier.gather import effective_error, front, usable
 from sgns.frontier.labels import place_labels
 from sgns.frontier.point import Point
 
-__all__ = ["COLUMNS", "known", "scene_figure", "through_time_figure", "training_figure"]
+__all__ = [
+    "COLUMNS",
+    "known",
+    "reduction_figure",
+    "scene_figure",
+    "through_time_figure",
+    "training_figure",
+]
 
 COLUMNS = {
     "force_nrmse": "force, NRMSE [-]",
@@ -162,6 +169,37 @@ def through_time_figure(points: Sequence[Point], title: str) -> bytes:
         plain_numbers(axes)
         axes.grid(alpha=0.3)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper", fontsize=7)
+    return png(figure)
+
+
+def reduction_figure(points: Sequence[Point], title: str) -> bytes:
+    """What r modes leave out of held-out runs, over the time of encoding and decoding, as PNG; a line per centring."""
+    figure = Figure(figsize=(11, 5.5), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(xscale="log", yscale="log", title=title)
+    plain_numbers(axes)
+    axes.set(
+        xlabel="encoding and decoding every frame, wall seconds per simulated second",
+        ylabel="particle positions, RMSE on held-out runs [mm]",
+    )
+    for number, axis in enumerate(dict.fromkeys(p.axis for p in points)):
+        line = sorted((p for p in points if p.axis == axis), key=lambda p: p.modes)
+        x, y = [p.wall_s_per_simulated_s for p in line], [p.own_position_rmse_mm for p in line]
+        axes.plot(x, y, "D-", color=f"C{number}", ms=4, lw=1, label=axis)
+        for point in line:
+            axes.annotate(
+                f"{point.modes:g}",
+                (point.wall_s_per_simulated_s, point.own_position_rmse_mm),
+                xytext=(4, 4 + 8 * number),
+                textcoords="offset points",
+                fontsize=7,
+                color=f"C{number}",
+            )
+    frozen = [p.frozen_rmse_mm for p in points if p.frozen_rmse_mm > 0]
+    if frozen:
+        axes.axhline(frozen[0], color="0.5", ls=":", lw=1, label="nothing moves")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, title="numbers: r")
     return png(figure)
 
 

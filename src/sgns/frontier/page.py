@@ -9,7 +9,14 @@ from pathlib import Path
 
 from sgns.evaluation.report import CSS, note, picture, section
 from sgns.evaluation.report_figures import ReportFigure
-from sgns.frontier.figures import COLUMNS, known, scene_figure, through_time_figure, training_figure
+from sgns.frontier.figures import (
+    COLUMNS,
+    known,
+    reduction_figure,
+    scene_figure,
+    through_time_figure,
+    training_figure,
+)
 from sgns.frontier.gather import front
 from sgns.frontier.point import Point, write_points
 from sgns.frontier.study import Study, StudyScene
@@ -40,6 +47,7 @@ TABLE: tuple[tuple[str, Callable[[Point], str]], ...] = (
     ("own soil, mm", lambda p: digits(p.own_position_rmse_mm)),
     ("skill", lambda p: digits(p.skill_frozen)),
     ("training, s", lambda p: digits(p.training_s)),
+    ("displacement energy, %", lambda p: digits(100.0 * p.energy)),
     ("note", lambda p: p.note),
 )
 
@@ -101,6 +109,13 @@ def scene_figures(scene: StudyScene, points: Sequence[Point]) -> list[ReportFigu
             ReportFigure(
                 f"{scene.name}_training", f"{scene.name}: error against training time", caption, image
             )
+        )
+    reduced = [p for p in points if p.kind == "reduction" and p.own_position_rmse_mm > 0]
+    if reduced:
+        image = reduction_figure(reduced, f"{scene.name}: what r modes leave out")
+        caption = "No simulation: the held-out runs are projected onto the modes. No surrogate with r modes can be better."
+        found.append(
+            ReportFigure(f"{scene.name}_reduction", f"{scene.name}: reduction alone", caption, image)
         )
     return found
 

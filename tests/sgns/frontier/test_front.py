@@ -7,7 +7,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from sgns.frontier.figures import scene_figure, through_time_figure, training_figure
+from sgns.frontier.figures import reduction_figure, scene_figure, through_time_figure, training_figure
 from sgns.frontier.gather import effective_error, front
 from sgns.frontier.labels import place_labels
 from sgns.frontier.point import Point
@@ -78,3 +78,13 @@ def test_figures_of_training_and_of_errors_through_time_are_pictures() -> None:
     ]
     assert through_time_figure(trained, "t").startswith(b"\x89PNG")
     assert training_figure(trained, "t").startswith(b"\x89PNG")
+
+
+def test_the_figure_of_reductions_is_a_picture() -> None:
+    points = [
+        point(
+            f"r {r}", 0.1, 0.4, "reduction", modes=float(r), own_position_rmse_mm=9.0 / r, frozen_rmse_mm=12.0
+        )
+        for r in (1, 2, 4)
+    ]
+    assert reduction_figure(points, "t").startswith(b"\x89PNG")
