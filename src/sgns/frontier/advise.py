@@ -61,10 +61,7 @@ class Wish:
 
     def step_time(self, point: Point) -> float:
         """Wall time of a step of a point [s]; NaN if it is not known."""
-        seconds = point.wall_s_per_simulated_s
-        if self.particles and point.kind != "solver":
-            seconds = point.decoded_wall_s_per_simulated_s
-        return seconds * STEP
+        return STEP * (point.decoded_cost if self.particles else point.cost)
 
     def excess(self, point: Point) -> float:
         """The largest of what a point does over what is allowed; 1 or less: it is good enough."""
@@ -91,11 +88,11 @@ def chosen(points: Sequence[Point], wish: Wish) -> tuple[Point, bool]:
         )
     good = [p for p in there if wish.excess(p) <= 1.0]
     if good and wish.errors:
-        return min(good, key=lambda p: p.wall_s_per_simulated_s), True
+        return min(good, key=lambda p: p.cost), True
     if good:
         with_force = [p for p in good if not math.isnan(p.force_nrmse)] or good
-        return min(with_force, key=lambda p: (p.force_nrmse, p.wall_s_per_simulated_s)), True
-    return min(there, key=lambda p: (wish.excess(p), p.wall_s_per_simulated_s)), False
+        return min(with_force, key=lambda p: (p.force_nrmse, p.cost)), True
+    return min(there, key=lambda p: (wish.excess(p), p.cost)), False
 
 
 def advice(points: Sequence[Point], wish: Wish) -> list[str]:

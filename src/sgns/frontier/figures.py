@@ -60,10 +60,11 @@ def scene_figure(points: Sequence[Point], column: str, bands: Mapping[str, float
     axes.set(xscale="log", yscale="log", title=title)
     plain_numbers(axes)
     axes.set_xlabel(
-        "wall seconds per simulated second, one core (median of repeats; bar: fastest to slowest)"
+        "seconds of one core per simulated second: wall time, median of repeats (bar: fastest to slowest); "
+        "without bar: processor time, the core was shared"
     )
     axes.set_ylabel(f"{COLUMNS[column]}, against the most accurate run (bar: best to worst case)")
-    references = [p for p in points if p.axis == "reference" and not math.isnan(p.wall_s_per_simulated_s)]
+    references = [p for p in points if p.axis == "reference" and not math.isnan(p.cost)]
     draw_points(axes, shown, column)
     band = bands.get(column, 0.0)
     set_limits(axes, [*shown, *references], column, band)
@@ -82,7 +83,7 @@ def scene_figure(points: Sequence[Point], column: str, bands: Mapping[str, float
         )
     best = front(points, column, bands)
     axes.step(
-        [p.wall_s_per_simulated_s for p in best],
+        [p.cost for p in best],
         [effective_error(p, column, bands) for p in best],
         where="post",
         color="k",
@@ -90,15 +91,12 @@ def scene_figure(points: Sequence[Point], column: str, bands: Mapping[str, float
         zorder=2,
         label="front: nothing faster is as good",
     )
-    labelled = [
-        (p.wall_s_per_simulated_s, getattr(p, column), f"★ {p.label}" if p.paper else p.label) for p in shown
-    ]
+    labelled = [(p.cost, getattr(p, column), f"★ {p.label}" if p.paper else p.label) for p in shown]
     for point in references:
-        axes.axvline(point.wall_s_per_simulated_s, color="0.5", ls=":", lw=1)
-        labelled.append((point.wall_s_per_simulated_s, max(band, low * 1.3), f"reference: {point.label}"))
+        axes.axvline(point.cost, color="0.5", ls=":", lw=1)
+        labelled.append((point.cost, max(band, low * 1.3), f"reference: {point.label}"))
     axes.legend(loc="lower left", fontsize=8)
-    figure.canvas.draw()
-    # The legend's place is taken, too.
+    settle(figure)
     place_labels(axes, *zip(*labelled, strict=True))
     return png(figure)
 
@@ -110,7 +108,7 @@ def draw_points(axes: Axes, points: Sequence[Point], column: str) -> None:
             chosen = [p for p in points if p.kind == kind and p.paper == paper]
             if not chosen:
                 continue
-            x = [p.wall_s_per_simulated_s for p in chosen]
+            x = [p.cost for p in chosen]
             y = [getattr(p, column) for p in chosen]
             bars = {"xerr": [spread(p, "wall_s_per_simulated_s") for p in chosen]}
             if hasattr(chosen[0], f"{column}_low"):
@@ -139,8 +137,16 @@ def plain_numbers(axes: Axes) -> None:
         axis.set_major_formatter(lambda value, _: f"{value:g}")
 
 
+def settle(figure: Figure) -> None:
+    """Axes where they stay, so that labels can be placed in pixels."""
+    figure.canvas.draw()
+    figure.set_layout_engine("none")
+
+
 def spread(point: Point, column: str) -> tuple[float, float]:
     """How far the bar reaches below and above; nothing where it is not known."""
+    if column == "wall_s_per_simulated_s" and point.shared:
+        return 0.0, 0.0
     middle, low, high = (getattr(point, f"{column}{end}") for end in ("", "_low", "_high"))
     below, above = middle - low, high - middle
     return (0.0 if math.isnan(below) else max(below, 0.0), 0.0 if math.isnan(above) else max(above, 0.0))
@@ -148,7 +154,7 @@ def spread(point: Point, column: str) -> tuple[float, float]:
 
 def set_limits(axes: Axes, points: Sequence[Point], column: str, band: float) -> None:
     """Room for labels around all points and the band."""
-    x = [p.wall_s_per_simulated_s for p in points] + [1.0]
+    x = [p.cost for p in points] + [1.0]
     y = [getattr(p, column) for p in points if getattr(p, column) > 0.0] + ([band] if band else [])
     axes.set_xlim(min(x) / 2.5, max(x) * 3.0)
     axes.set_ylim(min(y) / 1.8, max(y) * 1.5)
@@ -179,17 +185,17 @@ def reduction_figure(points: Sequence[Point], title: str) -> bytes:
     axes = figure.add_subplot(xscale="log", yscale="log", title=title)
     plain_numbers(axes)
     axes.set(
-        xlabel="encoding and decoding every frame, wall seconds per simulated second",
+        xlabel="encoding and decoding every frame, seconds of one core per simulated second",
         ylabel="particle positions, RMSE on held-out runs [mm]",
     )
     for number, axis in enumerate(dict.fromkeys(p.axis for p in points)):
         line = sorted((p for p in points if p.axis == axis), key=lambda p: p.modes)
-        x, y = [p.wall_s_per_simulated_s for p in line], [p.own_position_rmse_mm for p in line]
+        x, y = [p.cost for p in line], [p.own_position_rmse_mm for p in line]
         axes.plot(x, y, "D-", color=f"C{number}", ms=4, lw=1, label=axis)
         for point in line:
             axes.annotate(
                 f"{point.modes:g}",
-                (point.wall_s_per_simulated_s, point.own_position_rmse_mm),
+                (point.cost, point.own_position_rmse_mm),
                 xytext=(4, 4 + 8 * number),
                 textcoords="offset points",
                 fontsize=7,
@@ -226,7 +232,7 @@ def training_figure(points: Sequence[Point], title: str) -> bytes:
             axes.text(min(x) / 1.4, line[0], f" {name}", fontsize=7, va="bottom", color="0.35")
         axes.set_xlim(min(x) / 1.5, max(x) * 3.0)
         axes.set_ylim(min(y) / 1.5, max([*y, *line]) * 1.5)
-        figure.canvas.draw()
+        settle(figure)
         place_labels(axes, x, y, [p.label for p in shown], 6.0)
     return png(figure)
 

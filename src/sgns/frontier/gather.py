@@ -47,9 +47,7 @@ def gathered(study: Study) -> list[Point]:
             f"study={study.name} output={study.folder}"
         )
     order = {scene.name: number for number, scene in enumerate(study.scenes)}
-    cost = {
-        id(p): math.inf if math.isnan(p.wall_s_per_simulated_s) else p.wall_s_per_simulated_s for p in found
-    }
+    cost = {id(p): math.inf if math.isnan(p.cost) else p.cost for p in found}
     return sorted(found, key=lambda point: (order[point.scene], -cost[id(point)], point.label))
 
 
@@ -83,7 +81,7 @@ def judged(
 
 def usable(point: Point) -> bool:
     """Whether a point can stand in for a simulation: it finished, and needs no run of the solver as its input."""
-    return point.kind != "reduction" and not math.isnan(point.wall_s_per_simulated_s)
+    return point.kind != "reduction" and not math.isnan(point.cost)
 
 
 def effective_error(point: Point, column: str, bands: Mapping[str, float]) -> float:
@@ -97,7 +95,7 @@ def effective_error(point: Point, column: str, bands: Mapping[str, float]) -> fl
 def front(points: Iterable[Point], column: str, bands: Mapping[str, float]) -> list[Point]:
     """The points that no faster point equals in an error, fastest first (Pareto)."""
     best, found = math.inf, []
-    for point in sorted(filter(usable, points), key=lambda point: point.wall_s_per_simulated_s):
+    for point in sorted(filter(usable, points), key=lambda point: point.cost):
         error = effective_error(point, column, bands)
         if error < best:
             best = error

@@ -33,9 +33,9 @@ TABLE: tuple[tuple[str, Callable[[Point], str]], ...] = (
     ("point", lambda p: ("★ " if p.paper else "") + p.label),
     ("what is varied", lambda p: p.axis),
     ("kind", lambda p: p.kind),
-    ("s per s", lambda p: digits(p.wall_s_per_simulated_s)),
+    ("s per s", lambda p: digits(p.cost) + ("*" if p.shared else "")),
     ("ratio", lambda p: digits(p.ratio)),
-    ("with all particles, s per s", lambda p: digits(p.decoded_wall_s_per_simulated_s)),
+    ("with all particles, s per s", lambda p: digits(p.decoded_cost)),
     ("force NRMSE", lambda p: digits(p.force_nrmse)),
     ("mean draft, %", lambda p: digits(100.0 * p.draft_mean_error)),
     ("mean vertical, %", lambda p: digits(100.0 * p.vertical_mean_error)),
@@ -113,7 +113,9 @@ def scene_figures(scene: StudyScene, points: Sequence[Point]) -> list[ReportFigu
     reduced = [p for p in points if p.kind == "reduction" and p.own_position_rmse_mm > 0]
     if reduced:
         image = reduction_figure(reduced, f"{scene.name}: what r modes leave out")
-        caption = "No simulation: the held-out runs are projected onto the modes. No surrogate with r modes can be better."
+        caption = (
+            "No simulation: held-out runs projected onto the modes. No surrogate with r modes is better."
+        )
         found.append(
             ReportFigure(f"{scene.name}_reduction", f"{scene.name}: reduction alone", caption, image)
         )
@@ -150,7 +152,8 @@ def table(scene: StudyScene, points: Sequence[Point]) -> str:
         for p in points
     )
     return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>' + note(
-        "Bold: on one of the fronts. “s per s”: wall seconds per simulated second; “ratio”: to the reference workload "
+        "Bold: on one of the fronts. “s per s”: wall seconds per simulated second on one core; with *: processor "
+        "seconds, because other work shared the core; “ratio”: to the reference workload "
         "measured in the same run; “own”: against the solver that made the training runs, over its test runs; "
         "“skill”: 1 − squared error / that of a bed in which nothing moves. All columns: points.csv."
     )

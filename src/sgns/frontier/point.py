@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from sgns.wholefile import whole_file
 
 __all__ = ["KINDS", "Point", "read_points", "write_points"]
 
+SHARED = 1.1  # wall time over processor time from which a core counts as shared
 KINDS = ("solver", "reduction", "surrogate", "full space")
 
 
@@ -135,9 +136,22 @@ class Point:
         if self.kind not in KINDS:
             raise UserError(f"a point is of kind {self.kind!r}; allowed: {', '.join(KINDS)}")
 
-    def with_values(self, **values: Any) -> Point:
-        """A copy with some fields changed."""
-        return replace(self, **values)
+    @property
+    def shared(self) -> bool:
+        """Whether other work had the core for more than a tenth of the time while this was measured."""
+        return self.wall_s_per_simulated_s > SHARED * self.processor_s_per_simulated_s
+
+    @property
+    def cost(self) -> float:
+        """Seconds of one core per simulated second: wall time, or processor time where the core was shared."""
+        return self.processor_s_per_simulated_s if self.shared else self.wall_s_per_simulated_s
+
+    @property
+    def decoded_cost(self) -> float:
+        """As `cost`, with the positions of all particles."""
+        if self.kind == "solver":
+            return self.cost
+        return self.decoded_wall_s_per_simulated_s * self.cost / self.wall_s_per_simulated_s
 
     def row(self) -> dict[str, Any]:
         """Plain values by column, numbers to five digits, empty where not known."""

@@ -40,3 +40,17 @@ def test_a_file_that_is_no_table_is_refused_in_one_line(tmp_path: Path, content:
 def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"cannot read .*b\.csv"):
         read_points(tmp_path / "b.csv")
+
+
+def test_where_the_core_was_shared_processor_time_is_the_cost() -> None:
+    alone = Point(
+        "s", "cut", "solver", "dx", "a", wall_s_per_simulated_s=1.05, processor_s_per_simulated_s=1.0
+    )
+    shared = Point(
+        "s", "cut", "surrogate", "r", "b", wall_s_per_simulated_s=0.4, processor_s_per_simulated_s=0.1,
+        decoded_wall_s_per_simulated_s=0.8,
+    )  # fmt: skip
+    assert (alone.shared, alone.cost, alone.decoded_cost) == (False, 1.05, 1.05)
+    assert (shared.shared, shared.cost) == (True, 0.1) and shared.decoded_cost == pytest.approx(0.2)
+    unknown = Point("s", "cut", "solver", "dx", "c", wall_s_per_simulated_s=2.0)
+    assert unknown.cost == 2.0
