@@ -112,16 +112,19 @@ def advice(points: Sequence[Point], wish: Wish) -> list[str]:
         value = effective_error(point, column, wish.bands)
         if math.isnan(value):
             continue
-        within = value <= wish.bands.get(column, 0.0)
-        limit = wish.errors.get(column)
+        limit, band = wish.errors.get(column), wish.bands.get(column, 0.0)
         said = f"  {words}: {value:.3g}{unit}"
-        said += " (within the reference's own error)" if within else ""
+        if value <= band:
+            said += " or less (within the reference's own error)"
+        elif (low := getattr(point, f"{column}_low", math.nan)) < (
+            high := getattr(point, f"{column}_high", 0.0)
+        ):
+            said += f" ({low:.3g} to {high:.3g} from case to case)"
         said += f", asked for {limit:.3g}{unit}" if limit is not None else ""
         lines.append(said)
-        if limit is not None and limit < wish.bands.get(column, 0.0):
+        if limit is not None and limit < band:
             lines.append(
-                f"    the reference itself is only known to {wish.bands[column]:g}{unit}: nothing can be shown to "
-                "be better"
+                f"    the reference itself is only known to {band:g}{unit}: nothing can be shown to be better"
             )
     reference = next((p for p in points if p.scene == wish.scene and p.axis == "reference"), None)
     against = f"against the solver at {reference.label}" if reference else "against the study's reference"
@@ -143,7 +146,8 @@ def commands(point: Point) -> list[str]:
     if point.kind == "surrogate":
         return [
             f"sgns train {point.settings} output=outputs/advised",
-            "sgns rollout checkpoint=outputs/advised/best.ckpt scene=... output=rollout.h5",
+            "sgns rollout checkpoint=outputs/advised/best.ckpt "
+            f"scene={shipped(point.study, point.scene).get('scene', '...')} output=rollout.h5",
         ]
     return [point.settings] if point.settings else []
 
@@ -201,12 +205,14 @@ def positive(key: str, value: Any) -> float:
     return float(value)
 
 
-def bands(study: str, scene: str) -> dict[str, float]:
-    """How wrong the reference of a study that ships with the package may be, by column; empty for others."""
+def shipped(study: str, scene: str) -> dict[str, Any]:
+    """Settings of a scene of a study that ships with the package; empty for others."""
     file = files("sgns.conf").joinpath(f"study/{study}.yaml")
     if not file.is_file():
         return {}
-    settings = yaml.safe_load(file.read_text(encoding="utf-8"))
-    return {
-        key: float(value) for key, value in (settings["scenes"].get(scene, {}).get("bands") or {}).items()
-    }
+    return yaml.safe_load(file.read_text(encoding="utf-8"))["scenes"].get(scene, {})
+
+
+def bands(study: str, scene: str) -> dict[str, float]:
+    """How wrong the reference of a study may be, by column; empty where it is not known."""
+    return {key: float(value) for key, value in (shipped(study, scene).get("bands") or {}).items()}

@@ -13,7 +13,7 @@ __all__ = ["place_labels"]
 
 DISTANCES = (7, 14, 22, 32, 44, 58, 74, 92, 112, 136, 164, 196, 230, 270, 320, 380, 450)  # [pixels]
 ANGLES = 24
-NEAR = 16.0  # a label further away than this gets a line to its point [pixels]
+NEAR = 9.0  # a label further away than this gets a line to its point [pixels]
 
 
 def place_labels(
@@ -59,7 +59,7 @@ def place_labels(
         nearest = np.clip(points[index], centre - half, centre + half)
         if math.dist(nearest, points[index]) > NEAR:
             ends = axes.transData.inverted().transform([points[index], nearest])
-            axes.plot(*ends.T, "-", color="0.6", lw=0.5, zorder=1.5, scalex=False, scaley=False)
+            axes.plot(*ends.T, "-", color="0.45", lw=0.6, zorder=3, scalex=False, scaley=False)
             lines.append((points[index], nearest))
     return [boxes[index] for index in sorted(boxes)]
 
