@@ -101,11 +101,10 @@ def advice(points: Sequence[Point], wish: Wish) -> list[str]:
     lines = [f"{'use' if met else 'nothing meets this; closest'}: {point.kind}, {point.label}"]
     lines += [f"  {line}" for line in commands(point)]
     step = wish.step_time(point)
-    cost = f"{1e3 * step:.3g} ms per step of 1/60 s"
-    if point.kind != "solver":
-        cost += ", positions of all particles included" if wish.particles else ", particles not decoded"
+    soil = "" if point.kind == "solver" else ", all particles decoded" if wish.particles else ", none decoded"
     lines.append(
-        f"  costs {cost} on one core of {point.machine} ({point.ratio:.3g} of the reference workload)"
+        f"  costs {1e3 * step:.3g} ms per step of 1/60 s{soil}, on one core of {point.machine}: up to "
+        f"{1.0 / step:.3g} steps a second; {point.ratio:.3g} of the reference workload"
     )
     for key, (_, _, words, unit) in ERRORS.items():
         column = wish.columns[key]
