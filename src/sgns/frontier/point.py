@@ -64,7 +64,7 @@ class Point:
     repeats: float = math.nan
     """How many repeats, or stretches of one run, the median is of."""
     workload_wall_s_per_simulated_s: float = math.nan
-    """The reference workload (timing.py), just before and after, on the same core; processor time if that was shared."""
+    """The reference workload (timing.py), before and after, on the same core; processor time if that was shared."""
     ratio: float = math.nan
     """`cost` / workload_wall_s_per_simulated_s."""
     includes: str = ""
