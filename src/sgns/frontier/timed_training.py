@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 # Steps that are timed to find out how many fit, after as many that warm up.
 PILOT_STEPS = 12
 # How often the validation runs choose the best checkpoint.
-VALIDATIONS = 6
+VALIDATIONS = 4
 _SCHEME = 1  # of what a folder of a training stands for
 
 
@@ -131,5 +131,14 @@ def _key(
     seed: int,
 ) -> str:
     """Name of the folder of a training: of everything that its result depends on."""
-    told = [_SCHEME, seconds, reduced.folder.name, reduced.num_modes, reduced.frame_rate, model, training, seed]
+    told = [
+        _SCHEME,
+        seconds,
+        reduced.folder.name,
+        reduced.num_modes,
+        reduced.frame_rate,
+        model,
+        training,
+        seed,
+    ]
     return hashlib.blake2b(json.dumps(told, sort_keys=True).encode(), digest_size=8).hexdigest()
