@@ -39,7 +39,7 @@ FRAMES = 16  # of one pass
 INCLUDES = "encoding and decoding every frame; not: reading the frames, fitting the basis"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Wanted:
     """One point to be measured."""
 
@@ -72,7 +72,7 @@ def wanted_of(scene: StudyScene) -> Iterator[Wanted]:
 
 def measure_reduction(study: Study) -> None:
     """Measure the reduction points of a study that are not there yet."""
-    with one_core():
+    with one_core(last=True):
         for scene in study.scenes:
             wanted = list(wanted_of(scene))
             missing = [w for w in wanted if not study.store.has(scene.name, "reduction", w.label)]

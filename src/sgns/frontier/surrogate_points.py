@@ -181,7 +181,7 @@ def described(
         parameters=float(network_costs(done.checkpoint, simulator.card).parameters),
         training_s=done.processor_s,
         training_samples=float(done.samples),
-        note="" if every == 1 else f"every {every}th frame of the runs",
+        note="" if every == 1 else f"frames: 1 of {every}",
         includes=INCLUDES,
         command=command_line(),
         machine=cpu_model(),

@@ -40,7 +40,7 @@ class TimedTraining:
         checkpoint: The best by the validation runs.
         processor_s: Processor time of the training, validation included [s].
         steps: Optimiser steps; 0 where there are none (polynomials).
-        samples: Windows seen, all steps together; of polynomials the windows fitted.
+        samples: Windows seen, all steps together; of polynomials those of the moments, noise drawn anew counted again.
     """
 
     checkpoint: Path
@@ -73,9 +73,10 @@ def train_for(
         return TimedTraining(output / "best.ckpt", **known)
     torch.set_num_threads(1)
     frames = sum(len(run.latent) - 1 for run in reduced.runs("train"))
-    steps, samples = 0, frames
     checked = model_settings(model)
-    if isinstance(checked, ModelSettings):
+    if not isinstance(checked, ModelSettings):
+        steps, samples = 0, frames * training["draws"]
+    else:
         steps = max(VALIDATIONS, round(seconds / seconds_per_step(reduced, checked, training, seed)))
         training |= {
             "max_steps": steps,
