@@ -93,10 +93,10 @@ def measure_scene(study: Study, scene: StudyScene, missing: list[Wanted]) -> Non
     log.info(
         "%s, reduction: fitted on %d runs (%.0f s)", scene.name, len(training), time.perf_counter() - began
     )
-    motion = held_out_motion(pca.basis("particle_axis"), held_out)
+    motion = held_out_motion(pca.basis("particle_axis", 1), held_out)
     workload = Workload()
     for centring in dict.fromkeys(w.centring for w in missing):
-        basis = pca.basis(centring)
+        basis = pca.basis(centring, pca.rank(centring))
         found = [w for w in missing if w.centring == centring and w.modes <= basis.num_modes]
         curve = reconstruction_curve(held_out, basis)
         before = workload.measure()
@@ -147,7 +147,7 @@ def described(study: Study, scene: StudyScene, one: Wanted) -> Point:
 def held_out_motion(basis: Basis, paths: list[Path]) -> float:
     """Mean square of the held-out runs about each particle's mean place in the training runs [m²]: what the energy is
     a share of, for every centring."""
-    return float(reconstruction_curve(paths, basis.sliced(1))[0])
+    return float(reconstruction_curve(paths, basis)[0])
 
 
 class CodingTimes(NamedTuple):
