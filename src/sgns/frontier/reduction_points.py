@@ -17,15 +17,13 @@ from typing import NamedTuple
 
 import torch
 
-from sgns import __version__
 from sgns.campaign import Dataset
 from sgns.claim import claimed
 from sgns.errors import UserError
-from sgns.evaluation.provenance import command_line, cpu_model
 from sgns.frontier.point import Point
 from sgns.frontier.study import PointSettings, Study, StudyScene
 from sgns.frontier.surrogate_points import training_settings
-from sgns.frontier.timing import Workload, cost_fields, one_core
+from sgns.frontier.timing import Workload, cost_fields, made_here, one_core
 from sgns.reduction import CENTRINGS, Basis
 from sgns.reduction.reconstruction import fit_runs, reconstruction_curve
 from sgns.runs import Run
@@ -138,9 +136,7 @@ def described(study: Study, scene: StudyScene, one: Wanted) -> Point:
         settings=shlex.join([f"dataset={scene.dataset}", *changes]),
         modes=float(one.modes),
         includes=INCLUDES,
-        command=command_line(),
-        machine=cpu_model(),
-        version=__version__,
+        **made_here(),
     )
 
 

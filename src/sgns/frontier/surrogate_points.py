@@ -30,19 +30,17 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from mpm_warp import Scene
-from sgns import __version__
 from sgns.campaign import Dataset
 from sgns.claim import claimed
 from sgns.errors import UserError
 from sgns.evaluation.costs import network_costs
-from sgns.evaluation.provenance import command_line, cpu_model
 from sgns.evaluation.scores import Scores
 from sgns.frontier.observation import Observation, Observer, observed_frames
 from sgns.frontier.own_errors import own_errors
 from sgns.frontier.point import Point
 from sgns.frontier.study import PointSettings, Study, StudyScene
 from sgns.frontier.timed_training import TimedTraining, train_for
-from sgns.frontier.timing import Workload, composed_scene, cost_fields, one_core
+from sgns.frontier.timing import Workload, composed_scene, cost_fields, made_here, one_core
 from sgns.frontier.training_sets import every_nth_frame, with_training_runs
 from sgns.reduction.reduced import reduce_dataset
 from sgns.rollout import require_known_bed
@@ -183,9 +181,7 @@ def described(
         training_samples=float(done.samples),
         note="" if every == 1 else f"frames: 1 of {every}",
         includes=INCLUDES,
-        command=command_line(),
-        machine=cpu_model(),
-        version=__version__,
+        **made_here(),
     )
 
 
@@ -296,7 +292,6 @@ def measure_elsewhere(study: Study, scene: StudyScene, entry: PointSettings) -> 
         label=entry.label,
         includes=FULL_SPACE_INCLUDES,
         note=f"{case!r} of {file.as_posix()}",
-        version=__version__,
         **full_space_fields(rows[case]),
     )
     study.store.save(point, {})
