@@ -43,7 +43,6 @@ from sgns.frontier.timed_training import TimedTraining, train_for
 from sgns.frontier.timing import Workload, composed_scene, cost_fields, made_here, one_core
 from sgns.frontier.training_sets import every_nth_frame, with_training_runs
 from sgns.reduction.reduced import reduce_dataset
-from sgns.rollout import require_known_bed
 from sgns.simulator import Rollout, Simulator
 
 __all__ = ["TrainingPlan", "measure_surrogates"]
@@ -125,12 +124,13 @@ def measured(
     whole = Dataset.open(settings["dataset"]["path"])
     dataset = with_training_runs(whole, plan.runs)
     reduced = reduce_dataset(dataset, settings["reduction"], progress=False)
+    require_same_bed(scene, reduced.arrangement_hash)
     done = train_for(
         plan.seconds, every_nth_frame(reduced, plan.every), settings, study.folder / "trainings", plan.seed
     )
     simulator = Simulator.load(done.checkpoint)
     before = workload.measure()
-    costs, rollouts = timed_rollouts(simulator, scene, plan.every, done.checkpoint)
+    costs, rollouts = timed_rollouts(simulator, scene)
     costs |= cost_fields(costs.pop("rates"), [*before, *workload.measure()], costs.pop("processor_rate"))
     scores = own_errors(simulator, whole.runs("test"), dataset.runs("train"), plan.every)
     point = described(study, scene, entry, plan.every, done, simulator)
@@ -142,6 +142,16 @@ def measured(
             return replace(point, note=f"{case}: not finite from frame {bad} on"), {}
         observations[case] = observed(simulator, case_scene, rollout)
     return point, observations
+
+
+def require_same_bed(scene: StudyScene, arrangement: str) -> None:
+    """Refuses cases whose particles are not those of the dataset."""
+    for case in scene.cases:
+        if scene.case_scene(case).arrangement_hash != arrangement:
+            raise UserError(
+                f"study.scenes.{scene.name}.cases.{case} has another bed of particles than dataset={scene.dataset}, "
+                "so that no surrogate of it can be judged there; use the dataset's scene and bed"
+            )
 
 
 def training_settings(dataset: str, overrides: tuple[str, ...]) -> dict[str, Any]:
@@ -191,7 +201,7 @@ def step_settings(done: TimedTraining) -> list[str]:
 
 
 def timed_rollouts(
-    simulator: Simulator, scene: StudyScene, every: int, checkpoint: Path
+    simulator: Simulator, scene: StudyScene
 ) -> tuple[dict[str, Any], dict[str, tuple[Scene, Rollout]]]:
     """Every case from rest, several times.
 
@@ -201,8 +211,6 @@ def timed_rollouts(
     """
     rates, processor, decoded = [], [], []
     scenes = {case: case_scene(scene, case, simulator.frame_rate) for case in scene.cases}
-    for case_scene_ in scenes.values():
-        require_known_bed(simulator, case_scene_, checkpoint)
     paths = {case: (s.body_poses(), s.body_points(), s.to_dict()) for case, s in scenes.items()}
     rollouts: dict[str, tuple[Scene, Rollout]] = {}
     for repeat in range(REPEATS + 1):

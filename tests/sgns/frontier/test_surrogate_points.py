@@ -224,5 +224,5 @@ def test_a_rollout_that_leaves_the_numbers_is_said_and_not_kept(tmp_path, monkey
 @pytest.mark.usefixtures("tiny")
 def test_another_bed_than_the_data_s_is_one_line(tmp_path):
     asked = study(tmp_path, {"axis": "preset", "label": "whole"}, cases={"a": ["scene.duration=0.2"]})
-    with pytest.raises(UserError, match="this scene's bed is not the one"):
+    with pytest.raises(UserError, match="has another bed of particles than dataset=quick"):
         measure_surrogates(asked)

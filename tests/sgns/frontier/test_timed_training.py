@@ -41,7 +41,8 @@ def test_what_is_complete_is_taken_and_what_is_not_is_begun_anew(data, tmp_path)
     assert again.checkpoint.stat().st_mtime_ns > made
 
 
-def test_other_settings_have_another_folder(data, tmp_path):
+def test_other_settings_have_another_folder(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(timed_training, "train", lambda *_, output, **__: output.mkdir(parents=True))
     wider = NETWORK | {"model": MODEL | {"hidden_width": 8}}
     done = {
         train_for(seconds, data, settings, tmp_path / "kept", seed).checkpoint
