@@ -66,6 +66,13 @@ class TrainingPlan:
     every: int = 1
     seed: int = 0
 
+    @property
+    def beyond_overrides(self) -> str:
+        """What no override of `sgns train` says."""
+        runs = "" if self.runs is None else f"trained on {self.runs} runs"
+        frames = "" if self.every == 1 else f"one frame in {self.every}"
+        return ", ".join(filter(None, (runs, frames)))
+
     @classmethod
     def of(cls, scene: StudyScene, entry: PointSettings) -> TrainingPlan:
         """The keys of an entry over those of its scene.
@@ -133,7 +140,7 @@ def measured(
     costs, rollouts = timed_rollouts(simulator, scene)
     costs |= cost_fields(costs.pop("rates"), [*before, *workload.measure()], costs.pop("processor_rate"))
     scores = own_errors(simulator, whole.runs("test"), dataset.runs("train"), plan.every)
-    point = described(study, scene, entry, plan.every, done, simulator)
+    point = described(study, scene, entry, plan, done, simulator)
     own = own_fields(scores, len(whole.runs("test")))
     point = replace(point, training_runs=float(len(dataset.runs("train"))), **own, **costs)
     observations = {}
@@ -171,7 +178,7 @@ def described(
     study: Study,
     scene: StudyScene,
     entry: PointSettings,
-    every: int,
+    plan: TrainingPlan,
     done: TimedTraining,
     simulator: Simulator,
 ) -> Point:
@@ -182,22 +189,23 @@ def described(
         kind="surrogate",
         axis=entry.axis,
         label=entry.label,
-        settings=shlex.join([f"dataset={scene.dataset}", *entry.set, *step_settings(done)]),
+        settings=shlex.join([f"dataset={scene.dataset}", *entry.set, *other_overrides(plan, done)]),
         paper=entry.paper,
         particles=float(len(simulator.start_positions)),
         modes=float(simulator.num_modes),
         parameters=float(network_costs(done.checkpoint, simulator.card).parameters),
         training_s=done.processor_s,
         training_samples=float(done.samples),
-        note="" if every == 1 else f"frames: 1 of {every}",
+        note=plan.beyond_overrides,
         includes=INCLUDES,
         **made_here(),
     )
 
 
-def step_settings(done: TimedTraining) -> list[str]:
-    """The override of the steps that fitted, for who wants to train the same."""
-    return [f"training.max_steps={done.steps}"] if done.steps else []
+def other_overrides(plan: TrainingPlan, done: TimedTraining) -> list[str]:
+    """The steps that fitted, and the seed, for who wants to train the same."""
+    steps = [f"training.max_steps={done.steps}"] if done.steps else []
+    return [*steps, *([f"seed={plan.seed}"] if plan.seed else [])]
 
 
 def timed_rollouts(

@@ -189,7 +189,7 @@ def test_points_from_training_to_observation(tmp_path):
     asked = study(
         tmp_path,
         {"axis": "preset", "label": "whole"},
-        {"axis": "runs", "label": "two runs at 30 Hz", "runs": 2, "every": 2},
+        {"axis": "runs", "label": "two runs at 30 Hz", "runs": 2, "every": 2, "seed": 3},
         training={"seconds": 0.1},
     )
     measure_surrogates(asked)
@@ -200,7 +200,8 @@ def test_points_from_training_to_observation(tmp_path):
     assert whole.own_runs == 1
     assert 0 < whole.wall_s_per_simulated_s < whole.decoded_wall_s_per_simulated_s
     assert "training.max_steps=10" in whole.settings
-    assert part.note == "frames: 1 of 2"
+    assert (whole.note, part.note) == ("", "trained on 2 runs, one frame in 2")
+    assert "seed=3" in part.settings
     fast, slow = (asked.store.observation(point, "a") for point in (whole, part))
     assert (len(fast.time), len(slow.time)) == (13, 7)
     assert slow.time[-1] == pytest.approx(fast.time[-1])
