@@ -18,25 +18,14 @@ import torch
 
 from sgns.campaign import SPLITS, Dataset
 from sgns.evaluation.provenance import cpu_model
-from sgns.reduction import CENTRINGS, IncrementalPCA
-from sgns.reduction.reconstruction import ReductionCurves, reduction_curves
-from sgns.runs import Run, frame_chunks
+from sgns.reduction import CENTRINGS
+from sgns.reduction.reconstruction import ReductionCurves, fit_runs, reduction_curves
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
 POWERS = [2**k for k in range(9)]
-
-
-def fit(paths: list[Path]) -> IncrementalPCA:
-    """One stream over runs, for up to 256 modes."""
-    pca = IncrementalPCA(POWERS[-1])
-    for path in paths:
-        with Run(path) as run:
-            for frames in frame_chunks(run.particle_count, run.frame_count):
-                pca.partial_fit(run.positions(frames))
-    return pca
 
 
 def rows_of(centring: str, curves: ReductionCurves) -> list[dict[str, str]]:
@@ -90,7 +79,7 @@ def main() -> None:
     print(
         cpu_model(), "threads", torch.get_num_threads(), {split: len(runs) for split, runs in paths.items()}
     )
-    pca = fit(paths["train"])
+    pca = fit_runs(paths["train"], POWERS[-1])
     curves, rows = {}, []
     for centring in CENTRINGS:
         basis = pca.basis(centring)

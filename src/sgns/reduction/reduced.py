@@ -30,7 +30,8 @@ from sgns.campaign import SPLITS, Dataset
 from sgns.errors import UserError
 from sgns.reduction.basis import CENTRINGS, Basis
 from sgns.reduction.choice import MEASURES, choose_modes
-from sgns.reduction.incremental_pca import IncrementalPCA, checked_device
+from sgns.reduction.incremental_pca import checked_device
+from sgns.reduction.reconstruction import fit_runs
 from sgns.runs import Run, frame_chunks
 from sgns.settings import check_fields
 from sgns.wholefile import whole_file
@@ -231,21 +232,18 @@ def fitted_basis(
         except UserError as error:
             log.warning("%s; fitting it anew", error)
     # More modes than particles or rows cannot be had, whatever is asked.
-    pca = IncrementalPCA(settings["max_modes"], device=device)
-    names, arrangement = [], ""
-    for run_path in tqdm(runs, desc="fitting the basis", **bar):
-        with Run(run_path) as run:
-            arrangement = run.arrangement_hash
-            for frames in frame_chunks(run.particle_count, run.frame_count):
-                pca.partial_fit(run.positions(frames))
-        names.append(run_path.stem)
+    pca = fit_runs(tqdm(runs, desc="fitting the basis", **bar), settings["max_modes"], device)
+    with Run(runs[0]) as run:
+        arrangement = run.arrangement_hash
     rank = pca.rank(settings["centring"])
     if rank == 0:
         raise UserError(
             "nothing moves in the training runs: the data has rank 0 and no modes; simulate "
             "runs that move the soil"
         )
-    basis = pca.basis(settings["centring"], rank, arrangement_hash=arrangement, fitted_on=names)
+    basis = pca.basis(
+        settings["centring"], rank, arrangement_hash=arrangement, fitted_on=[path.stem for path in runs]
+    )
     basis.save(path)
     return basis
 

@@ -1,0 +1,145 @@
+"""Trainings that take a given processor time, whatever a step of theirs takes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import statistics
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from sgns.learning.kinds import model_settings
+from sgns.learning.model_settings import ModelSettings
+from sgns.learning.trainee import SurrogateTraining, TrainingSettings
+from sgns.learning.training import prepared, train
+from sgns.reduction.reduced import ReducedDataset
+from sgns.wholefile import write_whole
+
+__all__ = ["TimedTraining", "train_for"]
+
+log = logging.getLogger(__name__)
+
+# Steps that are timed to find out how many fit, after as many that warm up.
+PILOT_STEPS = 12
+# How often the validation runs choose the best checkpoint.
+VALIDATIONS = 4
+_SCHEME = 1  # of what a folder of a training stands for
+
+
+@dataclass(frozen=True)
+class TimedTraining:
+    """A complete training.
+
+    Attributes:
+        checkpoint: The best by the validation runs.
+        processor_s: Processor time of the training, validation included [s].
+        steps: Optimiser steps; 0 where there are none (polynomials).
+        samples: Windows seen, all steps together; of polynomials those of the moments, noise drawn anew counted again.
+    """
+
+    checkpoint: Path
+    processor_s: float
+    steps: int
+    samples: int
+
+
+def train_for(
+    seconds: float, reduced: ReducedDataset, settings: Mapping[str, Any], folder: Path, seed: int = 0
+) -> TimedTraining:
+    """Train on this thread for about so much processor time, or take what is complete.
+
+    The steps of the optimiser are as many as fit, by the time of a few, and the learning rate falls over them, so that
+    every training is a whole one. Polynomials are fitted, however long it takes.
+
+    Args:
+        seconds: Processor time of the steps; validation comes on top.
+        reduced: The dataset in its basis.
+        settings: `conf/train` as plain values.
+        folder: Trainings are kept in, each in a folder named by what it depends on.
+        seed: Of weights, noise and order.
+    """
+    model, training = settings["model"], settings["training"] | {"threads": 1, "resume": False}
+    num_modes = reduced.num_modes
+    output = folder / _key(seconds, reduced, model, training, seed)
+    record = output / "timed.json"
+    if record.exists():
+        known = json.loads(record.read_text(encoding="utf-8"))
+        return TimedTraining(output / "best.ckpt", **known)
+    torch.set_num_threads(1)
+    frames = sum(len(run.latent) - 1 for run in reduced.runs("train"))
+    checked = model_settings(model)
+    if not isinstance(checked, ModelSettings):
+        steps, samples = 0, frames * training["draws"]
+    else:
+        steps = max(VALIDATIONS, round(seconds / seconds_per_step(reduced, checked, training, seed)))
+        training |= {
+            "max_steps": steps,
+            "validate_every": -(-steps // VALIDATIONS),
+            "warmup_steps": min(training["warmup_steps"], steps // 10),
+        }
+        samples = steps * training["batch_size"]
+    began = time.process_time()
+    train(
+        reduced,
+        num_modes=num_modes,
+        model=model,
+        training=training,
+        output=output,
+        seed=seed,
+        provenance={
+            "preset": settings["preset"]["name"],
+            "dataset": settings["dataset"]["name"],
+            "seconds": seconds,
+        },
+    )
+    done = TimedTraining(output / "best.ckpt", round(time.process_time() - began, 1), steps, samples)
+    write_whole(record, json.dumps({k: v for k, v in asdict(done).items() if k != "checkpoint"}) + "\n")
+    return done
+
+
+def seconds_per_step(
+    reduced: ReducedDataset, model: ModelSettings, training: Mapping[str, Any], seed: int
+) -> float:
+    """Processor time of an optimiser step with its batch, median of a few [s]."""
+    settings = TrainingSettings.from_dict(training)
+    surrogate, data = prepared(reduced, reduced.num_modes, model, settings, seed, {}, None)
+    module = SurrogateTraining(surrogate, settings)
+    # Lightning logs only within a trainer, so the step is taken by hand; small, for nothing of it is kept.
+    optimiser = torch.optim.AdamW(module.parameters(), lr=1e-6, fused=True)
+    taken = []
+    for step in range(2 * PILOT_STEPS):
+        began = time.process_time()
+        losses = module.losses(data.training_windows.batch(step, settings.batch_size, data.noise))
+        optimiser.zero_grad()
+        sum(settings.loss[name] * value for name, value in losses.items()).backward()
+        torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+        optimiser.step()
+        taken.append(time.process_time() - began)
+    return statistics.median(taken[PILOT_STEPS:])
+
+
+def _key(
+    seconds: float,
+    reduced: ReducedDataset,
+    model: Mapping[str, Any],
+    training: Mapping[str, Any],
+    seed: int,
+) -> str:
+    """Name of the folder of a training: of everything that its result depends on."""
+    told = [
+        _SCHEME,
+        seconds,
+        reduced.folder.name,
+        reduced.num_modes,
+        reduced.frame_rate,
+        model,
+        training,
+        seed,
+    ]
+    return hashlib.blake2b(json.dumps(told, sort_keys=True).encode(), digest_size=8).hexdigest()
