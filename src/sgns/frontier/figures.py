@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from io import BytesIO
@@ -82,23 +83,24 @@ def scene_figure(points: Sequence[Point], column: str, bands: Mapping[str, float
             color="0.35",
         )
     best = front(points, column, bands)
-    axes.step(
-        [p.cost for p in best],
-        [effective_error(p, column, bands) for p in best],
-        where="post",
-        color="k",
-        lw=1.2,
-        zorder=2,
-        label="front: nothing faster is as good",
-    )
+    line = corners([(p.cost, effective_error(p, column, bands)) for p in best])
+    axes.plot(*zip(*line, strict=True), "k-", lw=1.2, zorder=2, label="front: nothing faster is as good")
     labelled = [(p.cost, getattr(p, column), f"★ {p.label}" if p.paper else p.label) for p in shown]
     for point in references:
         axes.axvline(point.cost, color="0.5", ls=":", lw=1)
         labelled.append((point.cost, max(band, low * 1.3), f"reference: {point.label}"))
     axes.legend(loc="lower left", fontsize=8)
     settle(figure)
-    place_labels(axes, *zip(*labelled, strict=True))
+    place_labels(axes, *zip(*labelled, strict=True), line=line)
     return png(figure)
+
+
+def corners(best: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Corners of the stairs through points of increasing time and decreasing error."""
+    found = list(best[:1])
+    for (_, before), (time, error) in itertools.pairwise(best):
+        found += [(time, before), (time, error)]
+    return found
 
 
 def draw_points(axes: Axes, points: Sequence[Point], column: str) -> None:
@@ -216,6 +218,7 @@ def training_figure(points: Sequence[Point], title: str) -> bytes:
     figure.suptitle(title, fontsize=10)
     panels = figure.subplots(1, 2)
     columns = {"own_force_nrmse": "mean_force_nrmse", "own_position_rmse_mm": "frozen_rmse_mm"}
+    labels = []
     for axes, (column, baseline) in zip(panels, columns.items(), strict=True):
         shown = [p for p in points if p.training_s > 0 and getattr(p, column) > 0]
         if not shown:
@@ -232,8 +235,10 @@ def training_figure(points: Sequence[Point], title: str) -> bytes:
             axes.text(min(x) / 1.4, line[0], f" {name}", fontsize=7, va="bottom", color="0.35")
         axes.set_xlim(min(x) / 1.5, max(x) * 3.0)
         axes.set_ylim(min(y) / 1.5, max([*y, *line]) * 1.5)
-        settle(figure)
-        place_labels(axes, x, y, [p.label for p in shown], 6.0)
+        labels.append((axes, x, y, [p.label for p in shown]))
+    settle(figure)
+    for label in labels:
+        place_labels(*label, size=6.0)
     return png(figure)
 
 

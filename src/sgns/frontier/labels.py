@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -17,7 +18,12 @@ NEAR = 9.0  # a label further away than this gets a line to its point [pixels]
 
 
 def place_labels(
-    axes: Axes, x: Sequence[float], y: Sequence[float], texts: Sequence[str], size: float = 7.0
+    axes: Axes,
+    x: Sequence[float],
+    y: Sequence[float],
+    texts: Sequence[str],
+    size: float = 7.0,
+    line: Sequence[tuple[float, float]] = (),
 ) -> list[np.ndarray]:
     """Write a text beside each point.
 
@@ -30,6 +36,7 @@ def place_labels(
         y: likewise.
         texts: one for each point; an empty one is left out.
         size: of the letters [points].
+        line: corners of a line that labels keep off, data coordinates.
 
     Returns:
         The box of each text in pixels: x0, y0, x1, y1.
@@ -39,7 +46,8 @@ def place_labels(
     border = axes.get_window_extent(renderer)
     points = axes.transData.transform(np.column_stack([x, y]).astype(float))
     taken = [np.array([px - 4, py - 4, px + 4, py + 4]) for px, py in points]
-    lines: list[tuple[np.ndarray, np.ndarray]] = []
+    corners = axes.transData.transform(np.array(line, dtype=float)) if len(line) else []
+    lines: list[tuple[np.ndarray, np.ndarray]] = list(itertools.pairwise(corners))
     boxes: dict[int, np.ndarray] = {}
     crowd = [np.sum(np.hypot(*(points - point).T) < 60.0) for point in points]
     for index in sorted(range(len(points)), key=lambda i: crowd[i]):
@@ -106,5 +114,6 @@ def best_place(
 
 def crosses(low: np.ndarray, high: np.ndarray, start: np.ndarray, end: np.ndarray) -> bool:
     """Whether the line from start to end meets the box."""
-    between = start + np.linspace(0.0, 1.0, 40)[:, None] * (end - start)
+    count = 2 + int(math.dist(start, end) / 4)
+    between = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
     return bool(((between > low) & (between < high)).all(axis=1).any())

@@ -8,6 +8,7 @@ that ratios to it hold on a machine whose speed changes.
 from __future__ import annotations
 
 import os
+import shlex
 import statistics
 import subprocess
 import time
@@ -110,9 +111,10 @@ def cost_fields(
 
 
 def made_here() -> dict[str, str]:
-    """The columns of `Point` that say how and where it is measured."""
+    """The columns of `Point` that say how and where it is measured; the command without its output folder."""
+    words = shlex.split(command_line())
     return {
-        "command": command_line(),
+        "command": shlex.join(word for word in words if not word.startswith("output=")),
         "machine": cpu_model(),
         "version": __version__,
         "commit": commit(),

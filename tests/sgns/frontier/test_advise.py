@@ -9,8 +9,8 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns.errors import UserError
-from sgns.frontier.advise import advice, main, wished
-from sgns.frontier.point import Point, write_points
+from sgns.frontier.advise import advice, main, table, wished
+from sgns.frontier.point import Point, read_points, write_points
 
 POINTS = [
     Point("full", "cut", "solver", "reference", "finest", wall_s_per_simulated_s=400.0, ratio=90.0),
@@ -25,7 +25,7 @@ POINTS = [
 
 
 @pytest.fixture
-def table(tmp_path: Path) -> Path:
+def own_table(tmp_path: Path) -> Path:
     write_points(tmp_path / "points.csv", POINTS)
     return tmp_path / "points.csv"
 
@@ -93,5 +93,23 @@ def test_bad_input_gives_one_line(overrides: list[str], line: str) -> None:
         answer(*overrides)
 
 
-def test_the_command_reads_a_table_of_one_s_own(table: Path) -> None:
-    assert main(OmegaConf.create(asked("error.force=0.25", f"table='{table}'"))) == pytest.approx(3.0 / 60)
+def test_the_command_reads_a_table_of_one_s_own(own_table: Path) -> None:
+    assert main(OmegaConf.create(asked("error.force=0.25", f"table='{own_table}'"))) == pytest.approx(
+        3.0 / 60
+    )
+
+
+def test_the_table_that_ships_is_the_committed_study() -> None:
+    committed = Path(__file__).parents[3] / "experiments" / "accuracy_vs_time" / "full" / "points.csv"
+    assert table(None).read_bytes() == committed.read_bytes()
+    points = read_points(table(None))
+    assert {p.kind for p in points} >= {"solver", "surrogate"}
+    references = [p for p in points if p.axis == "reference"]
+    assert len(references) == len({p.scene for p in points})
+    assert not any("/" in p.command for p in points)  # no folder of the machine that made it
+
+
+def test_the_table_that_ships_answers() -> None:
+    points = read_points(table(None))
+    lines = advice(points, wished(asked("error.force=0.6", "time=0.01"), points))
+    assert lines[0].startswith("use: ")
