@@ -221,8 +221,8 @@ def errors(
 def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
     """Train for a processor time and predict test runs."""
     plain = settings(path, FULL_SPACE[name], **FULL_SPACE_TRAINING)
-    dynamics, runs = full_space(path, plain["model"], "train")
-    windows = FullSpaceWindows(runs, dynamics.history)
+    dynamics, training_runs = full_space(path, plain["model"], "train")
+    windows = FullSpaceWindows(training_runs, dynamics.history)
     noise_scale = fit_normalisation(
         dynamics, windows, plain["training"]["noise"], plain["training"]["normalisation_floor"]
     )
