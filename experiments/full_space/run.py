@@ -19,6 +19,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -220,8 +221,8 @@ def errors(
 def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
     """Train for a processor time and predict test runs."""
     plain = settings(path, FULL_SPACE[name], **FULL_SPACE_TRAINING)
-    dynamics, runs = full_space(path, plain["model"], "train")
-    windows = FullSpaceWindows(runs, dynamics.history)
+    dynamics, training_runs = full_space(path, plain["model"], "train")
+    windows = FullSpaceWindows(training_runs, dynamics.history)
     noise_scale = fit_normalisation(
         dynamics, windows, plain["training"]["noise"], plain["training"]["normalisation_floor"]
     )
@@ -312,8 +313,10 @@ def solver(path: Path, name: str) -> dict[str, Any]:
 
 def in_fresh_process(action: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
     """Run in a process of its own, so that memory is this case's."""
-    with multiprocessing.get_context("spawn").Pool(1, single_threaded) as pool:
-        return pool.apply(action, arguments)
+    context = multiprocessing.get_context("spawn")
+    # Not a Pool: it waits for ever for a process that was killed for its memory.
+    with ProcessPoolExecutor(1, mp_context=context, initializer=single_threaded) as pool:
+        return pool.submit(action, *arguments).result()
 
 
 def single_threaded() -> None:

@@ -22,6 +22,7 @@ from tqdm import tqdm
 from sgns.errors import UserError
 from sgns.evaluation.bodies import is_wheel
 from sgns.evaluation.costs import forget_peak, network_costs, peak_memory
+from sgns.evaluation.full_space_cost import full_space_cost
 from sgns.evaluation.metrics import body_errors, mean_prediction, position_errors
 from sgns.evaluation.overlap import overlap_warning, seen_before
 from sgns.evaluation.provenance import provenance
@@ -32,6 +33,8 @@ from sgns.evaluation.scores import aggregate, run_scores
 from sgns.evaluation.surface import surface_grid
 from sgns.evaluation.tables import write_tables
 from sgns.evaluation.training_curves import read_log
+from sgns.learning.kinds import model_settings
+from sgns.learning.model_settings import ModelSettings
 from sgns.poses import in_body_frame
 from sgns.reduction import Basis
 from sgns.reduction.reconstruction import reduction_curves
@@ -132,6 +135,7 @@ def evaluate(
     checkpoint: Path,
     new_rollouts: Sequence[Path] = (),
     repeats: int = 3,
+    full_space: bool = False,
     made: dict[str, str] | None = None,
 ) -> Evaluation:
     """Rolls out every run of a split, measures, and writes `rollouts/`, `metrics.csv` and `metrics.json`.
@@ -144,8 +148,14 @@ def evaluate(
         checkpoint: file of the simulator, for messages and the rollouts' run files.
         new_rollouts: run files without truth, checked here and shown in the report.
         repeats: timed rollouts.
+        full_space: whether to measure what the same network would cost on every particle.
         made: how it was made, for the report.
     """
+    network = model_settings(simulator.card["model"]) if full_space else None
+    if full_space and not isinstance(network, ModelSettings):
+        raise UserError(
+            f"full_space=true: {checkpoint} holds polynomials; only a network has a counterpart in full space"
+        )
     paths = [Path(path) for path in dataset.runs(split)]
     if not paths:
         raise UserError(
@@ -198,6 +208,7 @@ def evaluate(
         total=aggregate([run.scores for run in runs]),
         timing=time_network(simulator, paths[0], repeats),
         costs=costs,
+        full_space=full_space_cost(paths[0], network, repeats) if network else None,
         mean_force=mean_force,
         mean_torque=mean_torque,
         training_log=read_log(checkpoint.parent / "tensorboard"),
@@ -256,6 +267,8 @@ def main(cfg: DictConfig) -> float:
     new_rollouts = [cfg.new_rollouts] if isinstance(cfg.new_rollouts, str) else cfg.new_rollouts or []
     if not isinstance(cfg.timing_repeats, int) or cfg.timing_repeats < 3:
         raise UserError(f"timing_repeats is {cfg.timing_repeats!r}; it must be a whole number, at least 3")
+    if not isinstance(cfg.full_space, bool):
+        raise UserError(f"full_space is {cfg.full_space!r}; it must be true or false")
     checkpoint = Path(cfg.checkpoint)
     if cfg.dataset.get("format") == "published":
         from sgns.evaluation.published_scores import evaluate_published
@@ -273,6 +286,7 @@ def main(cfg: DictConfig) -> float:
         checkpoint=checkpoint,
         new_rollouts=[Path(str(path)) for path in new_rollouts],
         repeats=cfg.timing_repeats,
+        full_space=cfg.full_space,
         made=provenance(simulator, checkpoint),
     )
     report = write_report(evaluation, output)

@@ -18,6 +18,17 @@ if TYPE_CHECKING:
 
 __all__ = ["cost_table", "example_table", "force_table", "soil_table"]
 
+COST_ROWS = (
+    "wall seconds per simulated second",
+    "solver's time / this",
+    "training, wall seconds per step",
+    "training, wall seconds in all",
+    "numbers that describe the soil at a moment",
+    "learned parameters",
+    "checkpoint [MB]",
+    "peak memory of the process [MB]",
+)
+
 
 @dataclass(frozen=True)
 class Column:
@@ -181,32 +192,47 @@ def percentages(evaluation: Evaluation, component: str, errors: str, sizes: str)
 
 
 def cost_table(evaluation: Evaluation) -> str:
-    """Time and memory of solver and network: a column each."""
+    """Time and memory of solver, network and, if measured, the network on every particle: a column each."""
     timing, costs, n = evaluation.timing, evaluation.costs, evaluation.particle_count
     solver = evaluation.total.solver_rate
-    rows = (
-        ("wall seconds per simulated second", solver, timing.stepping, timing.decoding),
-        ("solver's time / this", 1.0, solver / timing.stepping, solver / timing.decoding),
-        ("training, wall seconds per step", None, costs.seconds_per_step, None),
-        ("training, wall seconds in all", None, costs.training_seconds, None),
-        ("numbers that describe the soil at a moment", 6 * n, 3 * evaluation.num_modes, 3 * n),
-        ("learned parameters", None, costs.parameters, None),
-        ("checkpoint [MB]", None, 1e-6 * costs.checkpoint_bytes, None),
-        (
-            "peak memory of the process [MB]",
-            math.nan,
+    columns = {
+        "solver (MPM)": (solver, 1.0, None, None, 6 * n, None, None, math.nan),
+        "network": (
+            timing.stepping,
+            solver / timing.stepping,
+            costs.seconds_per_step,
+            costs.training_seconds,
+            3 * evaluation.num_modes,
+            costs.parameters,
+            1e-6 * costs.checkpoint_bytes,
             1e-6 * timing.stepping_bytes,
+        ),
+        "network, particles decoded": (
+            timing.decoding,
+            solver / timing.decoding,
+            None,
+            None,
+            3 * n,
+            None,
+            None,
             1e-6 * timing.decoding_bytes,
         ),
-    )
-    headings = ("solver (MPM)", "network", "network, particles decoded")
+    }
+    if full := evaluation.full_space:
+        columns["full space, untrained"] = (
+            full.rollout,
+            solver / full.rollout,
+            full.training_step,
+            None,
+            3 * n,
+            full.parameters,
+            None,
+            1e-6 * full.peak_bytes,
+        )
     return table(
         [
-            Column("", [row[0] for row in rows], text=True),
-            *(
-                Column(heading, [quantity(row[index]) for row in rows])
-                for index, heading in enumerate(headings, start=1)
-            ),
+            Column("", COST_ROWS, text=True),
+            *(Column(heading, [quantity(value) for value in values]) for heading, values in columns.items()),
         ],
         total_row=False,
         style="costs",

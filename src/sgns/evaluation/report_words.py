@@ -223,10 +223,15 @@ def cost_note(evaluation: Evaluation) -> str:
         if costs.training_steps > 0.0
         else "Training: there is no training.json beside the checkpoint. "
     )
+    full_space = (
+        "Full space: the same network on every particle, the paper's reference; its weights are not trained, which its "
+        f"costs do not depend on; one thread, training steps of {evaluation.full_space.batch_size} samples."
+        if evaluation.full_space
+        else "The same network on every particle, the paper's reference, is measured with full_space=true."
+    )
     return (
         f"Network: median of {timing.repeats} warm repeats on one thread along run {timing.run}; nothing is "
         "written to disk; the peak memory is that of the whole process, Python and its libraries included. "
         f"{training}Solver: what its run files say, on the machine that made them; they hold position and velocity "
-        "of every particle and no memory figure. The same network on all particles, the paper's reference, is "
-        "not measured here: see experiments/full_space in the repository."
+        f"of every particle and no memory figure. {full_space}"
     )

@@ -14,7 +14,7 @@ from sgns.evaluation.scores import Scores
 from sgns.reduction import Basis
 from sgns.reduction.reconstruction import ReductionCurves
 
-__all__ = ["Costs", "EvaluatedRun", "Evaluation", "NetworkTiming"]
+__all__ = ["Costs", "EvaluatedRun", "Evaluation", "FullSpaceCost", "NetworkTiming"]
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,25 @@ class Costs:
 
 
 @dataclass(frozen=True)
+class FullSpaceCost:
+    """A network on every particle, untrained.
+
+    Attributes:
+        parameters: weights that would be learned.
+        training_step: wall time of a step of `batch_size` windows on one thread, reading them included [s].
+        batch_size: windows of that step.
+        rollout: wall seconds per simulated second on one thread.
+        peak_bytes: peak memory of the whole process while it trains; NaN if not known.
+    """
+
+    parameters: int
+    training_step: float
+    batch_size: int
+    rollout: float
+    peak_bytes: float
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """Everything that a report shows, in numbers.
 
@@ -105,6 +124,7 @@ class Evaluation:
         particle_count: particles n of the bed.
         start: common start of the particles [m], shape (n, 3).
         costs: of the network.
+        full_space: of the same network on every particle; None if it was not asked for.
         mean_torque: mean torque of the training split [N m], shape (3,).
         training_log: losses and validation scores by step, as `training_curves.read_log` gives them.
         trained_on: names of the evaluated runs that the basis and the network were fitted on.
@@ -126,6 +146,7 @@ class Evaluation:
     particle_count: int
     start: np.ndarray
     costs: Costs = field(default_factory=Costs)
+    full_space: FullSpaceCost | None = None
     mean_torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
     training_log: Mapping[str, np.ndarray] = field(default_factory=dict)
     trained_on: Sequence[str] = ()

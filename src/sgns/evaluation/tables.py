@@ -6,6 +6,7 @@ import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,7 @@ def write_tables(evaluation: Evaluation, output: Path) -> None:
                 "training_wall_s_per_step": costs.seconds_per_step,
                 "training_batch_size": costs.batch_size,
             },
+            "full_space": asdict(evaluation.full_space) if evaluation.full_space else None,
             "evaluated_runs_trained_on": list(evaluation.trained_on),
             "evaluated_runs_that_chose_the_checkpoint": list(evaluation.chosen_by),
             "reconstruction_mse_m2": evaluation.curves.held_out,

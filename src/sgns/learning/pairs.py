@@ -134,10 +134,13 @@ class IndexedPairs:
 
 def pairs_of(edge_index: Tensor, node_count: int) -> Pairs:
     """The quickest form of these edges; they are those of a complete graph only in its order."""
-    index = torch.arange(node_count, device=edge_index.device)
-    receiver, sender = torch.meshgrid(index, index, indexing="ij")
     for self_loops in (False, True):
+        # Their number first: a graph of all particles has few edges, and all pairs of its nodes take tens of GB.
+        if node_count < 2 or edge_index.shape[1] != node_count * (node_count - (not self_loops)):
+            continue
+        index = torch.arange(node_count, device=edge_index.device)
+        receiver, sender = torch.meshgrid(index, index, indexing="ij")
         keep = (receiver != sender) | self_loops
-        if node_count > 1 and torch.equal(edge_index, torch.stack([sender[keep], receiver[keep]])):
+        if torch.equal(edge_index, torch.stack([sender[keep], receiver[keep]])):
             return CompletePairs(node_count, self_loops)
     return IndexedPairs(edge_index, node_count)

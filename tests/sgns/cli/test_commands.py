@@ -101,7 +101,7 @@ def test_settings_of_a_command(command: str) -> None:
     own = {
         "simulate": {"shard", "shards"},
         "rollout": {"num_modes"},
-        "evaluate": {"split", "num_modes", "new_rollouts", "timing_repeats"},
+        "evaluate": {"split", "num_modes", "new_rollouts", "timing_repeats", "full_space"},
         "frontier": {"study", "axis"},
         "advise": {"task", "error", "time", "particles", "against", "table"},
         "check": {"files"},
@@ -157,6 +157,7 @@ def test_settings_can_be_shown(empty_folder: Path) -> None:
         (["evaluate", "checkpoint=a.ckpt", "dataset=null"], ["a group is null"]),
         (["evaluate", "checkpoint=a.ckpt", "~dataset"], ["dataset is missing", "allowed:", "quick"]),
         (["evaluate", "checkpoint=a.ckpt", "dataset.path=nope"], ["no dataset in nope"]),
+        (["evaluate", "checkpoint=a.ckpt", "full_space=3"], ["full_space is 3"]),
         (["evaluate", "checkpoint=a.ckpt", "timing_repeats=x"], ["timing_repeats is 'x'"]),
         (["train", "dataset.path=null"], ["dataset.path is null"]),
         (["train", "seed=1.5"], ["seed is 1.5", "whole number"]),

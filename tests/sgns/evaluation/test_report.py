@@ -21,7 +21,7 @@ from sgns.evaluation.report_words import (
     summary,
     titled,
 )
-from sgns.evaluation.results import Costs, EvaluatedRun, Evaluation, NetworkTiming
+from sgns.evaluation.results import Costs, EvaluatedRun, Evaluation, FullSpaceCost, NetworkTiming
 from sgns.evaluation.scores import Scores, aggregate
 from sgns.reduction import Basis
 from sgns.reduction.reconstruction import ReductionCurves
@@ -281,3 +281,12 @@ def test_costs_that_are_not_known_are_not_made_up():
     known = replace(evaluation(), costs=costs)
     assert ">0.0400</td>" in cost_table(known) and ">253 777</td>" in cost_table(known)
     assert "6000 steps of 32 samples" in cost_note(known)
+
+
+def test_full_space_has_a_column_where_it_was_measured():
+    plain = evaluation()
+    measured = replace(plain, full_space=FullSpaceCost(40_000, 2.5, 2, 27.0, 3e9))
+    assert "full space" not in cost_table(plain) and "full_space=true" in cost_note(plain)
+    page = cost_table(measured)
+    assert "full space, untrained" in page and ">27.0</td>" in page and ">40 000</td>" in page
+    assert "full_space=true" not in cost_note(measured)

@@ -51,3 +51,8 @@ def test_edges_end_where_the_index_says() -> None:
 def test_one_node_alone() -> None:
     pairs = pairs_of(edge_indices(1, 0), 1)
     assert torch.equal(pairs.gather(torch.empty(2, 0, 3)), torch.zeros(2, 1, 3))
+
+
+def test_a_graph_of_many_nodes_and_few_edges_needs_no_table_of_all_pairs() -> None:
+    nodes = 3_000_000  # all their pairs would take 144 TB
+    assert isinstance(pairs_of(torch.tensor([[0, 1], [2, 2]]), nodes), IndexedPairs)
