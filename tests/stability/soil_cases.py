@@ -233,9 +233,11 @@ def against_the_wall() -> tuple[float, str]:
     scene = Push(bed=bed, tool=tool, path=path, duration=1.2, frame_rate=100.0)
     frames = frames_of(scene)
     beyond = max(float(np.max(f.position[:, 0] - 0.32)) for f in frames)
-    # What soil under the peak pressure has as its speed when the pressure is let go: 2 sigma / (rho c).
+    # What soil under the peak pressure has as its speed when the pressure is let go, 2 sigma / (rho c), and never more
+    # than half the speed of its waves.
+    wave = scene.material.wave_speed
     pressure = max(float(np.linalg.norm(f.force)) for f in frames) / (0.158 * 0.12)
-    release = 2.0 * pressure / (scene.material.bulk_density * scene.material.wave_speed)
+    release = min(2.0 * pressure / (scene.material.bulk_density * wave), 0.5 * wave)
     return shares(
         {
             "beyond the wall": (1000.0 * max(beyond, 0.0), 1.0, "mm"),

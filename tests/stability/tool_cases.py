@@ -166,12 +166,14 @@ def one_flipped_triangle() -> tuple[float, str]:
     triangles = box_triangles()
     triangles[3] = triangles[3][::-1]
     with tempfile.TemporaryDirectory() as folder:
-        return refused(lambda: mesh_scene(Path(folder), triangles), "do not all face the same way")
+        accepted, words = refused(lambda: mesh_scene(Path(folder), triangles), "do not all face the same way")
+    return accepted, words.replace(f"{folder}/", "")
 
 
 def open_mesh() -> tuple[float, str]:
     with tempfile.TemporaryDirectory() as folder:
-        return refused(lambda: mesh_scene(Path(folder), box_triangles()[:-1]), "is not closed")
+        accepted, words = refused(lambda: mesh_scene(Path(folder), box_triangles()[:-1]), "is not closed")
+    return accepted, words.replace(f"{folder}/", "")
 
 
 def too_thin() -> tuple[float, str]:
