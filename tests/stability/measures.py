@@ -109,8 +109,8 @@ def shares(found: Mapping[str, tuple[float, float, str]]) -> tuple[float, str]:
         found: name -> value, limit, unit.
     """
     words = [f"{name} {value:.3g} of {limit:.3g} {unit}" for name, (value, limit, unit) in found.items()]
-    worst = [max(0.0, value) / limit for value, limit, _ in found.values()]
-    return float(np.max(worst)), "; ".join(words)  # a NaN stays one
+    worst = [np.maximum(0.0, value) / limit for value, limit, _ in found.values()]  # a NaN stays one
+    return float(np.max(worst)), "; ".join(words)
 
 
 def blade_shares(scene: Scene, frames: list[Frame], gain: float = 3.0) -> tuple[float, str]:
