@@ -88,8 +88,9 @@ def creep() -> tuple[float, str]:
     moved = np.linalg.norm(frames[-1].position - frames[2].position, axis=1)
     force = [float(np.linalg.norm(f.force)) for f in frames]
     words = (
-        f"mean {1e3 * moved.mean():.3g} mm; force {force[2]:.3g} N after 1 s, {force[-1]:.3g} N at the end"
+        f"mean {1e3 * moved.mean():.3g} mm, {np.sum(moved > 1e-3)} of {len(moved)} particles beyond 1 mm; "
     )
+    words += f"force {force[2]:.3g} N after 1 s, {force[-1]:.3g} N at the end"
     return 1000.0 * float(moved.max()), words
 
 
