@@ -24,7 +24,8 @@ __all__ = ["Bed", "Scene"]
 INITIAL_STRESSES = ("geostatic", "k0", "none")
 
 MOST_COURANT = 0.8
-"""Largest `courant`. From 0.86 on a cut's forces come out too small, with nothing else to see (experiments/stability/step.csv)."""
+"""Largest `courant`. From 0.86 on a cut's forces come out too small, with nothing else to see
+(experiments/stability/step.csv)."""
 
 
 @dataclass(frozen=True)
