@@ -1,15 +1,17 @@
 # Everything runs in .venv, which `make setup` makes with the standard library's venv and pip.
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
+WORKERS ?= 1
 BIN := .venv/bin
 READY := .venv/.sgns-ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo frontier test lint clean
+.PHONY: help setup demo frontier test stability lint clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
-	@echo "  settings: PYTHON=python3.12 (3.10 to 3.13), TORCH='torch==2.13.0' (what pip installs first)"
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@echo "  settings: PYTHON=python3.12 (3.10 to 3.13), TORCH='torch==2.13.0' (what pip installs first),"
+	@echo "            WORKERS=4 (processes of make stability)"
 
 setup: $(READY) ## make .venv and install the package with what tests and lint need
 
@@ -37,6 +39,9 @@ frontier: setup ## what accuracy costs in time: the quick study, about a quarter
 
 test: setup ## run the tests
 	$(BIN)/python -m pytest
+
+stability: setup ## measure the hard cases (about half an hour of one core; goes on where it stopped)
+	$(BIN)/python experiments/stability/run.py --workers $(WORKERS)
 
 lint: setup ## check the code's style and format
 	$(BIN)/ruff check .

@@ -13,6 +13,7 @@ from .material import Material
 from .push import Push
 from .scene import Bed, Scene
 from .solver import Frame, Solver
+from .state import State
 from .symmetry import asymmetry
 from .time_step import substeps_per_frame
 from .walls import Walls
@@ -36,6 +37,7 @@ __all__ = [
     "SceneError",
     "Solver",
     "SolverStopped",
+    "State",
     "Tolerances",
     "Walls",
     "Wheel",

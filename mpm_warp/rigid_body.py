@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 __all__ = ["RigidBody", "contact_spring", "longest_step"]
 
+LONGEST_WAY = 0.5
+"""Of a body in one substep [grid spacings]."""
+
 
 def contact_spring(scene: Scene, volume: float) -> tuple[float, float]:
     """Stiffness [N/m] and damping [N s/m] of the spring between the body and a particle of `volume` [m^3].
@@ -104,11 +107,16 @@ class RigidBody:
         """The struct that kernels take."""
 
     def start_frame(self, frame: int) -> None:
-        """Load the prescribed motion of the frame that begins at `frame`, and forget the impulse."""
+        """Load the prescribed motion of the frame that begins at `frame`, and forget the impulse.
+
+        Raises:
+            SolverStopped: the body jumps.
+        """
         self.data.impulse.zero_()
         if self._axle is not None:
             self._axle[2:].zero_()
         poses = self.scene.poses_at((frame * self.substeps + np.arange(self.substeps + 1)) * self.dt)
+        self._require_steady(frame, poses[:, :3])
         velocity = np.diff(poses[:, :3], axis=0) / self.dt
         spin = angular_velocity(poses[:-1, 3:], poses[1:, 3:], self.dt)
         for array, values in (
@@ -126,19 +134,51 @@ class RigidBody:
             pose[2] = self._axle.numpy()[0]
         return pose
 
-    def check(self, time: float) -> None:
-        """Stop where a free body's motion means nothing any more.
+    def lasting(self) -> dict[str, wp.array]:
+        """What a frame leaves to the next one, by name."""
+        arrays = {"contact_stretch": self.data.stick}
+        if self._axle is not None:
+            arrays["axle"] = self._axle
+        return arrays
+
+    def check(self, time: float, speed_bound: float) -> None:
+        """Stop where the soil's push or a free body's motion means nothing any more.
+
+        Args:
+            time: [s], for the message.
+            speed_bound: of a free body [m/s].
 
         Raises:
-            SolverStopped: it reached the floor, or its height is not finite.
+            SolverStopped: the force is not finite; the body reached the floor, or its motion cannot be.
         """
+        if not np.isfinite(self.data.impulse.numpy()).all():
+            raise SolverStopped(f"the force on the body is not finite by {time:.3f} s: lower scene.courant")
         if self._axle is None:
             return
-        lowest = self._axle.numpy()[0] - self.scene.body.half_size[2]
-        if not lowest > -self.scene.bed.size[2]:
+        height, rate, _ = self._axle.numpy()
+        if not abs(rate) <= speed_bound:
+            raise SolverStopped(
+                f"the body moves up or down at {rate:.3g} m/s by {time:.3f} s, which nothing here can cause "
+                f"({speed_bound:.3g} m/s at most): lower scene.courant or raise scene.damping"
+            )
+        if not height - self.scene.body.half_size[2] > -self.scene.bed.size[2]:
             raise SolverStopped(
                 f"the body reached the floor of the bin by {time:.3f} s: make scene.bed.size deeper or the load smaller"
             )
+
+    def _require_steady(self, frame: int, position: np.ndarray) -> None:
+        """A body that is somewhere else in the next substep does not push soil: it appears in its midst."""
+        way = np.linalg.norm(np.diff(position, axis=0), axis=1)
+        far = ~(way <= LONGEST_WAY * self.scene.bed.spacing)
+        if not far.any():
+            return
+        substep = int(np.argmax(far))
+        at = ", ".join(f"{c:.4f}" for c in position[substep])
+        raise SolverStopped(
+            f"the body jumps by {way[substep]:.3g} m from ({at}) m within substep {substep} of frame {frame + 1}, at "
+            f"{frame / self.scene.frame_rate + substep * self.dt:.5f} s: make its path smooth there; the frames before "
+            "it are good"
+        )
 
     def impulse(self) -> np.ndarray:
         """By the soil on the body since the frame began [N s], and its moment [N m s], shape (2, 3); a moment that is

@@ -15,6 +15,7 @@ from .effects import Effects
 from .errors import SceneError, SolverStopped
 from .grid import grid_step
 from .grid_layout import lay_grid
+from .guard import Guard
 from .images import Images, images
 from .initial_stress import initial_stress
 from .launches import Launch, SceneKernel
@@ -24,6 +25,7 @@ from .rotation import rotate
 from .scene import Scene
 from .soil import soil_parameters
 from .start import find_device
+from .state import Memory, State
 from .symmetry import half, require_symmetry
 from .time_step import steps_to_remap, substeps_per_frame, top_body_speed
 from .transfer import transfer
@@ -66,6 +68,7 @@ class Solver:
         effects: which physics; kernels are compiled without what is off.
         device: `cpu` (one core) or `cuda`, `cuda:0`, ...
         precision: `float32` or `float64`.
+        start: what to go on from instead of the scene's own start; of the same scene, whose numerics may differ.
     """
 
     def __init__(
@@ -74,6 +77,7 @@ class Solver:
         effects: Effects | None = None,
         device: str = "cpu",
         precision: str = "float32",
+        start: State | None = None,
     ) -> None:
         if precision not in PRECISIONS:
             raise SceneError(f"precision is {precision!r}; allowed: {', '.join(PRECISIONS)}")
@@ -90,7 +94,11 @@ class Solver:
         self.substeps_per_frame = substeps_per_frame(scene)
         self.time_step = 1.0 / scene.frame_rate / self.substeps_per_frame
         """Substep [s]."""
+        self._guard = Guard(scene, self.time_step)
         self._allocate()
+        self._start = start
+        if start is not None:
+            self._memory.load(start)
 
     @property
     def particle_count(self) -> int:
@@ -103,10 +111,10 @@ class Solver:
         return len(self._x)
 
     def frames(self) -> Iterator[Frame]:
-        """All frames in order, the initial state first.
+        """All frames in order, the initial state first, or those after the one that the solver starts from.
 
         Raises:
-            SolverStopped: at the end of the first frame in which a particle or the body went wrong.
+            SolverStopped: in the first frame in which a particle or the body went wrong, with the state before it.
         """
         worker = Worker(self.device)
         for stage in self.stages():
@@ -120,15 +128,23 @@ class Solver:
         that of other scenes with it (batch.py)."""
         for program in (self._remap, self._until_remap):
             yield Work(program, 0)
-        for index in range(self.scene.frame_count):
+        first = 0 if self._start is None else self._start.frame + 1
+        if self._start is not None:
+            self._memory.keep(self._start.frame)
+        for index in range(first, self.scene.frame_count):
             if index > 0:
-                self._substep.zero_()
-                if self._body is not None:
-                    self._body.start_frame(index - 1)
-                yield from self._advance(index)
-                if self._body is not None:
-                    self._body.check(index / self.scene.frame_rate)
+                try:
+                    yield from self._advance(index)
+                except SolverStopped as stopped:
+                    stopped.state = self._memory.state()
+                    raise
+            self._memory.keep(index)
             yield self._frame(index)
+
+    def state(self) -> State | None:
+        """What a solver of the same scene needs to go on after the last frame that `frames` gave; None before the
+        first."""
+        return self._memory.state()
 
     # --- set-up -------------------------------------------------------------------------------------------
 
@@ -186,6 +202,28 @@ class Solver:
                 self.effects.torque,
             )
         self._record_launches(n, nodes, ghosts)
+        self._memory = Memory(self._lasting())
+
+    def _lasting(self) -> dict[str, wp.array]:
+        """What a frame leaves to the next one; the grid is filled anew at every remap."""
+        arrays = {
+            "position": self._x,
+            "velocity": self._v,
+            "felt_velocity": self._felt,
+            "velocity_gradient": self._c,
+            "elastic_strain": self._e,
+            "log_volume": self._ln_j,
+            "stress": self._stress,
+            "swelling": self._swelling,
+        }
+        arrays |= {f"turns_{'xyz'[axis]}": turns for axis, turns in self._turns.items()}
+        if self.effects.fluidity:
+            arrays["fluidity"] = self._soil.g
+        if self._nonlocal is not None:
+            arrays["cooperative_fluidity"] = self._nonlocal.field
+        if self._body is not None:
+            arrays |= self._body.lasting()
+        return arrays
 
     def _record(self, kernel: SceneKernel, count: int, *arguments: Any) -> Launch:
         return Launch(kernel, count, arguments, self.device)
@@ -277,6 +315,7 @@ class Solver:
             yield part, its_grid, its_body
 
     def _record_nonlocal(self, ghosts: dict[int, np.ndarray]) -> list[Launch]:
+        self._nonlocal: NonlocalFluidity | None = None
         if not self.effects.nonlocality:
             return []
         real, grid = self._real, self._grid
@@ -286,7 +325,7 @@ class Solver:
         particles = [self._home, self._e, self._ln_j]
         ghost = Images(real, self.device, grid, ghosts, mirrored=False)  # fluidity has no direction
         on_plane = self._half.on_plane if self._half is not None else 0
-        term = NonlocalFluidity(
+        self._nonlocal = NonlocalFluidity(
             real,
             self.effects,
             self.device,
@@ -298,7 +337,7 @@ class Solver:
             self._cooperation,
             on_plane,
         )
-        return [*term.launches, *ghost.unfold(self._cooperation)]
+        return [*self._nonlocal.launches, *ghost.unfold(self._cooperation)]
 
     def _record_wraps(self, n: int) -> list[Launch]:
         """Bring particles that left a periodic bin back in."""
@@ -314,34 +353,44 @@ class Solver:
     # --- stepping -----------------------------------------------------------------------------------------
 
     def _advance(self, index: int) -> Iterator[Work]:
+        """From frame index - 1 to frame `index`."""
+        self._substep.zero_()
+        if self._body is not None:
+            self._body.start_frame(index - 1)
         left = self.substeps_per_frame
         while left:
             self._top_speed.zero_()
             yield Work(self._remap, 1)
-            speed = max(self._top_body_speed, float(self._top_speed.numpy()[0]))
+            top = float(self._top_speed.numpy()[0])
+            if not top <= self._guard.speed_bound:
+                fastest = int(np.argmax(np.linalg.norm(self._v.numpy(), axis=1)))
+                raise self._stopped(index, self.substeps_per_frame - left, fastest, self._guard.too_fast(top))
+            speed = max(self._top_body_speed, top)
             steps = min(left, steps_to_remap(self.scene, self.time_step, speed))
             left -= steps
             self._keep.fill_(math.exp(-steps * self.time_step / self.scene.velocity_memory))
             yield Work(self._until_remap, steps)
-        self._check_particles(index)
+        self._check(index)
 
-    def _check_particles(self, index: int) -> None:
+    def _check(self, index: int) -> None:
+        """At the end of frame `index`."""
         count, particle, substep, near = (int(i) for i in self._stray.numpy())
-        if not count:
-            return
+        if count:
+            raise self._stopped(index, substep, particle, self._guard.strayed(bool(near)))
+        found = self._guard.too_strained(self._ln_j.numpy(), self._e.numpy())
+        if found is not None:
+            raise self._stopped(index, self.substeps_per_frame, *found)
+        if self._body is not None:
+            self._body.check(index / self.scene.frame_rate, self._guard.speed_bound)
+
+    def _stopped(self, index: int, substep: int, particle: int, cause: str) -> SolverStopped:
         time = (index - 1) / self.scene.frame_rate + substep * self.time_step
         at = ", ".join(f"{c:.4f}" for c in self._x.numpy()[particle])
         if self._half is not None:
             particle = int(self._half.kept[particle])
-        cause = (
-            "it left the grid: soil was thrown or pushed beyond it, raise scene.bed.headroom"
-            if near
-            else "its speed is not finite or carried it further than a cell between two remaps: lower scene.courant or "
-            "the body's speed"
-        )
-        raise SolverStopped(
-            f"particle {particle} at ({at}) m went wrong at {time:.5f} s, substep {substep} of frame {index}: "
-            f"{cause} ({count} faults in this frame; the frames before it are good)"
+        return SolverStopped(
+            f"particle {particle} at ({at}) m went wrong at {time:.5f} s, substep {substep} of frame {index}: {cause}; "
+            "the frames before it are good"
         )
 
     def _frame(self, index: int) -> Frame:

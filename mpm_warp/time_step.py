@@ -9,16 +9,20 @@ import numpy as np
 from .rigid_body import longest_step
 from .scene import Scene
 
-__all__ = ["steps_to_remap", "substeps_per_frame", "top_body_speed"]
+__all__ = ["damped_share", "steps_to_remap", "substeps_per_frame", "top_body_speed"]
 
 
 def substeps_per_frame(scene: Scene) -> int:
     """Equal steps in a frame: as many as elastic waves, the body's motion and a free body's mass ask for."""
     limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + top_body_speed(scene))
-    # A damped oscillator asks for a shorter step than a free one.
-    limit *= math.sqrt(1.0 + scene.elastic_damping**2) - scene.elastic_damping
+    limit *= damped_share(scene)
     limit = min(limit, longest_step(scene))
     return max(1, math.ceil(1.0 / scene.frame_rate / limit - 1e-9))
+
+
+def damped_share(scene: Scene) -> float:
+    """Longest stable step of a damped oscillator over that of a free one [-]."""
+    return math.sqrt(1.0 + scene.elastic_damping**2) - scene.elastic_damping
 
 
 def top_body_speed(scene: Scene) -> float:

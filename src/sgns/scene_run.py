@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mpm_warp import Effects, Scene, Solver
+from mpm_warp import Effects, Scene, Solver, SolverStopped
 from mpm_warp.batch import all_together
 from mpm_warp.work import Work
+from sgns.continuation import Continuation
 from sgns.runs import RunWriter
 
 __all__ = ["Timing", "scene_stages", "simulate_scene"]
@@ -53,17 +54,23 @@ def scene_stages(
     device: str = "cpu",
     precision: str = "float32",
     progress: Any = None,
+    going_on: Continuation | None = None,
 ) -> Generator[Timing | Work, None, None]:
     """Compute a scene and write its run file, with the particles that `scene.bed.store_every` leaves in it.
 
     Args:
         reasons: effect → on, reason, number, for the run file; by default what `effects` says of itself.
         progress: called once after every frame.
+        going_on: a stopped run of this scene; its frames are copied and the solver begins after them.
 
     Yields:
         All work that the device has to do (mpm_warp's work.py), and at the end what it cost.
+
+    Raises:
+        SolverStopped: the line says where the frames before it are kept and how to go on.
     """
-    solver = Solver(scene, effects, device, precision)
+    computed, state = (scene, None) if going_on is None else (going_on.changed_scene, going_on.state)
+    solver = Solver(computed, effects, device, precision, start=state)
     stored = scene.stored
     with RunWriter(
         output,
@@ -81,33 +88,51 @@ def scene_stages(
             "time_step_s": solver.time_step,
             "substeps_per_frame": solver.substeps_per_frame,
             "particles_simulated": solver.particle_count,
-        },
+        }
+        | ({"continued": going_on.record} if going_on is not None else {}),
     ) as writer:
-        wall_time, seen, shared_by = 0.0, None, 1
-        for stage in solver.stages():
-            if isinstance(stage, Work):
-                yield stage
-                shared_by = stage.shared_by
-                if seen is not None:
-                    now = time.perf_counter()
-                    wall_time, seen = wall_time + (now - seen) / shared_by, now
-                continue
-            # The clock starts with the first frame: loading kernels is not part of the cost of a run.
-            seen = seen if seen is not None else time.perf_counter()
-            writer.append(
-                stage.time,
-                stage.position[stored],
-                stage.velocity[stored],
-                stage.body_points,
-                stage.body_pose,
-                stage.force,
-                stage.torque,
-            )
+        for frame in going_on.frames() if going_on is not None else ():
+            writer.append(*frame)
             if progress is not None:
                 progress()
-        wall_time += (time.perf_counter() - seen) / shared_by
+        there = writer.frame_count
+        # Loading kernels is not part of the cost of a run: the clock starts with the first frame, or with the first
+        # work where the first frames are there already.
+        wall_time, seen, shared_by = 0.0, None, 1
+        try:
+            for stage in solver.stages():
+                if isinstance(stage, Work):
+                    if there and stage.steps and seen is None:
+                        seen = time.perf_counter()
+                    yield stage
+                    shared_by = stage.shared_by
+                    if seen is not None:
+                        now = time.perf_counter()
+                        wall_time, seen = wall_time + (now - seen) / shared_by, now
+                    continue
+                seen = seen if seen is not None else time.perf_counter()
+                writer.append(
+                    stage.time,
+                    stage.position[stored],
+                    stage.velocity[stored],
+                    stage.body_points,
+                    stage.body_pose,
+                    stage.force,
+                    stage.torque,
+                )
+                if progress is not None:
+                    progress()
+        except SolverStopped as stopped:
+            if stopped.state is None or stopped.state.frame != writer.frame_count - 1:
+                raise
+            kept = writer.stop(wall_time, str(stopped), stopped.state)
+            raise SolverStopped(
+                f"{stopped}. They are kept: sgns simulate continue_from={kept} output={output} "
+                f"scene.courant={0.5 * computed.courant:g} goes on from there with half the step"
+            ) from stopped
+        wall_time += (time.perf_counter() - seen) / shared_by if seen is not None else 0.0
         writer.finish(wall_time)
-    frames = scene.frame_count - 1
+    frames = scene.frame_count - max(1, there)
     yield Timing(
         wall_time, frames / scene.frame_rate, frames * solver.substeps_per_frame * solver.computed_count
     )

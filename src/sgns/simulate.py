@@ -12,8 +12,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from mpm_warp import Scene
 from sgns.campaign import plan
 from sgns.campaign_runs import simulate_campaign
+from sgns.continuation import continued
 from sgns.cost import require_space, run_cost
 from sgns.errors import UserError
 from sgns.runs import Run
@@ -49,6 +51,19 @@ def main(cfg: DictConfig) -> float | None:
     Returns:
         Wall seconds per simulated second of a single scene.
     """
+    if cfg.continue_from is not None:
+        if cfg.get("dataset") is not None:
+            raise UserError("continue_from goes on with one run; leave out dataset=")
+        going_on = continued(cfg, HydraConfig.get().overrides.task)
+        return _simulate_one(
+            going_on.scene,
+            cfg,
+            effects=going_on.effects,
+            reasons=going_on.reasons,
+            seed=going_on.seed,
+            precision=going_on.precision,
+            going_on=going_on,
+        )
     asked, batch = asked_effects(cfg), cfg.solver.batch
     if type(batch) is not int or batch < 1:
         raise UserError(f"solver.batch is {batch!r}; it must be a whole number, 1 or more")
@@ -75,18 +90,27 @@ def main(cfg: DictConfig) -> float | None:
     effects, decisions = decided(scene, asked)
     for name, decision in decisions.items():
         log.info("%s", decision_line(name, decision))
+    return _simulate_one(
+        scene,
+        cfg,
+        effects=effects,
+        reasons=recorded(decisions),
+        seed=cfg.seed,
+        precision=cfg.solver.precision,
+    )
+
+
+def _simulate_one(scene: Scene, cfg: DictConfig, **settings: Any) -> float:
+    """Simulate a scene into `cfg.output` with a bar and a few words about it; see `scene_stages`."""
     output = Path(cfg.output)
     require_space(output.parent, run_cost(scene).size)
     with tqdm(total=scene.frame_count, unit="frame", desc=scene.name, disable=None) as bar:
         timing = simulate_scene(
             scene,
             output,
-            effects=effects,
-            reasons=recorded(decisions),
-            seed=cfg.seed,
             device=cfg.device,
-            precision=cfg.solver.precision,
             progress=bar.update,
+            **settings,
         )
     with Run(output) as run:
         every = scene.bed.store_every

@@ -70,8 +70,9 @@ class NewFile:
             raise _cannot_write(self.path, error) from error
         raise error
 
-    def complete(self) -> None:
-        """Wait until the disk has everything, then give the file its name. Close the HDF5 file before.
+    def complete(self, path: Path | None = None) -> None:
+        """Wait until the disk has everything, then give the file its name, or that of `path` in the same folder. Close
+        the HDF5 file before.
 
         Raises:
             UserError: the disk did not take it; nothing is left behind.
@@ -80,7 +81,7 @@ class NewFile:
             self.check()
             os.fsync(self._file.fileno())
             self._file.close()
-            os.replace(self._temp, self.path)
+            os.replace(self._temp, path or self.path)
         except OSError as error:
             self.discard()
             raise _cannot_write(self.path, error) from error

@@ -53,7 +53,7 @@ def check_run(path: str | os.PathLike[str]) -> list[str]:
             return [f"the file is damaged ({one_line(error)})"]
         checks = [_check_h5md, _check_attributes]
         if not problems:  # the rest relies on complete datasets of the right shapes
-            checks += [_check_times, _check_body, _check_view, _check_frames]
+            checks += [_check_stopped, _check_times, _check_body, _check_view, _check_frames]
         for check in checks:
             try:
                 problems += check(file)
@@ -113,6 +113,14 @@ def _check_attributes(file: h5py.File) -> list[str]:
 
 def _says_why(effect: object) -> bool:
     return isinstance(effect, dict) and isinstance(effect.get("on"), bool) and bool(effect.get("reason"))
+
+
+def _check_stopped(file: h5py.File) -> list[str]:
+    reason = read_attributes(file).get("stopped")
+    if reason is None:
+        return []
+    frames = file[f"{ELEMENTS['position'].path}/value"].shape[0]
+    return [f"the run stopped after {frames} good frames: {one_line(reason)}"]
 
 
 def _check_times(file: h5py.File) -> list[str]:

@@ -108,6 +108,12 @@ class Run:
         """Version of sgns that wrote the file."""
         return self._attributes["package_version"]
 
+    @property
+    def stopped(self) -> str | None:
+        """Why the run ended before its time; None for a whole run."""
+        reason = self._attributes.get("stopped")
+        return None if reason is None else str(reason)
+
     # --- what was recorded --------------------------------------------------------------------------------
 
     @property

@@ -55,6 +55,8 @@ ATTRIBUTES = (
     "extra",
 )
 """Root attributes; `scene`, `effects` and `extra` are YAML text in UTF-8."""
+OPTIONAL = ("stopped",)
+"""Root attributes that only some files have: why a run ended before its time."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +109,8 @@ def package_version() -> str:
 
 
 def read_attributes(file: h5py.File) -> dict[str, Any]:
-    """The root attributes; text as str."""
-    return {name: _text(value) for name, value in file.attrs.items() if name in ATTRIBUTES}
+    """The root attributes, those that only some files have too; text as str."""
+    return {name: _text(value) for name, value in file.attrs.items() if name in ATTRIBUTES + OPTIONAL}
 
 
 def write_text(owner: h5py.Group | h5py.Dataset, name: str, text: str) -> None:

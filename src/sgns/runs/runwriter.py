@@ -17,9 +17,11 @@ import h5py
 import numpy as np
 import yaml
 
+from mpm_warp import State
 from sgns.errors import UserError
 from sgns.runs.newfile import NewFile
 from sgns.runs.runlayout import ELEMENTS, FORMAT, FORMAT_VERSION, PRODUCERS, package_version, write_text
+from sgns.runs.stopped import stopped_path, write_state
 from sgns.runs.vtkhdf import write_view
 
 __all__ = ["ContentHash", "RunWriter"]
@@ -50,8 +52,8 @@ class ContentHash:
 class RunWriter:
     """Writes a run file; use it as a context manager and call `finish` at the end.
 
-    The file appears under its name only when `finish` succeeds; leaving the context in any other way removes
-    what was written. An existing file of that name stays untouched until then.
+    The file appears under its name only when `finish` succeeds, or under another one with `stop`; leaving the context
+    in any other way removes what was written. An existing file of that name stays untouched until then.
 
     Args:
         path: where the run goes, usually `*.h5`; missing folders are made.
@@ -196,12 +198,36 @@ class RunWriter:
             raise ValueError("the run is already finished or discarded; make a new RunWriter")
         if self.frame_count == 0:
             raise ValueError("no frame was appended")
+        self._complete(wall_time_s, self.path)
+        stopped_path(self.path).unlink(missing_ok=True)  # of an earlier attempt
+
+    def stop(self, wall_time_s: float, reason: str, state: State) -> Path:
+        """Complete the file with the frames so far, as a stopped run beside the one it was to be (stopped.py).
+
+        Args:
+            wall_time_s: time it took so far [s].
+            reason: why there are no more frames.
+            state: at the last of them, to go on from.
+
+        Returns:
+            The file's path.
+        """
+        if self._file is None:
+            raise ValueError("the run is already finished or discarded; make a new RunWriter")
+        write_text(self._file, "stopped", reason)
+        write_state(self._file, state)
+        path = stopped_path(self.path)
+        self._complete(wall_time_s, path)
+        return path
+
+    def _complete(self, wall_time_s: float, path: Path) -> None:
+        assert self._file is not None
         try:
             self._write_series()
             self._file.attrs["wall_time_s"] = np.float64(wall_time_s)
             write_text(self._file, "content_hash", self._hash.hexdigest())
             self._file.close()
-            self._disk.complete()
+            self._disk.complete(path)
         except BaseException:
             self._discard()
             raise

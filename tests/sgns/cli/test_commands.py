@@ -99,7 +99,7 @@ def test_settings_of_a_command(command: str) -> None:
         "scene material effects solver dataset reduction model training preset checkpoint output seed device"
     )
     own = {
-        "simulate": {"shard", "shards"},
+        "simulate": {"continue_from", "shard", "shards"},
         "rollout": {"num_modes"},
         "evaluate": {"split", "num_modes", "new_rollouts", "timing_repeats", "full_space"},
         "frontier": {"study", "axis"},

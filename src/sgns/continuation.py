@@ -1,0 +1,133 @@
+"""Going on with a run whose solver stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from mpm_warp import Effects, Scene, State
+from sgns.errors import UserError
+from sgns.runs import Run
+from sgns.runs.stopped import read_state
+
+__all__ = ["CHANGES", "Continuation", "continued"]
+
+CHANGES = (
+    "courant",
+    "remap_time",
+    "remap_distance",
+    "velocity_memory",
+    "elastic_damping",
+    "volume_averaging",
+    "bed.headroom",
+)
+"""Keys of the scene that may change half-way: how it is computed, not what it is."""
+
+_OTHERS = ("continue_from", "output", "device", "solver.precision", "hydra")
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """A stopped run and what it goes on with."""
+
+    path: Path
+    scene: Scene
+    """What was asked for at first; the run file says this."""
+    changes: dict[str, Any]
+    """Keys of `CHANGES` with new values."""
+    effects: Effects
+    reasons: dict[str, dict[str, Any]]
+    """Of the effects, as in the file."""
+    precision: str
+    seed: int
+    state: State
+    before: list[dict[str, Any]]
+    """What the file says of earlier continuations."""
+
+    @property
+    def changed_scene(self) -> Scene:
+        """What is computed from here on."""
+        data = self.scene.to_dict()
+        for key, value in self.changes.items():
+            *groups, last = key.split(".")
+            place = data
+            for group in groups:
+                place = place[group]
+            place[last] = value
+        return Scene.from_dict(data)
+
+    @property
+    def record(self) -> list[dict[str, Any]]:
+        """For the run file: at which frames the solver went on, and with what changed."""
+        return [*self.before, {"frame": self.state.frame, "changed": dict(self.changes)}]
+
+    def frames(self) -> Iterator[tuple[np.ndarray, ...]]:
+        """The frames that are there, as `RunWriter.append` takes them."""
+        with Run(self.path) as run:
+            small = (run.body_points, run.pose, run.force, run.torque)
+            for index, time in enumerate(run.time):
+                soil = run.positions(index)[0], run.velocities(index)[0]
+                yield (time, *soil, *(series[index] for series in small))
+
+
+def continued(cfg: DictConfig, overrides: Sequence[str]) -> Continuation:
+    """What `cfg.continue_from` holds, with the changes among the command's `overrides`.
+
+    Raises:
+        UserError: the file is no stopped run, or something else is to be changed than how it is computed.
+    """
+    path = Path(str(cfg.continue_from))
+    changes = _changes(cfg, overrides)
+    with Run(path) as run:
+        reason = run.stopped
+        if reason is None:
+            raise UserError(f"continue_from: {path} is a whole run; there is nothing to go on with")
+        scene, reasons, extra = run.scene, run.effects, run.extra
+        seed, count = run.seed, run.frame_count
+    state = read_state(path)
+    if state.frame != count - 1:
+        raise UserError(f"{path} holds {count} frames but the state of frame {state.frame}; repeat the run")
+    asked = any(o.startswith("solver.precision=") for o in overrides)
+    return Continuation(
+        path=path,
+        scene=Scene.from_dict(scene),
+        changes=changes,
+        effects=_effects(reasons, path),
+        reasons=reasons,
+        precision=cfg.solver.precision if asked else str(extra.get("precision", cfg.solver.precision)),
+        seed=seed,
+        state=state,
+        before=_earlier(extra),
+    )
+
+
+def _effects(reasons: Mapping[str, Any], path: Path) -> Effects:
+    try:
+        return Effects(**{name: bool(effect["on"]) for name, effect in reasons.items()})
+    except (TypeError, KeyError) as error:
+        raise UserError(f"{path}: its effects are damaged ({error}); repeat the run") from None
+
+
+def _earlier(extra: Mapping[str, Any]) -> list[dict[str, Any]]:
+    found = extra.get("continued", [])
+    return found if isinstance(found, list) else []
+
+
+def _changes(cfg: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
+    changes = {}
+    for override in overrides:
+        key = override.split("=")[0].lstrip("+~")
+        if key.split("@")[0].split(".")[0] == "hydra" or key in _OTHERS:
+            continue
+        if key.removeprefix("scene.") not in CHANGES or not key.startswith("scene."):
+            raise UserError(
+                f"continue_from brings its own scene, soil and effects; leave out {key}; allowed besides output, "
+                f"device and solver.precision: {', '.join(f'scene.{name}' for name in CHANGES)}"
+            )
+        changes[key.removeprefix("scene.")] = OmegaConf.select(cfg, key)
+    return changes

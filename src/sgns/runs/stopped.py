@@ -1,0 +1,58 @@
+"""What is kept of a run whose solver stopped: its frames, and the state to go on from."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from mpm_warp import State
+from sgns.errors import UserError
+from sgns.runs.runlayout import one_line, open_run
+
+__all__ = ["read_state", "stopped_path", "write_state"]
+
+_GROUP = "state"
+
+
+def stopped_path(path: Path) -> Path:
+    """Where the frames of a run go that was to become `path` and stopped before its end."""
+    return path.with_name(f"{path.stem}.stopped{path.suffix}")
+
+
+def write_state(file: h5py.File, state: State) -> None:
+    """Store a state beside the frames."""
+    group = file.create_group(_GROUP)
+    group.attrs["frame"] = np.int64(state.frame)
+    for name, array in state.arrays.items():
+        group[name] = array
+
+
+def read_state(path: str | os.PathLike[str]) -> State:
+    """The state in a stopped run.
+
+    Raises:
+        UserError: the file cannot be read or holds none.
+    """
+    with open_run(path) as file:
+        try:
+            group = file.get(_GROUP)
+            if not isinstance(group, h5py.Group):
+                raise UserError(
+                    f"{path} holds no state to go on from; give a *.stopped.h5, which `sgns simulate` leaves when the "
+                    "solver stops"
+                )
+            return State(
+                int(group.attrs["frame"]), {name: _numbers(group, name, path) for name in sorted(group)}
+            )
+        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            raise UserError(f"{path}: its state is damaged ({one_line(error)}); repeat the run") from error
+
+
+def _numbers(group: h5py.Group, name: str, path: str | os.PathLike[str]) -> np.ndarray:
+    found = group[name]
+    if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "if":
+        raise UserError(f"{path}: /{_GROUP}/{name} does not hold numbers; repeat the run")
+    return found[...]

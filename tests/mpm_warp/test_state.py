@@ -1,0 +1,144 @@
+"""Going on from a recorded frame, and from where a solver stopped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from beds import block, cut
+
+from mpm_warp import Bed, Effects, Incline, Material, SceneError, Solver, SolverStopped, State, Walls, Wheel
+from mpm_warp.guard import Guard
+
+
+def wheel() -> Wheel:
+    bed = Bed(size=(0.4, 0.24, 0.08), spacing=0.02, headroom=0.1)
+    return Wheel(bed=bed, duration=0.1, settle=0.05, load=20.0)
+
+
+def slope(**kw) -> Incline:
+    bed = Bed(size=(0.08, 0.08, 0.04), spacing=0.02, headroom=0.04, walls=Walls(x="periodic", y="periodic"))
+    return Incline(bed=bed, material=Material(friction_angle=20.0), duration=0.1, flowing=False, tilt=30.0)
+
+
+@pytest.mark.parametrize(
+    ("scene", "effects"),
+    [
+        (cut(duration=0.1), Effects()),
+        (cut(duration=0.1), Effects(symmetry=True)),
+        (cut(duration=0.1), Effects(fluidity=True, nonlocality=True)),
+        (cut(duration=0.1), Effects(nonlocality=True)),
+        (wheel(), Effects()),
+        (slope(), Effects()),
+    ],
+    ids=["cut", "half", "fluidity", "nonlocal", "wheel", "periodic"],
+)
+def test_the_rest_is_bit_equal(scene, effects):
+    """A second solver that starts from a frame of the first goes on as the first did."""
+    solver, whole, state = Solver(scene, effects), [], None
+    for frame in solver.frames():
+        whole.append(frame)
+        if frame.index == 2:
+            state = solver.state()
+    assert state.frame == 2
+    rest = list(Solver(scene, effects, start=state).frames())
+    assert [f.index for f in rest] == [f.index for f in whole[3:]]
+    for one, two in zip(rest, whole[3:], strict=True):
+        for name in ("position", "velocity", "body_pose", "force", "torque"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+
+
+def stopped(scene, frame: int = 3) -> tuple[list, SolverStopped]:
+    """Frames of a solver that loses a particle in `frame`, and the error."""
+    solver, frames = Solver(scene), []
+    with pytest.raises(SolverStopped) as caught:
+        for found in solver.frames():
+            frames.append(found)
+            if found.index == frame - 1:
+                v = solver._v.numpy()
+                v[17] = np.nan
+                solver._v.assign(v)
+    return frames, caught.value
+
+
+def test_a_stopped_solver_gives_its_last_good_frame():
+    """From there a solver with a shorter step goes on, near to where an undisturbed one gets."""
+    frames, error = stopped(cut(duration=0.1))
+    assert error.state.frame == frames[-1].index == 2
+    np.testing.assert_array_equal(error.state.arrays["position"].astype(np.float32), frames[-1].position)
+    shorter = replace(cut(duration=0.1), courant=0.3)
+    *_, last = Solver(shorter, start=error.state).frames()
+    *_, undisturbed = Solver(cut(duration=0.1)).frames()
+    assert last.index == undisturbed.index
+    assert np.abs(last.position - undisturbed.position).max() < 1e-3
+
+
+@pytest.mark.parametrize("stopping", ["speed", "nan"])
+def test_what_soil_cannot_do_stops_the_solver(stopping):
+    scene = cut(duration=0.1, material=Material(youngs_modulus=1e6))
+    solver = Solver(scene)
+    frames = solver.frames()
+    next(frames)
+    array, value, words = {
+        "speed": (solver._v, 20.0, r"it moves at 34.6 m/s, which nothing here can cause \(\d"),
+        "nan": (solver._e, np.nan, "speed is not finite"),
+    }[stopping]
+    values = array.numpy()
+    values[17] = value
+    array.assign(values)
+    with pytest.raises(SolverStopped, match=words) as caught:
+        next(frames)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert "particle" in text and "substep" in text and "of frame 1" in text
+    assert caught.value.state.frame == 0
+
+
+@pytest.mark.parametrize(
+    ("volume", "shear", "courant", "words"),
+    [
+        (-0.5, 0.3, 0.6, None),
+        (-1.2, 0.0, 0.6, "strained to 30.1 % of its volume and by 0 in shear"),
+        (-0.5, -1.5, 0.6, "strained to 60.7 % of its volume and by 1.5 in shear"),
+        (-0.5, 0.0, 0.8, "compressed to 60.7 % of its volume, where waves are too fast for steps of"),
+        (np.nan, 0.0, 0.6, "strain is not finite"),
+        (0.0, np.inf, 0.6, "strain is not finite"),
+    ],
+)
+def test_strains_that_soil_cannot_have(volume, shear, courant, words):
+    scene = cut(courant=courant)
+    guard = Guard(scene, Solver(scene).time_step)
+    ln_j, strain = np.full(5, -0.01), np.zeros((5, 6))
+    ln_j[3], strain[3, 4] = volume, shear
+    found = guard.too_strained(ln_j, strain)
+    if words is None:
+        assert found is None
+    else:
+        assert found[0] == 3
+        assert words in found[1]
+
+
+def test_a_body_that_jumps_stops_the_solver():
+    rows = [(0.0, 0.104), (0.05, 0.104), (0.0501, 0.2), (1.0, 0.2)]
+    path = tuple((t, x, 0.2, 0.1, 0, 0, 0, 1) for t, x in rows)
+    solver = Solver(cut(motion="path", path=path, duration=0.1))
+    with pytest.raises(SolverStopped, match=r"the body jumps by 0\.\d+ m from \(0\.10"):
+        list(solver.frames())
+
+
+def test_a_state_of_another_scene_is_refused():
+    solver = Solver(cut(duration=0.1))
+    next(solver.frames())
+    state = solver.state()
+    with pytest.raises(SceneError, match=r"position has shape \(3840, 3\)"):
+        Solver(block(), start=State(0, {k: v for k, v in state.arrays.items() if k != "contact_stretch"}))
+    with pytest.raises(SceneError, match="'fluidity' is on one side only"):
+        Solver(cut(), Effects(fluidity=True), start=state)
+    state.arrays["log_volume"][3] = np.nan
+    with pytest.raises(SceneError, match="log_volume is not finite"):
+        Solver(cut(), start=state)
+
+
+def test_nothing_to_go_on_from_before_the_first_frame():
+    assert Solver(cut()).state() is None

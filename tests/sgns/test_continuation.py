@@ -1,0 +1,170 @@
+"""A run whose solver stopped: what is kept, and how to go on with it."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from test_simulate import SMALL, sgns
+
+from mpm_warp import Bed, Effects, Excavation, Plate, Scene, Solver, SolverStopped
+from sgns.continuation import continued
+from sgns.errors import UserError
+from sgns.runs import Run, check_run
+from sgns.runs.stopped import read_state, stopped_path
+from sgns.scene_run import simulate_scene
+
+LAST = 3  # frame before the one in which the solver stops
+
+
+def small(**kw) -> Excavation:
+    return Excavation(
+        bed=Bed(size=(0.4, 0.2, 0.16), spacing=0.04, store_every=3),
+        blade=Plate(length=0.1, width=0.1, thickness=0.08),
+        duration=0.1,
+        **kw,
+    )
+
+
+@pytest.fixture
+def stops(monkeypatch):
+    """Solvers lose a particle after the frame LAST, unless they step at half the usual courant number."""
+    whole = Solver._check
+
+    def check(self, index):
+        if index == LAST + 1 and self.scene.courant > 0.4:
+            raise self._stopped(index, 7, 11, "the test stops it")
+        whole(self, index)
+
+    monkeypatch.setattr(Solver, "_check", check)
+
+
+@pytest.fixture
+def stopped(stops, tmp_path):
+    """A stopped run's file, and the file that it was to become."""
+    output = tmp_path / "run.h5"
+    with pytest.raises(SolverStopped) as caught:
+        simulate_scene(small(), output, effects=Effects())
+    assert f"sgns simulate continue_from={stopped_path(output)} output={output} scene.courant=0.3" in str(
+        caught.value
+    )
+    return stopped_path(output), output
+
+
+def test_the_frames_before_are_kept(stopped):
+    kept, output = stopped
+    assert kept.name == "run.stopped.h5"
+    assert not output.exists()
+    assert [p.name for p in kept.parent.iterdir()] == [kept.name]
+    with Run(kept) as run:
+        assert run.frame_count == LAST + 1
+        assert "particle 11 at (" in run.stopped
+        assert run.positions(0)[0].shape == (len(small().stored), 3)
+    (problem,) = check_run(kept)
+    assert problem.startswith("the run stopped after 4 good frames: particle 11 at (")
+    assert read_state(kept).frame == LAST
+
+
+def test_check_names_it(stopped):
+    done = sgns(stopped[0].parent, "check", ".")
+    assert done.returncode == 2
+    assert "run.stopped.h5: the run stopped after 4 good frames" in done.stdout
+
+
+def test_going_on_with_half_the_step(stopped):
+    kept, output = stopped
+    done = sgns(kept.parent, "simulate", f"continue_from={kept}", "scene.courant=0.3", "output=run.h5")
+    assert done.returncode == 0, done.stderr
+    assert check_run(output) == []
+    assert not kept.exists()  # it has served its purpose
+    reference = list(Solver(small(courant=0.3)).frames())
+    with Run(output) as run:
+        assert run.frame_count == small().frame_count
+        assert run.scene == small().to_dict()
+        assert run.extra["continued"] == [{"frame": LAST, "changed": {"courant": 0.3}}]
+        assert run.stopped is None
+        assert np.abs(run.positions(-1)[0] - reference[-1].position[small().stored]).max() < 1e-3
+
+
+def test_a_run_that_goes_on_unchanged_is_the_undisturbed_one(stopped, monkeypatch, tmp_path):
+    """Bit for bit, as a run file: the same content hash."""
+    kept, _ = stopped
+    monkeypatch.undo()
+    simulate_scene(small(), tmp_path / "whole.h5", effects=Effects())
+    done = sgns(tmp_path, "simulate", f"continue_from={kept}", "output=rest.h5")
+    assert done.returncode == 0, done.stderr
+    with Run(tmp_path / "whole.h5") as one, Run(tmp_path / "rest.h5") as two:
+        assert one.content_hash == two.content_hash
+        assert two.extra["continued"] == [{"frame": LAST, "changed": {}}]
+
+
+def test_it_may_stop_again(stopped, monkeypatch):
+    """Then the frames of both are kept, and the file says so."""
+    kept, output = stopped
+    cfg = OmegaConf.create(
+        {"continue_from": str(kept), "scene": {"courant": 0.3}, "solver": {"precision": "float32"}}
+    )
+    going_on = continued(cfg, ["scene.courant=0.3", f"output={output}"])
+
+    def check(self, index):
+        if index == LAST + 2:
+            raise self._stopped(index, 7, 11, "the test stops it again")
+
+    monkeypatch.setattr(Solver, "_check", check)
+    with pytest.raises(SolverStopped, match=r"stops it again.*scene.courant=0.15 "):
+        simulate_scene(going_on.scene, output, effects=going_on.effects, going_on=going_on)
+    with Run(kept) as run:
+        assert run.frame_count == LAST + 2
+        assert "stops it again" in run.stopped
+        assert run.extra["continued"] == [{"frame": LAST, "changed": {"courant": 0.3}}]
+    assert read_state(kept).frame == LAST + 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["scene.depth=0.03"], "leave out scene.depth"),
+        (["scene=wheel"], "leave out scene"),
+        (["material.youngs_modulus=1e6"], "leave out material.youngs_modulus"),
+        (["scene.courant=2"], "scene.courant is 2"),
+        (["dataset=quick"], "leave out dataset="),
+    ],
+)
+def test_what_may_not_change(stopped, arguments, words):
+    kept, output = stopped
+    done = sgns(kept.parent, "simulate", f"continue_from={kept}", f"output={output}", *arguments)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert words in line
+    assert kept.exists()
+
+
+def test_what_cannot_be_gone_on_with(tmp_path, stopped):
+    kept, _ = stopped
+    assert sgns(tmp_path, "simulate", *SMALL, "output=whole.h5").returncode == 0
+    for name, words in (("whole.h5", "is a whole run"), ("none.h5", "no such run file")):
+        done = sgns(tmp_path, "simulate", f"continue_from={name}")
+        assert done.returncode == 2
+        assert words in done.stderr
+    with h5py.File(kept, "r+") as file:
+        file["state/log_volume"][0] = np.nan
+    done = sgns(tmp_path, "simulate", f"continue_from={kept}")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "log_volume is not finite" in done.stderr
+    with h5py.File(kept, "r+") as file:
+        del file["state/position"]
+        file["state/position"] = "text"
+    with pytest.raises(UserError, match="does not hold numbers"):
+        read_state(kept)
+    with h5py.File(kept, "r+") as file:
+        del file["state"]
+    with pytest.raises(UserError, match="holds no state to go on from"):
+        read_state(kept)
+
+
+def test_a_bed_without_a_body_can_go_on(stops, tmp_path):
+    scene = Scene(bed=Bed(size=(0.2, 0.2, 0.1), spacing=0.04), duration=0.1)
+    with pytest.raises(SolverStopped, match="continue_from="):
+        simulate_scene(scene, tmp_path / "bed.h5", effects=Effects())
+    assert read_state(tmp_path / "bed.stopped.h5").frame == LAST

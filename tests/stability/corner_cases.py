@@ -1,0 +1,168 @@
+"""The corners of the parameter grids, on coarse beds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from case import Case
+from measures import blade_shares, frames_of, shares, top_speed, volume_gain
+
+from mpm_warp import Bed, Effects, Excavation, Material, Plate, Solver, SolverStopped, Wheel
+
+CUT_BED = Bed(spacing=0.02)
+WHEEL_BED = Bed(size=(0.40, 0.19, 0.0583), spacing=0.04 / 3.0, particles_per_cell=4.0, headroom=0.10)
+K0_ANGLE = float(np.degrees(np.arctan(np.sqrt(3.0) * (1.0 - 0.6) / 1.3)))
+"""Friction angle at which soil of Poisson's ratio 0.3 just bears its K0 state [degrees]."""
+
+
+def excavation(depth: float, speed: float, rake: float, motion: str) -> tuple[float, str]:
+    """A run of the paper's campaign on a 2 cm grid."""
+    scene = Excavation(
+        bed=CUT_BED, blade=Plate(thickness=0.04), depth=depth, speed=speed, rake=rake, motion=motion
+    )
+    return blade_shares(scene, frames_of(scene, effects=Effects(symmetry=True)))
+
+
+def wheel(duration: float = 3.0, bed: Bed = WHEEL_BED, **values) -> tuple[float, str]:
+    """A run of the wheel campaign, with 1 s of settling: what must hold of any wheel."""
+    scene = Wheel(**({"bed": bed, "duration": duration, "damping": 5.0, "friction_angle": 37.0} | values))
+    frames = frames_of(scene, effects=Effects(symmetry=True))
+    settled = frames[round(0.5 * scene.frame_rate) :]
+    carried = float(np.mean([f.force[2] for f in settled])) / scene.load
+    sinkage = float(scene.sinkage(np.array([f.body_pose for f in frames])).max())
+    pull = float(np.mean([abs(f.force[0]) for f in settled])) / scene.load
+    fall = np.sqrt(2.0 * scene.gravity * scene.bed.size[2])
+    return shares(
+        {
+            "load not carried": (100.0 * abs(carried - 1.0), 5.0, "%"),
+            "sinkage": (sinkage, scene.bed.size[2], "m"),
+            "horizontal force": (pull, scene.material.limit_friction + scene.friction, "loads"),
+            "speed": (top_speed(frames), 2.0 * scene.rim_speed + fall, "m/s"),
+            "volume gain": (100.0 * volume_gain(scene, frames[-1].position), 3.0, "%"),
+        }
+    )
+
+
+def too_heavy() -> tuple[float, str]:
+    """The 5 cm wheel with the load of the big one: carried, or stopped by a line that says what to do."""
+    try:
+        return wheel(diameter=0.05, load=225.0, gravity=1.62, slip=0.7, width=0.0833)
+    except SolverStopped as stopped:
+        return float("reached the floor" not in str(stopped)), str(stopped)
+
+
+def raised_limit() -> tuple[float, str]:
+    """Soil of 45 degrees (mu_s = 1) with mu_2 = 0.9616: mu_2 is raised, the user told, the wheel runs."""
+    soil = Material(friction_angle=45.0)
+    said = any("the limit is raised to 1.2016" in words for words in soil.warnings())
+    value, note = wheel(friction_angle=45.0, load=100.0, duration=2.0)
+    return (value if said else np.inf), note
+
+
+def light_wheel() -> tuple[float, str]:
+    """A wheel of 10 g, lighter than the soil it touches: the step must shrink, and it must come to rest."""
+    bed = replace(WHEEL_BED, particles_per_cell=1.0)
+    scene = Wheel(
+        bed=bed, load=0.1, diameter=0.05, clearance=0.003, duration=0.7, settle=0.69, damping=5.0, slip=0.0
+    )
+    solver = Solver(scene, Effects(symmetry=True))
+    frames = list(solver.frames())
+    height = np.array([f.body_pose[2] for f in frames])
+    bounce = float(np.ptp(height[round(0.5 * scene.frame_rate) :]))
+    return 1000.0 * bounce, f"{solver.substeps_per_frame} substeps per frame"
+
+
+MUST = "force, speed, leakage and volume stay bounded"
+CARRIED = "the load is carried; sinkage, pull, speed and volume stay bounded"
+
+
+def _cut(depth: float, speed: float, rake: float, motion: str, hard: str) -> Case:
+    name = f"blade {100 * depth:g} cm, {100 * speed:g} cm/s, {rake:g}°, {motion}"
+    measure = partial(excavation, depth, speed, rake, motion)
+    return Case(name, hard, MUST, "largest share of a limit", 1.0, "", measure)
+
+
+def _wheel(name: str, hard: str, **values) -> Case:
+    return Case(name, hard, CARRIED, "largest share of a limit", 1.0, "", partial(wheel, **values))
+
+
+CASES = [
+    _cut(0.10, 0.15, 45.0, "curved", "deepest, fastest, steepest rake"),
+    _cut(0.10, 0.15, 45.0, "ramp", "deepest, fastest, steepest rake, sharp turns"),
+    _cut(0.10, 0.15, 0.0, "curved", "deepest, fastest, upright"),
+    _cut(0.10, 0.01, 45.0, "ramp", "deepest, slowest"),
+    _cut(0.02, 0.15, 45.0, "ramp", "shallower than a cell, fastest"),
+    _cut(0.02, 0.01, 0.0, "curved", "shallower than a cell, slowest"),
+    _wheel(
+        "wheel 5 cm, 70 %, Moon, 25 N",
+        "small wheel, high slip, low gravity, highest load of its size",
+        diameter=0.05,
+        slip=0.7,
+        gravity=1.62,
+        load=25.0,
+        width=0.0833,
+    ),
+    _wheel(
+        "wheel 30 cm, 70 %, Moon, 225 N",
+        "heaviest body in the lowest gravity: 139 kg",
+        diameter=0.30,
+        slip=0.7,
+        gravity=1.62,
+        load=225.0,
+        width=0.125,
+    ),
+    _wheel(
+        "wheel 30 cm, 20 %, Earth, 225 N, 43°",
+        "strongest soil: mu_s just below mu_2",
+        diameter=0.30,
+        slip=0.2,
+        load=225.0,
+        width=0.125,
+        friction_angle=43.0,
+    ),
+    _wheel(
+        "wheel 5 cm, 70 %, Earth, 25 N, 30°",
+        "weakest soil under the highest pressure",
+        diameter=0.05,
+        slip=0.7,
+        load=25.0,
+        width=0.0833,
+        friction_angle=30.0,
+    ),
+    _wheel(
+        "wheel on soil at the K0 limit",
+        f"friction angle {K0_ANGLE:.2f}°: the bed at rest is at yield",
+        load=60.0,
+        friction_angle=K0_ANGLE,
+        duration=2.0,
+    ),
+    Case(
+        name="wheel on soil with mu_s at 1, above mu_2",
+        hard="the rate law has no flow between mu_s and mu_2",
+        must=f"mu_2 is raised with a warning; {CARRIED}",
+        quantity="largest share of a limit",
+        limit=1.0,
+        unit="",
+        measure=raised_limit,
+    ),
+    Case(
+        name="wheel 5 cm, 70 %, Moon, 225 N",
+        hard="far more than the soil can bear",
+        must="carried, or stopped with what to do",
+        quantity="largest share of a limit",
+        limit=1.0,
+        unit="",
+        measure=too_heavy,
+    ),
+    Case(
+        name="wheel of 10 g",
+        hard="a body lighter than the soil it touches",
+        must="comes to rest",
+        quantity="movement after 0.5 s",
+        limit=0.1,
+        unit="mm",
+        measure=light_wheel,
+    ),
+]

@@ -1,0 +1,249 @@
+"""The stress update where its formulas end: no pressure, mu at mu_s and mu_2, grains of no size, inverted particles.
+
+(No `from __future__ import annotations`: Warp reads the types of the kernel.)
+"""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import warp as wp
+from beds import block, cut
+from case import Case
+from measures import frames_of
+
+from mpm_warp import Effects, Material, Solver
+from mpm_warp.constitutive import constitutive
+from mpm_warp.soil import soil_parameters, soil_struct
+from mpm_warp.start import start_warp
+
+SAND = Material()
+LAWS = {
+    "constant friction": (Effects(rate_dependence=False), SAND),
+    "saturating mu(I)": (Effects(), SAND),
+    "linear mu(I)": (Effects(), replace(SAND, rate_law="linear")),
+    "dynamic fluidity": (Effects(fluidity=True), SAND),
+    "dynamic fluidity, linear": (Effects(fluidity=True), replace(SAND, rate_law="linear")),
+    "steady nonlocality": (Effects(nonlocality=True), SAND),
+    "both": (Effects(fluidity=True, nonlocality=True), SAND),
+    "no separation": (Effects(separation=False), SAND),
+}
+"""Every law that a user can choose."""
+DT = 2.0e-4  # [s]
+
+
+def updated(effects: Effects, material: Material, pressure, ratio, a=None, g=1.0, real=wp.float32):
+    """mu, pressure [Pa] and the new fluidity after a step at trial states.
+
+    Args:
+        pressure: [Pa], shape (n,).
+        ratio: shear stress over pressure of the state before, shape (n,).
+        a: dt times the velocity gradient, shape (3, 3).
+        g: fluidity before, or the excess of cooperative flow [1/s].
+    """
+    start_warp()
+    law, Soil = constitutive(real, effects), soil_struct(real, effects.fluidity)
+    vec6, mat33, update, with_g = law.vec6, law.mat33, law.update, effects.fluidity
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def step(
+        e: wp.array(dtype=vec6),
+        j: wp.array(dtype=real),
+        g: wp.array(dtype=real),
+        a: mat33,
+        dt: real,
+        soil: Soil,
+    ):
+        p = wp.tid()
+        state = update(e[p], j[p], a, dt, soil, g[p])
+        e[p] = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
+        j[p] = state[6]
+        if wp.static(with_g):
+            g[p] = state[7]
+
+    pressure, ratio = (np.ravel(v).astype(float) for v in np.broadcast_arrays(pressure, ratio))
+    strain = np.zeros((len(pressure), 6))
+    strain[:, 3] = ratio * pressure / (2.0 * material.shear_modulus)
+    e = wp.array(strain, dtype=vec6, device="cpu")
+    j = wp.array(-pressure / material.bulk_modulus, dtype=real, device="cpu")
+    fluid = wp.array(np.full(len(pressure), g), dtype=real, device="cpu")
+    soil = soil_parameters(real, material, 1.0, effects.fluidity)
+    motion = mat33(*(np.zeros(9) if a is None else np.ravel(a)))
+    wp.launch(step, len(pressure), [e, j, fluid, motion, DT, soil], device="cpu")
+    found, p = e.numpy().astype(float), -material.bulk_modulus * j.numpy().astype(float)
+    size = np.sqrt(np.sum(found[:, :3] ** 2, axis=1) + 2.0 * np.sum(found[:, 3:] ** 2, axis=1))
+    tau = np.sqrt(2.0) * material.shear_modulus * size
+    return tau, p, fluid.numpy().astype(float)
+
+
+def no_pressure(law: str) -> tuple[float, str]:
+    """Largest shear stress over what the law allows, at pressures from 1e-30 Pa up, and in a whole block [-].
+
+    A law without such a bound may have what it had before the step.
+    """
+    effects, material = LAWS[law]
+    pressure, ratio = np.meshgrid(
+        10.0 ** np.arange(-30.0, 3.5, 0.5), [0.0, 1e-6, 0.5, 0.76, 0.9616, 2.0, 100.0]
+    )
+    shear = np.zeros((3, 3))
+    shear[0, 2] = 1e-3
+    worst = 0.0
+    for a in (None, shear):
+        tau, p, g = updated(effects, material, pressure, ratio, a)
+        if not (np.isfinite(tau).all() and np.isfinite(p).all() and np.isfinite(g).all()):
+            return np.nan, "the update at a point is not finite"
+        most = material.limit_friction * np.maximum(p, 0.0)
+        if material.rate_law == "linear":
+            trial = ratio.ravel() * pressure.ravel() + material.shear_modulus * 1e-3 * (a is not None)
+            most = np.maximum(most, 1.001 * trial)
+        # Where stress has no meaning in single precision any more, it must be negligible.
+        worst = max(worst, float(np.max(tau / (most + 1e-6))))
+    scene = block(duration=0.05, frame_rate=20.0, material=material)
+    solver = Solver(scene, effects)
+    turning = np.cross([3.0, -2.0, 5.0], scene.initial_positions() - 0.15)
+    solver._v.assign(turning + 0.2 * np.random.default_rng(0).normal(size=turning.shape))
+    start = solver._v.numpy().astype(float)
+    for _ in solver.frames():
+        pass
+    lost = np.linalg.norm(np.sum(solver._v.numpy() - start, axis=0)) / np.abs(start).sum()
+    return max(
+        worst, float(lost) / 1e-4
+    ), f"shear stress {worst:.3g} of its bound; momentum lost {lost:.2g} (1e-4)"
+
+
+def near(friction: str, laws: tuple[str, ...]) -> tuple[float, str]:
+    """Jump of mu between trial ratios next to each other around mu_s or mu_2, beyond their distance [-].
+
+    The return is a contraction: it never moves two states apart.
+    """
+    offsets = np.concatenate([-np.logspace(-1, -13, 60), [0.0], np.logspace(-13, -1, 60)])
+    worst, where = 0.0, ""
+    for name in laws:
+        effects, material = LAWS[name]
+        centre = getattr(material, f"{friction}_friction")
+        for pressure in (1.0, 1e3, 1e5):
+            for g in (0.0, 1e-6, 1.0, 1e4):
+                tau, p, after = updated(effects, material, pressure, centre + offsets, g=g, real=wp.float64)
+                mu = tau / p
+                if not (np.isfinite(mu).all() and np.isfinite(after).all()):
+                    return np.nan, f"{name} at {pressure:g} Pa, g {g:g} 1/s is not finite"
+                jump = np.abs(np.diff(mu)) - np.diff(offsets)
+                found = max(float(jump.max()), float(mu.max() - material.limit_friction))
+                if found > worst:
+                    worst, where = found, f"{name} at {pressure:g} Pa, g {g:g} 1/s"
+    return worst, where
+
+
+def tiny_grains(effects: Effects) -> float:
+    """Change of a cut's force between grains of 1 nm and constant friction mu_s [%].
+
+    The fluidity's own dynamics, which have nothing to do with d, are as good as at once.
+    """
+    force = []
+    for chosen, material in (
+        (effects, replace(SAND, grain_diameter=1e-9, fluidity_time=1e-8)),
+        (Effects(rate_dependence=False), SAND),
+    ):
+        frames = frames_of(cut(material=material), effects=chosen)
+        force.append(np.mean([f.force for f in frames[6:]], axis=0))
+    return 100.0 * float(np.linalg.norm(force[0] - force[1]) / np.linalg.norm(force[1]))
+
+
+def huge_grains() -> tuple[float, str]:
+    """Share by which the force of a cut through grains of 10 m exceeds that with constant friction mu_2 [%]."""
+    force = []
+    for effects, material in (
+        (Effects(), replace(SAND, grain_diameter=10.0)),
+        (
+            Effects(rate_dependence=False),
+            replace(SAND, static_friction=SAND.limit_friction, limit_friction=1.2),
+        ),
+    ):
+        frames = frames_of(cut(material=material), effects=effects)
+        force.append(float(np.linalg.norm(np.mean([f.force for f in frames[6:]], axis=0))))
+    return max(0.0, 100.0 * (force[0] / force[1] - 1.0)), f"{force[0]:.4g} N, {force[1]:.4g} N"
+
+
+def inverted() -> tuple[float, str]:
+    """Shear stress over its bound after steps that turn a particle inside out, or stretch it by e^8 [-]."""
+    worst = 0.0
+    for a in (
+        -2.5 * np.eye(3),
+        np.diag([-3.0, 0.0, 0.0]),
+        np.diag([-1.0, 0.0, 0.0]),
+        np.full((3, 3), 50.0),
+        3e3 * np.eye(3),
+    ):
+        tau, p, _ = updated(Effects(), SAND, np.logspace(-3, 5, 9), 0.5, a)
+        if not (np.isfinite(tau).all() and np.isfinite(p).all()):
+            return np.nan, f"not finite after {a.tolist()}"
+        worst = max(worst, float(np.max(tau / (SAND.limit_friction * np.maximum(p, 0.0) + 1e-6))))
+    return worst, ""
+
+
+CASES = [
+    *(
+        Case(
+            name=f"no pressure: {law}",
+            hard="p down to 1e-30 Pa and a block that flies apart: square roots and quotients of p",
+            must="finite, shear stress within the cone, momentum conserved",
+            quantity="largest share of a bound",
+            limit=1.01,
+            unit="",
+            measure=partial(no_pressure, law),
+            quick=law == "saturating mu(I)",
+        )
+        for law in LAWS
+    ),
+    *(
+        Case(
+            name=f"mu at mu_{'s' if friction == 'static' else '2'}{which}",
+            hard=f"the rate is zero or infinite there; xi has a pole{seed}",
+            must="mu does not jump and stays below mu_2",
+            quantity="jump of mu beyond that of the trial",
+            limit=limit,
+            unit="",
+            measure=partial(near, friction, laws),
+        )
+        for friction in ("static", "limit")
+        for which, laws, limit, seed in (
+            ("", ("saturating mu(I)", "steady nonlocality"), 1e-6, ""),
+            (", dynamic fluidity", ("dynamic fluidity",), 0.01, "; beyond mu_s the fluidity is seeded"),
+        )
+    ),
+    *(
+        Case(
+            name=f"grains of 1 nm, {name}",
+            hard="d -> 0: rates of 1e15 1/s in the formulas",
+            must="the force of constant friction",
+            quantity="change of the force",
+            limit=1.0,
+            unit="%",
+            measure=partial(tiny_grains, effects),
+        )
+        for name, effects in (
+            ("mu(I)", Effects()),
+            ("dynamic fluidity", Effects(fluidity=True)),
+            ("steady nonlocality", Effects(nonlocality=True)),
+        )
+    ),
+    Case(
+        name="grains of 10 m",
+        hard="I far beyond I_0",
+        must="no more force than with friction mu_2",
+        quantity="force beyond it",
+        limit=2.0,
+        unit="%",
+        measure=huge_grains,
+    ),
+    Case(
+        name="particles turned inside out",
+        hard="the log of a negative number",
+        must="finite, shear stress within the cone",
+        quantity="shear stress over its bound",
+        limit=1.01,
+        unit="",
+        measure=inverted,
+        quick=True,
+    ),
+]

@@ -1,0 +1,458 @@
+"""Thin, loose, thrown, shaken and squeezed soil."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from beds import BlockBed, block, cut
+from case import Case
+from measures import (
+    energies,
+    frames_of,
+    shares,
+    stopped_with,
+    top_speed,
+    volume_gain,
+    work_on_soil,
+)
+
+from mpm_warp import Bed, Box, Column, Effects, Excavation, Incline, Push, Scene, Solver, Walls
+from mpm_warp.diagnostics import leakage
+
+
+@dataclass(frozen=True)
+class OneLayer(Bed):
+    """Only the particles of the lowest layer."""
+
+    @property
+    def filled(self):
+        positions, volume = Bed.filled.func(self)
+        return positions[positions[:, 2] < positions[:, 2].min() + 1e-6], volume
+
+
+@dataclass(frozen=True)
+class Grains(Bed):
+    """Single particles, four cells from each other, in the air."""
+
+    @property
+    def filled(self):
+        h = self.spacing
+        axes = [np.arange(4.0 * h, s - 4.0 * h, 4.3 * h) for s in self.size[:2]]
+        heights = np.arange(2.0 * h, self.headroom - 6.0 * h, 4.3 * h)
+        places = np.stack(np.meshgrid(*axes, heights, indexing="ij"), axis=-1).reshape(-1, 3)
+        return places, Bed.filled.func(self)[1]
+
+
+@dataclass(frozen=True)
+class Thrown(Scene):
+    """Soil that starts with velocities."""
+
+    kind: str = "thrown"
+    upwards: float = 0.0
+    """[m/s]"""
+    spread: float = 0.0
+    """Largest component of a random velocity besides [m/s]."""
+
+    def initial_velocities(self) -> np.ndarray:
+        random = np.random.default_rng(0).uniform(-1.0, 1.0, self.filled[0].shape)
+        return self.spread * random + [0.0, 0.0, self.upwards]
+
+
+@dataclass(frozen=True)
+class Shifted(Bed):
+    """A lattice whose particles lie on the grid's nodes, walls, floor, edges and corners of the bin included."""
+
+    @property
+    def filled(self):
+        axes = [np.arange(round(s / self.spacing) + 1) * self.spacing for s in self.size]
+        axes[2] = axes[2] - self.size[2]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), self.spacing**3
+
+
+def rest(bed: Bed, duration: float = 1.0) -> float:
+    """Largest displacement of a bed left alone [mm]."""
+    scene = Scene(bed=bed, duration=duration)
+    last = frames_of(scene, every=10**6)[-1]
+    return 1000.0 * float(np.abs(last.position - scene.initial_positions()).max())
+
+
+def one_layer_at_rest() -> float:
+    return rest(OneLayer(size=(0.2, 0.2, 0.08), spacing=0.02, initial_stress="none"))
+
+
+def one_layer_scraped() -> tuple[float, str]:
+    """A blade scrapes the only layer off the floor."""
+    bed = OneLayer(size=(0.48, 0.4, 0.08), spacing=0.02, headroom=0.2, initial_stress="none")
+    scene = cut(bed=bed, motion="path", path=along(0.104, 0.304, 0.1, 0.021, 1.0), duration=1.0)
+    frames = frames_of(scene)
+    return shares(
+        {
+            "leakage": (100.0 * leakage(frames, scene.body), 1.0, "%"),
+            "speed": (top_speed(frames), 2.0, "m/s"),
+            "force": (max(float(np.linalg.norm(f.force)) for f in frames), 200.0, "N"),
+        }
+    )
+
+
+def along(x0: float, x1: float, start: float, z: float, end: float, y: float = 0.2):
+    """A path at rest until `start`, then along x at one height."""
+    rows = [(0.0, x0), (start, x0), (end, x1)]
+    return tuple((t, x, y, z, 0.0, 0.0, 0.0, 1.0) for t, x in rows)
+
+
+def flight() -> float:
+    """Error of single grains' paths against the parabola (of the scheme's own steps) [mm]."""
+    bed = Grains(size=(0.4, 0.4, 0.1), spacing=0.01, headroom=0.4, initial_stress="none")
+    scene = Thrown(bed=bed, upwards=0.5, spread=0.02, duration=0.1, frame_rate=20.0)
+    solver = Solver(scene)
+    *_, last = solver.frames()
+    count = (scene.frame_count - 1) * solver.substeps_per_frame
+    fall = 0.5 * scene.gravity * solver.time_step**2 * count * (count + 1)
+    exact = scene.initial_positions() + scene.duration * scene.initial_velocities() - [0.0, 0.0, fall]
+    return 1000.0 * float(np.abs(last.position - exact).max())
+
+
+def thrown_and_settled() -> tuple[float, str]:
+    """A whole bed is thrown 5 cm up, comes apart in the air and falls back."""
+    bed = Bed(
+        size=(0.32, 0.32, 0.16),
+        spacing=0.02,
+        headroom=0.24,
+        initial_stress="none",
+        walls=Walls("slip", "slip"),
+    )
+    scene = Thrown(bed=bed, upwards=1.0, spread=0.5, duration=2.0)
+    last = frames_of(scene, every=10**6)[-1]
+    gain = 100.0 * volume_gain(scene, last.position)
+    return abs(gain), f"{gain:+.2f} %"
+
+
+def grains_and_settled() -> tuple[float, str]:
+    """A rain of single grains becomes a layer: no block of it may be emptier or fuller than soil is."""
+    bed = Rain(
+        size=(0.16, 0.16, 0.08),
+        spacing=0.02,
+        headroom=1.3,
+        initial_stress="none",
+        walls=Walls("slip", "slip"),
+    )
+    scene = Thrown(bed=bed, spread=0.3, duration=2.0)
+    last = frames_of(scene, every=10**6)[-1]
+    layer = np.sort(last.position[:, 2] + bed.size[2])
+    # All of them together fill the bin to its surface; half of them lie below half of the height.
+    gain = 100.0 * (float(np.median(layer)) / (0.5 * bed.size[2]) - 1.0)
+    return abs(gain), f"median height {gain:+.2f} % off that of the full bed"
+
+
+@dataclass(frozen=True)
+class Rain(Bed):
+    """The full bed's particles, drawn apart upwards by a factor of twelve."""
+
+    @property
+    def filled(self):
+        positions, volume = Bed.filled.func(self)
+        raised = np.add(positions, [0.0, 0.0, self.size[2]])
+        return raised * [1.0, 1.0, 12.0], volume
+
+
+def dropped_block(speed: float) -> tuple[float, str]:
+    """A block hits the floor at `speed`: energy that appears, over what there was [%]."""
+    bed = BlockBed(
+        size=(0.3, 0.3, 0.3),
+        spacing=0.01,
+        initial_stress="none",
+        headroom=0.2,
+        low=(0.1, 0.1, -0.28),
+        high=(0.2, 0.2, -0.18),
+    )
+    scene = Thrown(bed=bed, upwards=-speed, duration=0.2, frame_rate=400.0)
+    energy = energies(scene, frames_of(scene))
+    return 100.0 * max(
+        0.0, float(energy.max() / energy[0] - 1.0)
+    ), f"at the end {100 * energy[-1] / energy[0]:.0f} %"
+
+
+def impact(speed: float) -> tuple[float, str]:
+    """A box hits the bed at `speed` and stops 3 cm deep: energy of the soil over the work done on it [-]."""
+    bed = Bed(size=(0.4, 0.4, 0.16), spacing=0.02, headroom=1.0)
+    start, stop = 0.03 + 0.02, 0.03 - 0.03
+    end = (start - stop) / speed
+    rows = ((0.0, start), (end, stop), (0.2, stop))
+    path = tuple((t, 0.2, 0.2, z, 0.0, 0.0, 0.0, 1.0) for t, z in rows)
+    scene = Push(bed=bed, tool=Box(size=(0.1, 0.1, 0.06)), path=path, duration=0.1, frame_rate=1000.0)
+    frames = frames_of(scene)
+    gained, work = energies(scene, frames) - energies(scene, frames)[0], work_on_soil(frames)
+    moving = slice(round(end * 1000.0), None)
+    ratio = float(np.max(gained[moving] / work[moving]))
+    peak = max(float(np.linalg.norm(f.force)) for f in frames)
+    return ratio, f"work {work[-1]:.3g} J, peak force {peak:.3g} N, top speed {top_speed(frames):.3g} m/s"
+
+
+def push_without_gravity() -> tuple[float, str]:
+    """A plate hits a free block: momentum that appears or is lost, over what was given [-]."""
+    free = block()
+    path = ((0.0, 0.08, 0.15, -0.15, 0, 0, 0, 1), (1.0, 1.08, 0.15, -0.15, 0, 0, 0, 1))
+    scene = cut(bed=free.bed, gravity=0.0, motion="path", path=path, duration=0.05, frame_rate=200.0)
+    solver = Solver(scene)
+    impulse = sum(f.force for f in solver.frames()) / scene.frame_rate
+    gained = solver._grid.particle_mass * solver._v.numpy().astype(float).sum(axis=0)
+    return float(np.linalg.norm(impulse + gained) / np.linalg.norm(gained)), f"{gained[0]:.3g} N s given"
+
+
+def free_block_in_nothing() -> float:
+    """Drift of a block of soil that nothing acts on, after 0.5 s [mm]."""
+    scene = block(gravity=0.0, duration=0.5, frame_rate=20.0)
+    *_, last = Solver(scene).frames()
+    return 1000.0 * float(np.abs(last.position - scene.initial_positions()).max())
+
+
+def on_nodes() -> tuple[float, str]:
+    """Particles on every node of the bin, its walls, edges and corners, let go."""
+    bed = Shifted(size=(0.2, 0.2, 0.1), spacing=0.02, initial_stress="none")
+    scene = Scene(bed=bed, duration=1.0)
+    frames = frames_of(scene, every=10)
+    outside = max(float(np.max(np.maximum(-f.position, f.position - [0.2, 0.2, 1.0])[:, :2])) for f in frames)
+    below = max(float(np.max(-0.1 - f.position[:, 2])) for f in frames)
+    moved = float(np.abs(frames[-1].position - scene.initial_positions()).max())
+    return shares(
+        {
+            "displacement": (1000.0 * moved, 2.0, "mm"),
+            "beyond walls and floor": (1000.0 * max(outside, below), 1.0, "mm"),
+            "speed at the end": (top_speed(frames[-1:]), 0.01, "m/s"),
+        }
+    )
+
+
+def against_the_wall() -> tuple[float, str]:
+    """A plate as wide as the bin pushes its soil against the end wall, down to two cells from it."""
+    bed = Bed(size=(0.32, 0.16, 0.12), spacing=0.02, headroom=0.6)
+    path = along(0.06, 0.25, 0.05, 0.0, 1.0, y=0.08)
+    tool = Box(size=(0.06, 0.158, 0.22))
+    scene = Push(bed=bed, tool=tool, path=path, duration=1.2, frame_rate=100.0)
+    frames = frames_of(scene)
+    beyond = max(float(np.max(f.position[:, 0] - 0.32)) for f in frames)
+    # What soil under the peak pressure has as its speed when the pressure is let go, 2 sigma / (rho c), and never more
+    # than half the speed of its waves.
+    wave = scene.material.wave_speed
+    pressure = max(float(np.linalg.norm(f.force)) for f in frames) / (0.158 * 0.12)
+    release = min(2.0 * pressure / (scene.material.bulk_density * wave), 0.5 * wave)
+    return shares(
+        {
+            "beyond the wall": (1000.0 * max(beyond, 0.0), 1.0, "mm"),
+            "speed": (top_speed(frames), 0.2 + release, "m/s"),
+            "leakage": (100.0 * leakage(frames, scene.body, edge=0.02), 5.0, "%"),
+        }
+    )
+
+
+def walls_hold(kind: str | float) -> float:
+    """How far soil that falls and spreads at 2 m/s gets beyond walls and floor [mm]."""
+    walls = Walls(kind, kind, kind)
+    bed = Bed(size=(0.2, 0.2, 0.1), spacing=0.02, headroom=0.5, initial_stress="none", walls=walls)
+    scene = Thrown(bed=bed, spread=2.0, duration=0.5)
+    frames = frames_of(scene)
+    sides = max(float(np.max(np.maximum(-f.position, f.position - 0.2)[:, :2])) for f in frames)
+    floor = max(float(np.max(-0.1 - f.position[:, 2])) for f in frames)
+    return 1000.0 * max(sides, floor, 0.0)
+
+
+def column_falls() -> tuple[float, str]:
+    """A column eight times as high as wide: energy that appears [%]."""
+    bed = Bed(size=(0.8, 0.12, 0.32), spacing=0.02, headroom=0.05, walls=Walls(y="slip"))
+    scene = Column(bed=bed, radius=0.04, shape="slab", duration=0.8)
+    energy = energies(scene, frames_of(scene))
+    return 100.0 * max(
+        0.0, float(energy.max() / energy[0] - 1.0)
+    ), f"at the end {100 * energy[-1] / energy[0]:.0f} %"
+
+
+def steep_slope() -> tuple[float, str]:
+    """A layer on an endless slope of 60 degrees slides off as a block: error of its speed after 0.5 s [%].
+
+    Its base cannot hold it: friction there is at most mu_2, at least mu_s.
+    """
+    bed = Bed(size=(0.08, 0.08, 0.08), spacing=0.02, headroom=0.08, walls=Walls("periodic", "periodic"))
+    scene = Incline(bed=bed, flowing=False, tilt=60.0, duration=0.5, gravity=9.81)
+    last = frames_of(scene, every=10**6)[-1]
+    speed = float(last.velocity[:, 0].mean())
+    low, high = (
+        scene.gravity * scene.duration * (np.sin(np.radians(60.0)) - mu * np.cos(np.radians(60.0)))
+        for mu in (scene.material.limit_friction, scene.material.static_friction)
+    )
+    off = max(0.0, low - speed, speed - high)
+    return 100.0 * off / high, f"{speed:.3g} m/s, between {low:.3g} and {high:.3g} m/s by theory"
+
+
+def volume_after_a_deep_cut() -> tuple[float, str]:
+    """Volume change of the settled soil after the deepest, fastest cut of the campaign, in either direction [%]."""
+    scene = Excavation(bed=Bed(spacing=0.02), depth=0.10, speed=0.15, rake=0.0, motion="curved", duration=4.0)
+    last = frames_of(scene, every=10**6, effects=Effects(symmetry=True))[-1]
+    change = 100.0 * volume_gain(scene, last.position)
+    return abs(change), f"{change:+.2f} %"
+
+
+def out_of_the_grid() -> tuple[float, str]:
+    """Soil is thrown higher than the grid reaches."""
+    scene = Thrown(bed=replace(block().bed, headroom=0.05), upwards=3.0, duration=0.3)
+    return stopped_with(scene, "raise scene.bed.headroom")
+
+
+CASES = [
+    Case(
+        name="one layer of particles at rest",
+        hard="nothing above, nothing beside: the grid hardly sees it",
+        must="stays where it is",
+        quantity="largest displacement in 1 s",
+        limit=1.0,
+        unit="mm",
+        measure=one_layer_at_rest,
+        quick=True,
+    ),
+    Case(
+        name="one layer of particles scraped off",
+        hard="single particles between blade and floor",
+        must="force, speed and leakage stay bounded",
+        quantity="largest share of a limit",
+        limit=1.0,
+        unit="",
+        measure=one_layer_scraped,
+    ),
+    Case(
+        name="single grains in flight",
+        hard="particles without neighbours",
+        must="each flies its parabola",
+        quantity="largest error after 0.1 s",
+        limit=0.01,
+        unit="mm",
+        measure=flight,
+        quick=True,
+    ),
+    Case(
+        name="bed thrown up and settled",
+        hard="soil comes apart and must become dense again",
+        must="settled soil has its volume back, in either direction",
+        quantity="volume change",
+        limit=3.0,
+        unit="%",
+        measure=thrown_and_settled,
+    ),
+    Case(
+        name="rain of grains becomes a layer",
+        hard="every particle was alone: nothing remembers the density but itself",
+        must="the layer is as high as the full bed",
+        quantity="change of the median height",
+        limit=3.0,
+        unit="%",
+        measure=grains_and_settled,
+    ),
+    Case(
+        name="block hits the floor at 5 m/s",
+        hard="a shock of a sixth of the wave speed",
+        must="no energy appears",
+        quantity="energy above that at the start",
+        limit=1.0,
+        unit="%",
+        measure=lambda: dropped_block(5.0),
+        quick=True,
+    ),
+    Case(
+        name="tool hits the bed at 5 m/s",
+        hard="stopped 3 cm deep within a millimetre per substep",
+        must="the soil gains no more energy than the tool gives",
+        quantity="energy gained over work done",
+        limit=1.0,
+        unit="",
+        measure=lambda: impact(5.0),
+        quick=True,
+    ),
+    Case(
+        name="zero gravity, nothing touches",
+        hard="every stress and every velocity is exactly zero",
+        must="soil that nothing acts on stays where it is",
+        quantity="largest displacement after 0.5 s",
+        limit=1e-3,
+        unit="mm",
+        measure=free_block_in_nothing,
+        quick=True,
+    ),
+    Case(
+        name="zero gravity, a plate pushes",
+        hard="soil flies apart at zero pressure",
+        must="momentum of soil and body together is conserved",
+        quantity="momentum that appears or is lost, over what was given",
+        limit=1e-3,
+        unit="",
+        measure=push_without_gravity,
+        quick=True,
+    ),
+    Case(
+        name="particles on every node, walls and corners included",
+        hard="weights at their kinks; half the wall particles' support is beyond the wall",
+        must="stays in the bin and comes to rest",
+        quantity="largest share of a limit",
+        limit=1.0,
+        unit="",
+        measure=on_nodes,
+        quick=True,
+    ),
+    Case(
+        name="soil pushed against a wall",
+        hard="soil between plate and wall has nowhere to go but up",
+        must="wall and plate hold, speeds stay bounded",
+        quantity="largest share of a limit",
+        limit=1.0,
+        unit="",
+        measure=against_the_wall,
+    ),
+    *(
+        Case(
+            name=f"soil thrown against walls ({kind})",
+            hard="2 m/s into walls and floor",
+            must="walls and floor hold",
+            quantity="way beyond them",
+            limit=1.0,
+            unit="mm",
+            measure=partial(walls_hold, kind),
+        )
+        for kind in ("no_slip", "slip", 0.3)
+    ),
+    Case(
+        name="column four times as high as wide",
+        hard="collapse from rest into free fall",
+        must="no energy appears",
+        quantity="energy above that at the start",
+        limit=1.0,
+        unit="%",
+        measure=column_falls,
+    ),
+    Case(
+        name="endless slope of 60 degrees",
+        hard="beyond mu_2: no steady flow exists",
+        must="accelerates as friction between mu_s and mu_2 lets it",
+        quantity="speed outside of that range",
+        limit=2.0,
+        unit="%",
+        measure=steep_slope,
+    ),
+    Case(
+        name="volume after the deepest, fastest cut",
+        hard="soil falls apart behind the blade and is heaped up in front of it",
+        must="settled soil has its volume back, in either direction",
+        quantity="volume change",
+        limit=3.0,
+        unit="%",
+        measure=volume_after_a_deep_cut,
+    ),
+    Case(
+        name="soil thrown out of the grid",
+        hard="no grid node is there to carry it",
+        must="stops and says what to change",
+        quantity="runs not stopped",
+        limit=0.0,
+        unit="",
+        measure=out_of_the_grid,
+        quick=True,
+    ),
+]

@@ -1,0 +1,230 @@
+"""Steps near their limit, soft and stiff soil, precision, very many steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+from beds import cut
+from case import Case
+from measures import blade_shares, frames_of, refused, stopped_with
+
+from mpm_warp import Bed, Effects, Material, Scene, Solver, Walls
+from mpm_warp.scene import MOST_COURANT
+
+ELASTIC = Effects(yielding=False, rate_dependence=False)
+
+
+@cache
+def mean_force(share: float, **changes) -> np.ndarray:
+    """Of the second half of a short cut at a share of the longest step [N]."""
+    frames = frames_of(cut(courant=share * MOST_COURANT, **changes))
+    return np.mean([f.force for f in frames[len(frames) // 2 :]], axis=0)
+
+
+def step_error(share: float) -> float:
+    """Change of the force against a tenth of the longest step [%]."""
+    exact = mean_force(0.1)
+    return 100.0 * float(np.linalg.norm(mean_force(share) - exact) / np.linalg.norm(exact))
+
+
+def settling_error(youngs_modulus: float) -> tuple[float, str]:
+    """Of the sinking of a confined elastic column under its own weight, however large its strains [%].
+
+    With the log law the column at rest has M ln J / J = -rho g s at a weight of s above, M the confined modulus.
+    """
+    height, material = 0.16, Material(youngs_modulus=youngs_modulus)
+    bed = Bed(
+        size=(0.04, 0.04, height),
+        spacing=0.01,
+        initial_stress="none",
+        headroom=0.02,
+        walls=Walls("slip", "slip", "slip"),
+    )
+    period = 4.0 * height / material.wave_speed
+    scene = Scene(bed=bed, material=material, duration=6.0 * period, frame_rate=40.0 / period, courant=0.4)
+    start = scene.initial_positions()[:, 2]
+    top = start > start.max() - 1e-6
+    frames = frames_of(scene, effects=ELASTIC)
+    depth = start.max() - np.linspace(-height, start.max(), 400)
+    load = material.bulk_density * scene.gravity * (depth - start.max())
+    modulus, ln_j = material.wave_speed**2 * material.bulk_density, np.zeros_like(load)
+    for _ in range(60):  # ln J = -(load / M) J by fixed point; the load is at most a fifth of M
+        ln_j = -(load / modulus) * np.exp(ln_j)
+    step = depth[0] - depth[1]
+    exact = float(np.sum(0.5 * (1.0 - np.exp(ln_j[1:]) + 1.0 - np.exp(ln_j[:-1]))) * step)
+    sink = float(np.mean([np.mean(start[top] - f.position[top, 2]) for f in frames[len(frames) // 6 :]]))
+    return 100.0 * abs(sink / exact - 1.0), f"sinks {1e3 * sink:.4g} mm, exact {1e3 * exact:.4g} mm"
+
+
+def soft_or_stiff_cut(youngs_modulus: float) -> tuple[float, str]:
+    """A cut, 6 cm deep, in soil of any stiffness."""
+    scene = cut(material=Material(youngs_modulus=youngs_modulus))
+    return blade_shares(scene, frames_of(scene))
+
+
+def precision_gap(quantity: str) -> float:
+    """Between float32 and float64 after a cut of 0.2 s."""
+    one, two = (frames_of(cut(), precision=p) for p in ("float32", "float64"))
+    if quantity == "force":
+        a, b = (np.mean([f.force for f in frames[6:]], axis=0) for frames in (one, two))
+        return 100.0 * float(np.linalg.norm(a - b) / np.linalg.norm(b))
+    return 1000.0 * float(np.abs(one[-1].position - two[-1].position).max())
+
+
+def creep_in_float32() -> float:
+    """Displacement of a resting bed in 20 s [mm]; single steps move soil by less than float32 can add to a position."""
+    scene = replace(cut(), bed=replace(cut().bed, spacing=0.04), motion="rest", clearance=0.05, duration=20.0)
+    scene = replace(scene, blade=replace(scene.blade, thickness=0.09))
+    last = frames_of(scene, every=10**6)[-1]
+    return 1000.0 * float(np.abs(last.position - scene.initial_positions()).max())
+
+
+def a_million_steps() -> tuple[float, str]:
+    """Displacement of a tiny bed at rest after 10^6 substeps [mm]."""
+    bed = Bed(size=(0.08, 0.08, 0.06), spacing=0.02, headroom=0.02)
+    scene = Scene(bed=bed, duration=1.0, frame_rate=1.0)
+    substeps = Solver(scene).substeps_per_frame
+    scene = replace(scene, duration=float(-(-1_000_000 // substeps)))
+    last = frames_of(scene, every=10**6)[-1]
+    moved = 1000.0 * float(np.abs(last.position - scene.initial_positions()).max())
+    return moved, f"{(scene.frame_count - 1) * substeps} substeps, {scene.duration:g} s"
+
+
+def twice(effects: Effects) -> float:
+    """Numbers that differ between two computations of the same random bed."""
+    bed = replace(cut().bed, arrangement="jittered", seed=3)
+    one, two = (frames_of(cut(bed=bed, duration=0.1), effects=effects) for _ in range(2))
+    return float(
+        sum(
+            np.sum(a.position != b.position) + np.sum(a.force != b.force)
+            for a, b in zip(one, two, strict=True)
+        )
+    )
+
+
+def compressed_beyond_the_step() -> tuple[float, str]:
+    """Soil at E = 10 kPa is compressed by a quarter, where the longest step is too long. (Frames are long, so that the
+    step is not much shortened to fit into one.)"""
+    scene = cut(material=Material(youngs_modulus=1e4), courant=MOST_COURANT, motion="rest", clearance=0.05)
+    return stopped_with(replace(scene, frame_rate=5.0, duration=0.4), "waves are too fast for steps")
+
+
+CASES = [
+    *(
+        Case(
+            name=f"step at {share:g} of its limit",
+            hard="a shallow limit between right and silently wrong",
+            must="the force does not depend on the step",
+            quantity="change of the force against a tenth of the limit",
+            limit=3.0,
+            unit="%",
+            measure=partial(step_error, share),
+            quick=share == 1.0,
+        )
+        for share in (0.2, 0.5, 0.9, 1.0)
+    ),
+    Case(
+        name="step at 1.05 of its limit",
+        hard="beyond the limit forces shrink and nothing looks wrong",
+        must="refused with the allowed range",
+        quantity="scenes accepted",
+        limit=0.0,
+        unit="",
+        measure=partial(
+            refused, lambda: cut(courant=1.05 * MOST_COURANT), f"allowed: above 0, at most {MOST_COURANT}"
+        ),
+        quick=True,
+    ),
+    Case(
+        name="soil stiffens beyond its step",
+        hard="soft soil compresses under its own weight, and its waves become faster than the step allows",
+        must="stops and says so",
+        quantity="runs not stopped",
+        limit=0.0,
+        unit="",
+        measure=compressed_beyond_the_step,
+        quick=True,
+    ),
+    *(
+        Case(
+            name=f"E = {modulus:.0e} Pa, column settles",
+            hard="strains from a fifth (soft) to 2e-5 (stiff): each range of the elastic update, and float32",
+            must="sinks as far as the log law says",
+            quantity="error of the sinking",
+            limit=6.0,
+            unit="%",
+            measure=partial(settling_error, modulus),
+        )
+        for modulus in (1e4, 1e5, 1e6, 1e7, 1e8)
+    ),
+    *(
+        Case(
+            name=f"E = {modulus:.0e} Pa, cut",
+            hard="a blade in soil far softer or stiffer than any sand",
+            must="force, speed, leakage and volume stay bounded",
+            quantity="largest share of a limit",
+            limit=1.0,
+            unit="",
+            measure=partial(soft_or_stiff_cut, modulus),
+        )
+        for modulus in (1e4, 1e8)
+    ),
+    Case(
+        name="float32 against float64, force",
+        hard="static strains of 1e-4 in single precision",
+        must="the force is that of double precision",
+        quantity="difference of the mean force",
+        limit=1.0,
+        unit="%",
+        measure=partial(precision_gap, "force"),
+        quick=True,
+    ),
+    Case(
+        name="float32 against float64, positions",
+        hard="rounding at every step",
+        must="particles are where double precision has them",
+        quantity="largest difference after 0.2 s",
+        limit=0.1,
+        unit="mm",
+        measure=partial(precision_gap, "position"),
+    ),
+    Case(
+        name="bed at rest for 20 s in float32",
+        hard="velocities of rounding errors only",
+        must="soil at rest stays at rest",
+        quantity="largest displacement",
+        limit=0.2,
+        unit="mm",
+        measure=creep_in_float32,
+    ),
+    Case(
+        name="a million substeps",
+        hard="rounding and drift add up",
+        must="a bed at rest stays where it is",
+        quantity="largest displacement",
+        limit=0.2,
+        unit="mm",
+        measure=a_million_steps,
+    ),
+    Case(
+        name="same seed twice",
+        hard="a random bed",
+        must="bit-equal on the CPU",
+        quantity="numbers that differ",
+        limit=0.0,
+        unit="",
+        measure=partial(twice, Effects()),
+        quick=True,
+    ),
+    Case(
+        name="same seed twice, steady nonlocality",
+        hard="iterations that go on from the last step",
+        must="bit-equal on the CPU",
+        quantity="numbers that differ",
+        limit=0.0,
+        unit="",
+        measure=partial(twice, Effects(nonlocality=True)),
+    ),
+]

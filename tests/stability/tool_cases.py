@@ -1,0 +1,269 @@
+"""Tools that jump, turn back, shake, spin, leave and come back; thin ones and odd meshes."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from beds import cut
+from case import Case
+from measures import blade_shares, frames_of, refused, shares, stopped_with, top_speed, volume_gain
+from meshes import box_corners, box_triangles, write_obj
+
+from mpm_warp import Effects, Excavation, MeshBody, Plate, Push, Solver
+from mpm_warp.diagnostics import leakage
+
+IN_SOIL = 0.06
+"""Height of the centre of the plate of `cut` when its tip is 4 cm deep [m]."""
+ABOVE = 0.11
+"""Likewise above the surface."""
+
+
+def driven(rows, duration: float, frame_rate: float = 60.0, **changes) -> Excavation:
+    """A plate that follows rows t, x, z."""
+    path = tuple((t, x, 0.2, z, 0.0, 0.0, 0.0, 1.0) for t, x, z in rows)
+    return cut(motion="path", path=path, duration=duration, frame_rate=frame_rate, **changes)
+
+
+def down(x: float = 0.104):
+    """The first rows of a path: down to `IN_SOIL` within 0.2 s."""
+    return [(0.0, x, ABOVE), (0.2, x, IN_SOIL)]
+
+
+def jumps_between_frames() -> tuple[float, str]:
+    """The plate is 10 cm further on a frame later; between them it moves at 6 m/s. Soil flies for up to 1.4 s."""
+    scene = driven([*down(), (0.4, 0.104, IN_SOIL), (0.4 + 1 / 60, 0.204, IN_SOIL)], 2.2)
+    scene = replace(scene, bed=replace(scene.bed, headroom=2.0))
+    frames = frames_of(scene)
+    return shares(
+        {
+            "speed": (top_speed(frames), 12.0 + 2.0, "m/s"),
+            "leakage": (100.0 * leakage(frames, scene.body), 1.0, "%"),
+            "volume gain": (100.0 * volume_gain(scene, frames[-1].position), 3.0, "%"),
+            "speed at the end": (top_speed(frames[-1:]), 0.3, "m/s"),
+        }
+    )
+
+
+def jumps_within_a_substep() -> tuple[float, str]:
+    rows = [*down(), (0.3, 0.104, IN_SOIL), (0.3001, 0.204, IN_SOIL)]
+    return stopped_with(driven(rows, 0.5), "the body jumps by")
+
+
+def appears_in_soil() -> tuple[float, str]:
+    """The plate is in the soil from the start; what is in its way is pushed out at once."""
+    scene = driven([(0.0, 0.2, IN_SOIL)], 1.0)
+    scene = replace(scene, bed=replace(scene.bed, headroom=1.0))
+    frames = frames_of(scene)
+    return shares(
+        {
+            "speed": (top_speed(frames), 0.5 * scene.material.wave_speed, "m/s"),
+            "speed at the end": (top_speed(frames[-1:]), 0.1, "m/s"),
+            "volume gain": (100.0 * volume_gain(scene, frames[-1].position), 3.0, "%"),
+        }
+    )
+
+
+def turns_back() -> tuple[float, str]:
+    """Forward at 0.2 m/s, back at once, and forward again."""
+    rows = [*down(), (0.7, 0.204, IN_SOIL), (1.2, 0.104, IN_SOIL), (1.7, 0.204, IN_SOIL)]
+    scene = driven(rows, 1.7)
+    return blade_shares(scene, frames_of(scene))
+
+
+def rests(seconds: float = 60.0) -> tuple[list, Excavation]:
+    """Down, 3 cm forward, then at rest."""
+    scene = driven([*down(), (0.5, 0.134, IN_SOIL)], 1.0 + seconds)
+    scene = replace(scene, bed=replace(scene.bed, spacing=0.04 / 1.5))
+    return frames_of(scene, every=60, effects=Effects(symmetry=True)), scene
+
+
+def creep() -> tuple[float, str]:
+    """Of the soil around a tool at rest, from 1 s to 60 s after it stopped [mm]."""
+    frames, _ = rests()
+    moved = np.linalg.norm(frames[-1].position - frames[2].position, axis=1)
+    force = [float(np.linalg.norm(f.force)) for f in frames]
+    words = (
+        f"mean {1e3 * moved.mean():.3g} mm, {np.sum(moved > 1e-3)} of {len(moved)} particles beyond 1 mm; "
+    )
+    words += f"force {force[2]:.3g} N after 1 s, {force[-1]:.3g} N at the end"
+    return 1000.0 * float(moved.max()), words
+
+
+def shakes(amplitude: float = 1e-3, frequency: float = 50.0) -> tuple[float, str]:
+    """In the soil, along x, for a second."""
+    times = np.arange(0.0, 1.0, 1.0 / (frequency * 24.0))
+    swing = 0.104 + amplitude * np.sin(2.0 * np.pi * frequency * times)
+    rows = [*down(), *((0.2 + t, x, IN_SOIL) for t, x in zip(times[1:], swing[1:], strict=True))]
+    scene = driven(rows, 1.2, frame_rate=600.0)
+    return blade_shares(scene, frames_of(scene, every=10))
+
+
+def leaves_and_comes_back() -> tuple[float, str]:
+    """Cuts, is lifted out, and goes down in another place; while it is out nothing may touch it."""
+    rows = [*down(), (0.7, 0.204, IN_SOIL), (0.9, 0.204, 0.18), (1.1, 0.16, 0.18), (1.4, 0.16, IN_SOIL)]
+    scene = driven([*rows, (1.9, 0.26, IN_SOIL)], 1.9)
+    frames = frames_of(scene)
+    share, words = blade_shares(scene, frames)
+    out = [f for f in frames if 0.95 < f.time < 1.05]
+    touch = max(float(np.linalg.norm(f.force)) for f in out)
+    return max(share, touch), f"{words}; force in the air {touch:.3g} N (limit 1)"
+
+
+def spins() -> tuple[float, str]:
+    """Three turns per second about its vertical axis, 4 cm deep: its edges move at 1.8 m/s."""
+    times = np.arange(0.0, 0.8, 0.01)
+    angle = np.maximum(times - 0.25, 0.0) * 6.0 * np.pi
+    height = np.interp(times, [0.0, 0.2], [ABOVE, IN_SOIL])
+    path = tuple(
+        (float(t), 0.24, 0.2, float(z), 0.0, 0.0, math.sin(0.5 * a), math.cos(0.5 * a))
+        for t, a, z in zip(times, angle, height, strict=True)
+    )
+    scene = cut(motion="path", path=path, duration=0.8, frame_rate=120.0)
+    scene = replace(scene, bed=replace(scene.bed, headroom=1.0))
+    frames = frames_of(scene)
+    edge = 6.0 * np.pi * 0.5 * scene.blade.width
+    return shares(
+        {
+            "speed": (top_speed(frames), 2.0 * edge + 2.0, "m/s"),
+            "leakage": (100.0 * leakage(frames, scene.body), 1.0, "%"),
+        }
+    )
+
+
+def thin(cells: float, speed: float) -> tuple[float, str]:
+    """Soil that comes through a plate `cells` grid spacings thick [%]."""
+    rows = [*down(), (0.2 + 0.1 / speed, 0.204, IN_SOIL)]
+    blade = Plate(length=0.2, width=0.193, thickness=0.02 * cells)
+    scene = driven(rows, 0.2 + 0.1 / speed, frame_rate=max(100.0, 500.0 * speed), blade=blade)
+    frames = frames_of(scene)
+    force = float(np.mean([f.force[0] for f in frames[len(frames) // 2 :]]))
+    return 100.0 * leakage(frames, scene.body), f"draft {-force:.3g} N"
+
+
+def mesh_scene(folder: Path, triangles: np.ndarray) -> Push:
+    """A box of triangles goes down and forward."""
+    file = write_obj(folder / "box.obj", box_corners((0.044, 0.193, 0.2)), triangles)
+    rows = [(0.0, 0.104, ABOVE), (0.1, 0.104, IN_SOIL), (0.3, 0.144, IN_SOIL)]
+    path = tuple((t, x, 0.2, z, 0.0, 0.0, 0.0, 1.0) for t, x, z in rows)
+    return Push(bed=cut().bed, tool=MeshBody(file=str(file)), path=path, duration=0.3)
+
+
+def flipped_mesh() -> float:
+    """Change of the force when all triangles of a mesh face inwards [%]."""
+    force = []
+    with tempfile.TemporaryDirectory() as folder:
+        for triangles in (box_triangles(), box_triangles()[:, ::-1]):
+            frames = frames_of(mesh_scene(Path(folder), triangles))
+            force.append(np.array([f.force for f in frames]))
+    return 100.0 * float(np.abs(force[1] - force[0]).max() / np.abs(force[0]).max())
+
+
+def one_flipped_triangle() -> tuple[float, str]:
+    triangles = box_triangles()
+    triangles[3] = triangles[3][::-1]
+    with tempfile.TemporaryDirectory() as folder:
+        accepted, words = refused(lambda: mesh_scene(Path(folder), triangles), "do not all face the same way")
+    return accepted, words.replace(f"{folder}/", "")
+
+
+def open_mesh() -> tuple[float, str]:
+    with tempfile.TemporaryDirectory() as folder:
+        accepted, words = refused(lambda: mesh_scene(Path(folder), box_triangles()[:-1]), "is not closed")
+    return accepted, words.replace(f"{folder}/", "")
+
+
+def too_thin() -> tuple[float, str]:
+    """A plate of 2 mm on a grid of 2 cm."""
+    blade = Plate(length=0.2, width=0.193, thickness=0.002)
+    bed = replace(cut().bed, particles_per_cell=8.0)
+    return refused(lambda: Solver(cut(blade=blade, bed=bed)), "too thin")
+
+
+def through_the_floor() -> tuple[float, str]:
+    return refused(lambda: driven([*down(), (0.4, 0.104, -0.1)], 0.5), "leaves the bin")
+
+
+BOUNDED = "force, speed, leakage and volume stay bounded"
+
+
+def _shares(name: str, hard: str, must: str, measure, quick: bool = False) -> Case:
+    return Case(name, hard, must, "largest share of a limit", 1.0, "", measure, quick)
+
+
+def _refused(name: str, hard: str, must: str, measure, quick: bool = True) -> Case:
+    return Case(name, hard, must, "scenes accepted", 0.0, "", measure, quick)
+
+
+CASES = [
+    _shares(
+        "tool 10 cm further within a frame",
+        "6 m/s through the soil",
+        "speed, leakage and volume stay bounded, and soil comes to rest",
+        jumps_between_frames,
+    ),
+    Case(
+        name="tool 10 cm further within a substep",
+        hard="a jump in its path: no step is short enough",
+        must="stops and says where",
+        quantity="runs not stopped",
+        limit=0.0,
+        unit="",
+        measure=jumps_within_a_substep,
+        quick=True,
+    ),
+    _shares(
+        "tool appears in the soil",
+        "springs of the contact are pressed by centimetres",
+        "speeds stay bounded, soil comes to rest with its volume",
+        appears_in_soil,
+    ),
+    _shares("tool turns back at once", "friction and the trench behind it", BOUNDED, turns_back),
+    Case(
+        name="tool at rest for 60 s",
+        hard="stressed soil, held for 150 000 substeps",
+        must="soil does not creep",
+        quantity="largest displacement from 1 s on",
+        limit=1.0,
+        unit="mm",
+        measure=creep,
+    ),
+    _shares("tool shakes at 50 Hz", "1 mm to each side: 0.3 m/s, 16 g", BOUNDED, shakes),
+    _shares(
+        "tool leaves and comes back",
+        "contact ends and begins in loose soil",
+        f"{BOUNDED}; no force in the air",
+        leaves_and_comes_back,
+    ),
+    _shares("tool spins at 3 turns per second", "edges at 1.8 m/s", "speed and leakage stay bounded", spins),
+    *(
+        Case(
+            name=f"plate {cells:g} spacings thick at {speed:g} m/s",
+            hard="both sides share grid nodes",
+            must="no soil comes through",
+            quantity="leakage",
+            limit=1.0,
+            unit="%",
+            measure=partial(thin, cells, speed),
+            quick=(cells, speed) == (0.5, 1.0),
+        )
+        for cells, speed in ((2.0, 1.0), (0.5, 0.2), (0.5, 1.0))
+    ),
+    _refused("plate a tenth of a spacing thick", "soil would pass through", "refused", too_thin),
+    _refused("tool through the floor", "no room for soil under it", "refused", through_the_floor),
+    Case(
+        name="mesh with flipped normals",
+        hard="inside and outside change places",
+        must="turned round: the same force",
+        quantity="change of the force",
+        limit=0.1,
+        unit="%",
+        measure=flipped_mesh,
+    ),
+    _refused("mesh with one flipped triangle", "no inside", "refused", one_flipped_triangle),
+    _refused("mesh with a hole", "no inside", "refused", open_mesh),
+]
