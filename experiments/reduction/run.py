@@ -19,7 +19,8 @@ import torch
 from sgns.campaign import SPLITS, Dataset
 from sgns.evaluation.provenance import cpu_model
 from sgns.reduction import CENTRINGS
-from sgns.reduction.reconstruction import ReductionCurves, fit_runs, reduction_curves
+from sgns.reduction.fitting import fit_runs
+from sgns.reduction.reconstruction import ReductionCurves, reduction_curves
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

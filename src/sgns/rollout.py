@@ -101,14 +101,22 @@ def write_rollout(
         The path written.
 
     Raises:
-        UserError: the rollout is not finite, or the file cannot be written.
+        UserError: the rollout is not finite, when the frames before that are in `<name>.stopped.h5` instead; or the
+            file cannot be written.
     """
-    path = Path(path)
-    require_finite(path, rollout)
+    path, whole = Path(path), finite_frames(rollout)
+    reason = ""
+    if whole < len(rollout.latent):
+        reason = (
+            f"the rollout for {path.name} is not finite from frame {whole} on: the network is not stable on this "
+            "path; train longer, or use a checkpoint with a higher validation skill"
+        )
+        if whole == 0:
+            raise UserError(reason)
     began = time.perf_counter()
     rate = float(simulator.frame_rate)
-    latent = torch.as_tensor(rollout.latent)
-    particle_count = len(simulator.start_positions)
+    latent = torch.as_tensor(rollout.latent[:whole])
+    particle_count, excess = len(simulator.start_positions), rollout.excess
     with RunWriter(
         path,
         scene=scene,
@@ -124,6 +132,8 @@ def write_rollout(
             "checkpoint_version": simulator.card.get("package_version"),
             "checkpoint_settings": simulator.card.get("settings", {}),
             "history": given_frames,
+            "outside_training": None if excess is None else excess.largest,
+            "outside_training_words": None if excess is None else excess.words(),
         },
     ) as writer:
         previous = None
@@ -139,22 +149,19 @@ def write_rollout(
                     rollout.torque[frame],
                 )
                 previous = position
-        writer.finish(float(rollout.wall_time_s) + time.perf_counter() - began)
+        wall_time = float(rollout.wall_time_s) + time.perf_counter() - began
+        if reason:
+            raise UserError(f"{reason}; the frames before are in {writer.stop(wall_time, reason)}")
+        writer.finish(wall_time)
     return path
 
 
-def require_finite(path: Path, rollout: Rollout) -> None:
-    """Refuses a rollout whose network ran away from the numbers it knows."""
+def finite_frames(rollout: Rollout) -> int:
+    """Frames before the first in which a rollout is not finite."""
     latent = np.asarray(rollout.latent, dtype=np.float64).reshape(len(rollout.latent), -1)
-    finite = np.isfinite(np.hstack([latent, np.asarray(rollout.force), np.asarray(rollout.torque)])).all(
-        axis=1
-    )
-    if not finite.all():
-        raise UserError(
-            f"the rollout for {path.name} is not finite from frame {int(np.argmin(finite))} on: the "
-            "network is not stable on this path; train longer, or use a checkpoint with a higher "
-            "validation skill"
-        )
+    parts = [latent, np.asarray(rollout.force), np.asarray(rollout.torque), np.asarray(rollout.poses)]
+    finite = np.isfinite(np.hstack(parts)).all(axis=1)
+    return len(finite) if finite.all() else int(np.argmin(finite))
 
 
 def require_known_bed(simulator: Simulator, scene: Scene, checkpoint: str | Path) -> None:
@@ -242,9 +249,14 @@ def unlearned(known: Mapping[str, Any], asked: Mapping[str, Any], told: Sequence
 def rollout_scene(
     simulator: Simulator, scene: Scene, path: str | Path, *, seed: int = 0, checkpoint: str | Path = ""
 ) -> RolloutTiming:
-    """Rolls a scene that was never simulated out, from the common start at rest, into a run file."""
+    """Rolls a scene that was never simulated out, from the common start at rest, into a run file.
+
+    Warns where path or soil leave what the training runs covered.
+    """
     with single_thread():
         rollout = simulator.rollout(scene.body_poses(), scene.body_points(), values=scene.to_dict())
+    if rollout.excess is not None and (words := rollout.excess.words()):
+        log.warning("%s: forces and soil are a guess there", words)
     began = time.perf_counter()
     write_rollout(path, simulator, scene.to_dict(), rollout, seed=seed, checkpoint=checkpoint)
     writing = time.perf_counter() - began
@@ -258,7 +270,9 @@ def main(cfg: DictConfig) -> float:
     from sgns.simulator import Simulator
 
     scene = scene_from_config(cfg)
-    simulator = Simulator.load(cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes)
+    simulator = Simulator.load(
+        cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes, hold_at_rest=cfg.hold_at_rest
+    )
     require_same_freedom(simulator, scene, cfg.checkpoint)
     require_known_bed(simulator, scene, cfg.checkpoint)
     ignored = unlearned(simulator.scene, scene.to_dict(), simulator.context_keys)

@@ -8,8 +8,9 @@ Letters: B paths, T frames, n particles, M body points, N body nodes, d history 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from torch import Tensor
 from sgns.errors import UserError
 from sgns.learning.body import BodyTrack, body_track
 from sgns.learning.context import context_of
+from sgns.learning.prediction import Step
 from sgns.learning.surrogate import Surrogate, load_surrogate
+from sgns.learning.training_range import Excess
 from sgns.poses import check_poses, fitted_poses, in_world_frame
 from sgns.reduction.basis import Basis
 
@@ -45,6 +48,15 @@ class State:
     torque: np.ndarray
     pose: np.ndarray
     _basis: Basis = field(repr=False)
+    _excess: Callable[[], Excess | None] = field(repr=False)
+
+    @property
+    def outside(self) -> float:
+        """How far this frame is from all that the training runs covered [1]: the distance of the worst of the tool's
+        pose and motion, the soil's modes and their velocity, and the context from its training range, in widths of
+        that range. 0: inside every range; above 0.05 the answer is a guess; NaN: the checkpoint does not know."""
+        found = self._excess()
+        return np.nan if found is None else float(found.amount[-1])
 
     def soil(self) -> np.ndarray:
         """Positions of all particles [m], shape (n, 3); decoded when asked for."""
@@ -70,6 +82,13 @@ class Rollout:
     poses: np.ndarray
     body_points: np.ndarray
     wall_time_s: float
+    _excess: Callable[[], Excess | None] = field(repr=False)
+
+    @cached_property
+    def excess(self) -> Excess | None:
+        """How far every frame is outside the training runs' range, see `State.outside`, and in what; None: the
+        checkpoint does not know."""
+        return self._excess()
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +117,16 @@ class Simulator:
         surrogate: Network, basis and start.
         device: "cpu" or "cuda".
         num_modes: Of the soil, the first of those it was trained with; None: all.
+        hold_at_rest: Whether the soil stays as it is while a prescribed tool has rested for d frames.
     """
 
-    def __init__(self, surrogate: Surrogate, device: str = "cpu", num_modes: int | None = None) -> None:
+    def __init__(
+        self,
+        surrogate: Surrogate,
+        device: str = "cpu",
+        num_modes: int | None = None,
+        hold_at_rest: bool = True,
+    ) -> None:
         try:
             self.device = torch.device(device)
             self._surrogate = surrogate.to(self.device).eval()
@@ -111,19 +137,22 @@ class Simulator:
         self._dynamics, self.basis = surrogate.dynamics, surrogate.basis
         if num_modes is not None:
             self._dynamics, self.basis = self._dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
+        self._dynamics.holds_rest = hold_at_rest
         self.start_positions = surrogate.start_positions.cpu().numpy()
         self.body_points = surrogate.body_points.cpu().numpy()
         self._start_latent = self.basis.transform(surrogate.start_positions.cpu())
         self.reset()
 
     @classmethod
-    def load(cls, path: str | Path, device: str = "cpu", num_modes: int | None = None) -> Simulator:
+    def load(
+        cls, path: str | Path, device: str = "cpu", num_modes: int | None = None, hold_at_rest: bool = True
+    ) -> Simulator:
         """From a checkpoint written by `sgns train`; arguments as of the class.
 
         Raises:
             UserError: The file is missing, truncated or not such a checkpoint.
         """
-        return cls(load_surrogate(path), device, num_modes)
+        return cls(load_surrogate(path), device, num_modes, hold_at_rest)
 
     @property
     def frame_rate(self) -> float:
@@ -209,7 +238,7 @@ class Simulator:
             values = scene.to_dict()
         elif scene is not None:
             pose = np.atleast_2d(np.asarray(scene, dtype=np.float64))[0]
-        self._frame, self._points = 0, points
+        self._frame, self._points, self._values = 0, points, values
         self._stepper = self._dynamics.stepper(len(points), self._context_of(values))
         self._poses: list[np.ndarray] = []
         if history is None:
@@ -225,7 +254,7 @@ class Simulator:
                 )
         self._latent = latent.clone()[None].to(self.device)
         nothing = np.zeros(3)
-        return State(0, self._newest(), nothing, nothing.copy(), self._pose_now(), self.basis)
+        return self._state(nothing, nothing.copy(), self._pose_now())
 
     def step(self, tool_pose: np.ndarray) -> State:
         """Move the tool to its next pose and the soil with it.
@@ -237,7 +266,7 @@ class Simulator:
             The state after the step.
 
         Raises:
-            UserError: The pose is not finite or its quaternion not of unit length.
+            UserError: The pose is not finite or its quaternion not of unit length, or the answer is not finite.
         """
         pose = check_poses(tool_pose, f"tool pose of frame {self._frame + 1}")[0]
         if not self._poses:
@@ -247,14 +276,17 @@ class Simulator:
         body = self._track(window, in_world_frame(window, self._points)).frames(slice(1, None))
         with torch.inference_mode():
             step = self._stepper.advance(self._latent, body)
-            self._latent = torch.cat([self._latent[:, 1:], step.latent[:, None]], dim=1)
+            held = self._dynamics.held(body) is not None
+            following = self._latent[:, -1:] if held else step.latent[:, None]
+            self._require_finite(following, step)
+            self._latent = torch.cat([self._latent[:, 1:], following], dim=1)
         if self.predicts_body:
             there = body.position[0, -2] + step.displacement[0]
             pose = self._predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
         self._poses = [*self._poses[1:], pose]
         self._frame += 1
         force, torque = (part[0].cpu().numpy() for part in (step.force, step.torque))
-        return State(self._frame, self._newest(), force, torque, pose, self.basis)
+        return self._state(force, torque, pose)
 
     def rollout(
         self,
@@ -311,7 +343,8 @@ class Simulator:
             nodes = path.body.position[0, padding:].cpu().numpy()
             poses = self._predicted_poses(poses, nodes, points)
             world = nodes if self._dynamics.settings.body_nodes == "points" else in_world_frame(poses, points)
-        return Rollout(states, force, torque, poses, world, wall_time)
+        excess = partial(self._excess_of, poses, points, states, values)
+        return Rollout(states, force, torque, poses, world, wall_time, excess)
 
     def rollouts(
         self,
@@ -376,6 +409,36 @@ class Simulator:
             return fitted_poses(points, nodes)
         return np.concatenate([nodes[:, 0], poses[:, 3:]], axis=1)
 
+    def _require_finite(self, following: Tensor, step: Step) -> None:
+        """Refuses a step that says nothing; the simulator stays where it was."""
+        found = {"the soil's state": following, "the force": step.force, "the torque": step.torque}
+        bad = [name for name, part in found.items() if not bool(torch.isfinite(part).all())]
+        if bad:
+            raise UserError(
+                f"{bad[0]} is not finite at frame {self._frame + 1}, likely because the tool's pose of that frame lies "
+                f"far from everything the network knows; frame {self._frame} is kept: step to another pose, or reset"
+            )
+
+    def _state(self, force: np.ndarray, torque: np.ndarray, pose: np.ndarray) -> State:
+        """The newest state."""
+        # How far it is outside takes the frame before as well, for velocities; before any pose nobody can tell.
+        poses = np.stack(self._poses[-2:]) if self._poses else pose[None]
+        latent = self._latent[0, -len(poses) :].cpu().numpy()
+        excess = partial(self._excess_of, poses, self._points, latent, self._values)
+        return State(self._frame, latent[-1].copy(), force, torque, pose, self.basis, excess)
+
+    def _excess_of(
+        self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, values: Mapping[str, Any] | None
+    ) -> Excess | None:
+        """How far frames are outside the training range; body points (M, 3) in the body frame."""
+        known, keys = self._surrogate.training_range, self.context_keys
+        if known is None or not np.isfinite(poses).all():
+            return None
+        numbers = context_of(self.scene if values is None else values, keys).tolist()
+        return known.excess(
+            poses, in_world_frame(poses, points), latent, dict(zip(keys, numbers, strict=True))
+        )
+
     def _context_of(self, values: Mapping[str, Any] | None) -> Tensor:
         scene = self.scene if values is None else values
         return torch.as_tensor(context_of(scene, self._dynamics.context_keys))[None].to(self.device)
@@ -394,9 +457,6 @@ class Simulator:
         if not bool(torch.isfinite(latent).all()):
             raise UserError("the latent history holds values that are not finite; every value must be")
         return latent
-
-    def _newest(self) -> np.ndarray:
-        return self._latent[0, -1].cpu().numpy().copy()
 
     def _pose_now(self) -> np.ndarray:
         return self._poses[-1] if self._poses else np.full(7, np.nan)

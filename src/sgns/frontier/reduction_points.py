@@ -25,7 +25,8 @@ from sgns.frontier.study import PointSettings, Study, StudyScene
 from sgns.frontier.surrogate_points import training_settings
 from sgns.frontier.timing import Workload, cost_fields, made_here, one_core
 from sgns.reduction import CENTRINGS, Basis
-from sgns.reduction.reconstruction import fit_runs, reconstruction_curve
+from sgns.reduction.fitting import fit_runs
+from sgns.reduction.reconstruction import reconstruction_curve
 from sgns.runs import Run
 
 __all__ = ["measure_reduction"]

@@ -38,6 +38,7 @@ from sgns.learning.statistics import fit_normalisation
 from sgns.learning.stepping import Dynamics
 from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
+from sgns.learning.training_range import TrainingRange
 from sgns.learning.validation import ValidationRollouts
 from sgns.poses import in_body_frame
 from sgns.reduction.reduced import ReducedDataset, ReducedRun, reduce_dataset
@@ -165,7 +166,15 @@ def train(
         with quiet_lightning():
             trainer = make_trainer(output, settings, device, callbacks, logger)
             began = time.perf_counter()
-            fit(trainer, module, data, output / "last.ckpt" if resumed else None)
+            try:
+                fit(trainer, module, data, output / "last.ckpt" if resumed else None)
+            except UserError as error:
+                if not (output / "best.ckpt").exists():
+                    raise
+                raise UserError(
+                    f"{error}; the best checkpoint of before is kept, to go on from into another output: "
+                    f"checkpoint={output / 'best.ckpt'}"
+                ) from error
             seconds = time.perf_counter() - began
         score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
         about = {"steps": settings.max_steps}
@@ -223,7 +232,10 @@ def surrogate_of(dynamics: Dynamics, reduced: ReducedDataset, card: dict[str, An
     first = reduced.runs("train")[0]
     points = torch.as_tensor(in_body_frame(first.pose[0], first.body_points[0]))
     basis = reduced.basis.sliced(dynamics.num_modes)
-    return Surrogate(dynamics, basis, torch.as_tensor(reduced.start_positions), points, card)
+    sees_points = dynamics.settings.body_nodes == "points"
+    known = TrainingRange.of(reduced.runs("train"), dynamics.num_modes, dynamics.context_keys, sees_points)
+    start = torch.as_tensor(reduced.start_positions)
+    return Surrogate(dynamics, basis, start, points, card | {"training_range": known.plain()})
 
 
 def prepared(

@@ -5,7 +5,7 @@ Letters: n particles, R modes of the basis.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +13,9 @@ import numpy as np
 import torch
 
 from sgns.reduction.basis import Basis
-from sgns.reduction.incremental_pca import IncrementalPCA
 from sgns.runs import Run, frame_chunks
 
-__all__ = ["ReductionCurves", "fit_runs", "reconstruction_curve", "reduction_curves"]
+__all__ = ["ReductionCurves", "reconstruction_curve", "reduction_curves"]
 
 
 @dataclass(frozen=True)
@@ -34,22 +33,6 @@ class ReductionCurves:
     displacement_energy: np.ndarray
     training: np.ndarray
     held_out: np.ndarray
-
-
-def fit_runs(paths: Iterable[Path], max_modes: int, device: str = "cpu") -> IncrementalPCA:
-    """One stream over runs; the bases of all centrings follow from it.
-
-    Args:
-        paths: Run files, each read in chunks.
-        max_modes: Modes to keep track of.
-        device: Torch device that does it.
-    """
-    pca = IncrementalPCA(max_modes, device=device)
-    for path in paths:
-        with Run(path) as run:
-            for frames in frame_chunks(run.particle_count, run.frame_count):
-                pca.partial_fit(run.positions(frames))
-    return pca
 
 
 def reduction_curves(basis: Basis, paths: Sequence[Path]) -> ReductionCurves:

@@ -30,8 +30,8 @@ from sgns.campaign import SPLITS, Dataset
 from sgns.errors import UserError
 from sgns.reduction.basis import CENTRINGS, Basis
 from sgns.reduction.choice import MEASURES, choose_modes
+from sgns.reduction.fitting import fit_runs, require_positions
 from sgns.reduction.incremental_pca import checked_device
-from sgns.reduction.reconstruction import fit_runs
 from sgns.runs import Run, frame_chunks
 from sgns.settings import check_fields
 from sgns.wholefile import whole_file
@@ -256,14 +256,21 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
         except (OSError, KeyError, ValueError) as error:
             log.warning("%s is damaged (%s); reducing %s again", path, error, run_path)
     with Run(run_path) as run:
-        latent = torch.cat(
-            [
-                basis.transform(run.positions(frames)).cpu()
-                for frames in frame_chunks(run.particle_count, run.frame_count)
-            ]
-        ).numpy()
+        parts = []
+        for frames in frame_chunks(run.particle_count, run.frame_count):
+            positions = run.positions(frames)
+            parts.append(basis.transform(positions).cpu())
+            if not bool(parts[-1].isfinite().all()):
+                require_positions(run_path, frames.start, positions)
         reduced = ReducedRun(
-            run_path.stem, latent, run.time, run.pose, run.body_points, run.force, run.torque, run.scene
+            run_path.stem,
+            torch.cat(parts).numpy(),
+            run.time,
+            run.pose,
+            run.body_points,
+            run.force,
+            run.torque,
+            run.scene,
         )
     write_reduced(path, reduced)
     return reduced

@@ -10,7 +10,7 @@ from sgns.frontier import reduction_points
 from sgns.frontier.reduction_points import measure_reduction, wanted_of
 from sgns.frontier.study import Study
 from sgns.reduction import IncrementalPCA
-from sgns.reduction.reconstruction import fit_runs
+from sgns.reduction.fitting import fit_runs
 from sgns.runs import Run
 
 
