@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +21,7 @@ import yaml
 from omegaconf import OmegaConf
 
 from mpm_warp import Decision, Effects, Scene
+from sgns.claim import claimed
 from sgns.errors import UserError
 from sgns.scene_effects import decided
 from sgns.settings import flattened
@@ -68,18 +70,22 @@ class Campaign:
     def record(self) -> None:
         """Write dataset.yaml, or check that the folder's own says the same."""
         file = self.path / "dataset.yaml"
-        if file.exists():
-            if _read(file) != self.describe():
-                raise UserError(
-                    f"{self.path} holds a dataset made with other settings; give another dataset.path, or remove "
-                    "the folder to make this one"
-                )
-            return
         try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(file, yaml.safe_dump(self.describe(), sort_keys=False))
+            while not file.exists():
+                with claimed(
+                    file
+                ) as ours:  # of two campaigns that begin at once the second finds the first's
+                    if ours and not file.exists():
+                        write_whole(file, yaml.safe_dump(self.describe(), sort_keys=False))
+                        return
+                time.sleep(0.05)
         except OSError as error:
             raise UserError(f"cannot write {file}: {error.strerror}") from None
+        if _read(file) != self.describe():
+            raise UserError(
+                f"{self.path} holds a dataset made with other settings; give another dataset.path, or remove "
+                "the folder to make this one"
+            )
 
 
 def plan(

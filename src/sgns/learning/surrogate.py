@@ -8,6 +8,7 @@ network's is written by Lightning and also holds what is needed to go on trainin
 
 from __future__ import annotations
 
+import io
 import pickle
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from sgns.learning.stepping import Dynamics
 from sgns.reduction.basis import Basis
 from sgns.wholefile import whole_file
 
-__all__ = ["Surrogate", "load_surrogate", "read_checkpoint"]
+__all__ = ["Surrogate", "load_surrogate", "read_checkpoint", "write_checkpoint"]
 
 _FORMAT = "sgns-surrogate"
 _FORMAT_VERSION = 2
@@ -94,13 +95,24 @@ class Surrogate(nn.Module):
     def save(self, path: Path) -> None:
         """Write a checkpoint without anything to go on training from."""
         state = {f"{_PREFIX}{name}": value for name, value in self.state_dict().items()}
-        with whole_file(path) as temporary:
-            torch.save({"state_dict": state, "hyper_parameters": self.card}, temporary)
+        write_checkpoint({"state_dict": state, "hyper_parameters": self.card}, path)
 
     @property
     def start_latent(self) -> Tensor:
         """The common start in the basis [m], shape (r, 3), float64."""
         return self.basis.transform(self.start_positions.cpu())
+
+
+def write_checkpoint(content: dict[str, Any], path: Path) -> None:
+    """Write a checkpoint; it appears complete or not at all.
+
+    Raises:
+        OSError: The disk does not take it.
+    """
+    buffer = io.BytesIO()  # torch says of a full disk only that some position is unexpected
+    torch.save(content, buffer)
+    with whole_file(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:

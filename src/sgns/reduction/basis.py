@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from sgns.errors import UserError
-from sgns.wholefile import whole_file
+from sgns.runs.newfile import new_hdf5
 
 __all__ = ["CENTRINGS", "Basis"]
 
@@ -189,25 +189,19 @@ class Basis:
         Raises:
             UserError: If the file cannot be written.
         """
-        path = Path(path)
-        try:
-            with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
-                for key, value in self.state().items():
-                    if isinstance(value, Tensor):
-                        # Checksummed, so that a damaged file is an error and not a wrong basis.
-                        array = value.detach().cpu().numpy()
-                        file.create_dataset(key, data=array, chunks=True, fletcher32=True)
-                    elif isinstance(value, list):
-                        # A dataset, because an attribute holds 64 kB at most.
-                        file.create_dataset(key, data=json.dumps(value))
-                    else:
-                        file.attrs[key] = value
-                file.attrs["format"] = _FORMAT
-                file.attrs["si_unit"] = "mean: m; eigenvalues and variances: m2; modes: 1"
-        except OSError as error:
-            raise UserError(
-                f"cannot write the basis to {path}: {error}; choose a folder that exists and is writable"
-            ) from error
+        with new_hdf5(Path(path)) as file:
+            for key, value in self.state().items():
+                if isinstance(value, Tensor):
+                    # Checksummed, so that a damaged file is an error and not a wrong basis.
+                    array = value.detach().cpu().numpy()
+                    file.create_dataset(key, data=array, chunks=True, fletcher32=True)
+                elif isinstance(value, list):
+                    # A dataset, because an attribute holds 64 kB at most.
+                    file.create_dataset(key, data=json.dumps(value))
+                else:
+                    file.attrs[key] = value
+            file.attrs["format"] = _FORMAT
+            file.attrs["si_unit"] = "mean: m; eigenvalues and variances: m2; modes: 1"
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Basis:

@@ -32,8 +32,8 @@ from sgns.reduction.basis import CENTRINGS, Basis
 from sgns.reduction.choice import MEASURES, choose_modes
 from sgns.reduction.incremental_pca import IncrementalPCA, checked_device
 from sgns.runs import Run, frame_chunks
+from sgns.runs.newfile import new_hdf5
 from sgns.settings import check_fields
-from sgns.wholefile import whole_file
 
 __all__ = ["ReducedDataset", "ReducedRun", "reduce_dataset"]
 
@@ -273,7 +273,7 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
 
 def write_reduced(path: Path, run: ReducedRun) -> None:
     """Write a reduced run; it appears complete or not at all."""
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(path) as file:
         for name in _SERIES:
             file.create_dataset(name, data=getattr(run, name))
         file.create_dataset("scene", data=json.dumps(run.scene))
