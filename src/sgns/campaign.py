@@ -21,11 +21,13 @@ import yaml
 from omegaconf import OmegaConf
 
 from mpm_warp import Decision, Effects, Scene
+from mpm_warp.inputs import read_text
 from sgns.claim import claimed
 from sgns.errors import UserError
 from sgns.scene_effects import decided
 from sgns.settings import flattened
 from sgns.wholefile import write_whole
+from sgns.yaml_text import parse_yaml
 
 __all__ = ["SPLITS", "Campaign", "Dataset", "plan"]
 
@@ -239,6 +241,6 @@ def _same(a: Any, b: Any) -> bool:
 
 def _read(file: Path) -> Any:
     try:
-        return yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        return parse_yaml(read_text(file))
+    except (OSError, ValueError) as error:
         raise UserError(f"cannot read {file}: {str(error).splitlines()[0]}") from None

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from sgns.errors import UserError
+from sgns.hdf5 import BROKEN, own_dataset
 from sgns.runs.newfile import new_hdf5
 
 __all__ = ["CENTRINGS", "Basis"]
@@ -218,9 +219,9 @@ class Basis:
                 if file.attrs.get("format") != _FORMAT:
                     raise UserError(f"{path}: an HDF5 file but not a basis; make one with `sgns reduce`")
                 state = {key: value for key, value in file.attrs.items()}
-                state["fitted_on"] = json.loads(file["fitted_on"][()])
-                state.update((key, torch.from_numpy(file[key][()])) for key in _ARRAYS)
-        except (OSError, ValueError, TypeError, KeyError, RuntimeError, AttributeError) as error:
+                state["fitted_on"] = json.loads(own_dataset(file, "fitted_on")[()])
+                state.update((key, torch.from_numpy(own_dataset(file, key)[()])) for key in _ARRAYS)
+        except (*BROKEN, AttributeError) as error:
             reason = " ".join(str(error).split())
             raise UserError(
                 f"{path}: not a readable basis, truncated or damaged ({reason}); fit again with `sgns reduce`"

@@ -28,6 +28,7 @@ from tqdm import tqdm
 
 from sgns.campaign import SPLITS, Dataset
 from sgns.errors import UserError
+from sgns.hdf5 import BROKEN, own_dataset
 from sgns.reduction.basis import CENTRINGS, Basis
 from sgns.reduction.choice import MEASURES, choose_modes
 from sgns.reduction.incremental_pca import IncrementalPCA, checked_device
@@ -255,7 +256,7 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
     if path.exists():
         try:
             return replace(read_reduced(path), name=run_path.stem)
-        except (OSError, KeyError, ValueError) as error:
+        except BROKEN as error:
             log.warning("%s is damaged (%s); reducing %s again", path, error, run_path)
     with Run(run_path) as run:
         latent = torch.cat(
@@ -285,10 +286,12 @@ def read_reduced(path: Path) -> ReducedRun:
     """Read a reduced run.
 
     Raises:
-        OSError, KeyError, ValueError: Not one.
+        One of sgns.hdf5.BROKEN: Not one.
     """
     with h5py.File(path, "r") as file:
         if file.attrs.get("format") != _FORMAT:
             raise ValueError("not a reduced run")
-        series = {name: file[name][()] for name in _SERIES}
-        return ReducedRun(name=str(file.attrs["name"]), scene=json.loads(file["scene"][()]), **series)
+        series = {name: own_dataset(file, name)[()] for name in _SERIES}
+        return ReducedRun(
+            name=str(file.attrs["name"]), scene=json.loads(own_dataset(file, "scene")[()]), **series
+        )
