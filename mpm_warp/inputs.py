@@ -24,7 +24,7 @@ def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
             raise ValueError("it is not a file but a pipe or device")
         if os.fstat(file.fileno()).st_size > most:
             raise ValueError(f"it is larger than {most / 1e6:.0f} MB")
-        return file.read(most)
+        return file.read()
 
 
 def read_text(path: Path, most: int = MOST_BYTES) -> str:

@@ -193,12 +193,15 @@ class Dataset:
             )
         content = _read(file)
         split = content.get("split") if isinstance(content, dict) else None
-        if not isinstance(split, dict) or not all(isinstance(split.get(s), list) for s in SPLITS):
+        if not isinstance(split, dict) or not all(_are_names(split.get(s)) for s in SPLITS):
             raise UserError(f"{file} has no split into {', '.join(SPLITS)}; it was not made by sgns simulate")
         if where:
-            split = _chosen(split, content.get("scenes") or {}, where, file)
+            scenes = content.get("scenes")
+            if not isinstance(scenes, dict) or not all(isinstance(scene, dict) for scene in scenes.values()):
+                raise UserError(f"{file} does not say what the scenes are, which dataset.where asks for")
+            split = _chosen(split, scenes, where, file)
         dataset = cls(name=str(content.get("name", path.name)), path=path, split=split)
-        missing = [run for s in SPLITS for run in dataset.runs(s) if not run.exists()]
+        missing = [run for s in SPLITS for run in dataset.runs(s) if not os.path.exists(run)]
         if missing:
             raise UserError(
                 f"runs of {path} are missing: {len(missing)}, the first is {missing[0].name}; finish the dataset: "
@@ -211,6 +214,13 @@ class Dataset:
         if split not in SPLITS:
             raise UserError(f"split is {split!r}; allowed: {', '.join(SPLITS)}")
         return [self.path / "runs" / f"{name}.h5" for name in self.split[split]]
+
+
+def _are_names(names: Any) -> bool:
+    """Whether these are names of files in one folder."""
+    return isinstance(names, list) and all(
+        isinstance(name, str) and name and not set(name) & {"/", os.sep, "\0"} for name in names
+    )
 
 
 def _chosen(
@@ -227,7 +237,7 @@ def _chosen(
         there = {name: scene[key] for name, scene in known.items()}
         known = {name: scene for name, scene in known.items() if any(_same(there[name], a) for a in allowed)}
         if not known:
-            values = ", ".join(map(str, sorted(set(there.values()), key=str)))
+            values = ", ".join(sorted(set(map(str, there.values()))))
             raise UserError(f"dataset.where leaves no run: {key} is {allowed}; in {file} it is {values}")
     return {part: [name for name in names if name in known] for part, names in split.items()}
 

@@ -112,10 +112,14 @@ def read_published(
         raise UserError(f"{folder} does not hold the published {split} runs: {error}") from None
     if cases is None:
         cases = [None] * len(records)
-    if not isinstance(cases, list) or len(cases) != len(records):
+    if not isinstance(cases, list) or not all(case is None or type(case) is int for case in cases):
+        raise UserError(f"{folder}: metadata.json does not name the {split} runs by their numbers")
+    if len(cases) != len(records):
         raise UserError(
             f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {len(records)}"
         )
+    if not records:
+        raise UserError(f"{folder}/{split}.tfrecord holds no run")
     try:
         return [_run(case, record, bin_size) for case, record in zip(cases, records, strict=True)]
     except (ValueError, KeyError, IndexError, struct.error) as error:

@@ -174,7 +174,13 @@ def _run_hydra() -> None:
     compose = ConfigLoaderImpl.load_configuration
 
     def checked(self: ConfigLoaderImpl, *args: Any, **settings: Any) -> DictConfig:
-        cfg = compose(self, *args, **settings)
+        try:
+            cfg = compose(self, *args, **settings)
+        except Exception as error:
+            if _line_of(error) is not None:
+                raise
+            # Composing runs nothing of ours: what goes wrong there is in the settings.
+            raise UserError(f"the settings cannot be put together: {type(error).__name__}: {error}") from error
         require_own_objects(cfg)
         return cfg
 
@@ -318,6 +324,9 @@ def _line_of(error: Exception) -> str | None:
         )
     if "omegaconf" not in sys.modules:
         return None
+    taken_out = [argument for argument in sys.argv if argument.startswith("~")]
+    if taken_out and isinstance(error, (AttributeError, KeyError)):
+        return f"{' '.join(taken_out)}: what is taken out here is needed; leave this out"
     from sgns.cli.setting_errors import describe
 
     return describe(error)

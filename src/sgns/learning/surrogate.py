@@ -205,7 +205,9 @@ def _require_own_values(state: dict[str, Any]) -> None:
 
 def _require_described(state: dict[str, Any], card: dict[str, Any]) -> None:
     """Refuses a card that describes more than there is in the file, before it is built."""
-    model = card["model"]
+    model, scene = card["model"], card["scene"]
+    if not isinstance(scene, dict) or not isinstance(scene.get("bed", {}), dict):
+        raise ValueError("its card does not say what the scene is")
     if model.get("kind", "network") == "polynomial":
         inputs, terms = len(card["used"]), state["dynamics.weights"].shape[0]
         groups = len(state["dynamics.inputs.mean"]) // (3 * int(card["num_modes"]))
