@@ -100,7 +100,9 @@ def refused_or_read(action: Any) -> None:
 NUMBERS = st.sampled_from(
     [0, -1, 1, 2, 3, 7, 1e-300, -1e300, 1e300, 10**20, -(10**20), 10**6, float("nan"), float("inf"), 0.5, 1e9]
 )
-TEXTS = st.text(max_size=12) | st.sampled_from(["", "a", "..", "/", "\x00", "no such file", "../../x", "nan", "1"])
+TEXTS = st.text(max_size=12) | st.sampled_from(
+    ["", "a", "..", "/", "\x00", "no such file", "../../x", "nan", "1"]
+)
 VALUES = st.recursive(
     NUMBERS | TEXTS | st.none() | st.booleans(),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(TEXTS, inner, max_size=3),
@@ -139,7 +141,11 @@ def damaged(draw: Any, content: bytes) -> bytes:
         elif action == 2:
             content = content[:at] + draw(st.binary(min_size=1, max_size=20)) + content[at:]
         elif action == 3:
-            content = content[:at] + bytes([content[at] ^ 1 << draw(st.integers(0, 7))] if content else []) + content[at + 1 :]
+            content = (
+                content[:at]
+                + bytes([content[at] ^ 1 << draw(st.integers(0, 7))] if content else [])
+                + content[at + 1 :]
+            )
         else:
             content = content[:at] + b"\xff" * 8 + content[at + 8 :]
     return content
@@ -155,7 +161,12 @@ SMALL = [
     *("scene.blade.length=0.1", "scene.blade.width=0.1", "scene.blade.thickness=0.08"),
 ]
 TRAIN = [
-    *("reduction.max_modes=6", "reduction.num_modes=3", "model.hidden_width=8", "model.message_passing_steps=1"),
+    *(
+        "reduction.max_modes=6",
+        "reduction.num_modes=3",
+        "model.hidden_width=8",
+        "model.message_passing_steps=1",
+    ),
     *("training.max_steps=2", "training.validate_every=2", "training.warmup_steps=0", "training.threads=1"),
 ]
 
@@ -179,7 +190,10 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("good")
     scene = Scene.from_dict(SCENE)
     make_dataset(
-        folder / "data", n=len(scene.stored), arrangement_hash=scene.arrangement_hash, scene=scene.to_dict() | {"duration": 0.2}
+        folder / "data",
+        n=len(scene.stored),
+        arrangement_hash=scene.arrangement_hash,
+        scene=scene.to_dict() | {"duration": 0.2},
     )
     status, said = call("train", f"dataset.path={folder / 'data'}", *TRAIN, f"output={folder / 'out'}")
     assert status == 0, said
@@ -194,16 +208,33 @@ SHOWN = st.one_of(
     VALUES.map(lambda value: json.dumps(value)),
     st.text(string.printable, max_size=12),
     st.sampled_from(
-        ["null", "[]", "{}", "???", "${seed}", "${oc.env:HOME}", "${x", "${scene}", "[1", "'", "1,2", "range(3)"]
+        [
+            "null",
+            "[]",
+            "{}",
+            "???",
+            "${seed}",
+            "${oc.env:HOME}",
+            "${x",
+            "${scene}",
+            "[1",
+            "'",
+            "1,2",
+            "range(3)",
+        ]
     ),
-    st.sampled_from(["{a:1}", "[1,[2]]", "true", "auto", "nope", "-0.0", "1e400", "0x10", "é", "a=b", "  ", "~"]),
+    st.sampled_from(
+        ["{a:1}", "[1,[2]]", "true", "auto", "nope", "-0.0", "1e400", "0x10", "é", "a=b", "  ", "~"]
+    ),
 )
 
 
 @st.composite
 def overrides(draw: Any) -> list[str]:
     """A command with some of its settings changed at random."""
-    command = draw(st.sampled_from(["simulate", "simulate", "train", "train", "rollout", "reduce", "evaluate", "check"]))
+    command = draw(
+        st.sampled_from(["simulate", "simulate", "train", "train", "rollout", "reduce", "evaluate", "check"])
+    )
     arguments = [command]
     for _ in range(draw(st.integers(1, 3))):
         key = draw(st.sampled_from(KEYS[command]))
@@ -216,7 +247,9 @@ def keys_of(command: str) -> list[str]:
     """Dotted keys of a command's settings and groups."""
     with initialize_config_module("sgns.conf", version_base="1.3"):
         keys = flattened(OmegaConf.to_container(compose(command), resolve=False))
-    return sorted({*keys, *(key.partition(".")[0] for key in keys), *(key.rpartition(".")[0] or key for key in keys)})
+    return sorted(
+        {*keys, *(key.partition(".")[0] for key in keys), *(key.rpartition(".")[0] or key for key in keys)}
+    )
 
 
 KEYS = {name: keys_of(name) for name in ("simulate", "train", "rollout", "reduce", "evaluate", "check")}
@@ -272,8 +305,35 @@ YAML = st.one_of(
     st.text(max_size=40),
     st.lists(
         st.sampled_from(
-            ["a: ", "- ", "&x ", "*x", "[", "]", "{", "}", "\n", "  ", "!!python/object:os.system ", "!!binary ", "|\n", "<<: "]
-            + ["? ", ": ", "'", '"', "# ", "%TAG", "---\n", "1", "2001-13-45", "split: ", "train: ", "scenes: ", "${oc.env:HOME}"]
+            [
+                "a: ",
+                "- ",
+                "&x ",
+                "*x",
+                "[",
+                "]",
+                "{",
+                "}",
+                "\n",
+                "  ",
+                "!!python/object:os.system ",
+                "!!binary ",
+                "|\n",
+                "<<: ",
+                "? ",
+                ": ",
+                "'",
+                '"',
+                "# ",
+                "%TAG",
+                "---\n",
+                "1",
+                "2001-13-45",
+                "split: ",
+                "train: ",
+                "scenes: ",
+                "${oc.env:HOME}",
+            ]
         ),
         max_size=25,
     ).map("".join),
@@ -297,7 +357,11 @@ def test_yaml_of_data(good, tmp_path) -> None:
 
 
 def test_dataset_yaml(good, tmp_path) -> None:
-    content = {"name": "a", "split": {"train": ["a", "b"], "validation": [], "test": ["c"]}, "scenes": {"a": {"gravity": 1.0}}}
+    content = {
+        "name": "a",
+        "split": {"train": ["a", "b"], "validation": [], "test": ["c"]},
+        "scenes": {"a": {"gravity": 1.0}},
+    }
 
     @cases(60)
     @given(changed(content), st.sampled_from([None, {"gravity": 1.0}, {"gravity": [1.0]}]))
@@ -312,7 +376,12 @@ def test_yaml_of_settings(empty_folder, good, nothing_long) -> None:
     (empty_folder / "conf" / "experiment").mkdir(parents=True)
 
     @cases(40)
-    @given(YAML | changed({"scene": SCENE, "seed": 1, "hydra": {"verbose": True}, "defaults": ["_self_"]}).map(json.dumps))
+    @given(
+        YAML
+        | changed({"scene": SCENE, "seed": 1, "hydra": {"verbose": True}, "defaults": ["_self_"]}).map(
+            json.dumps
+        )
+    )
     def check(text: str) -> None:
         file = empty_folder / "conf" / "experiment" / "x.yaml"
         file.write_text("# @package _global_\n" + text, encoding="utf-8", errors="surrogatepass")
@@ -330,11 +399,26 @@ def spoiled(draw: Any, names: list[str], attributes: list[str]) -> list[tuple[An
     """What is done to an HDF5 file."""
     actions = []
     for _ in range(draw(st.integers(1, 3))):
-        kind = draw(st.sampled_from(["missing", "shape", "huge", "type", "values", "group", "link", "attribute", "text"]))
+        kind = draw(
+            st.sampled_from(
+                ["missing", "shape", "huge", "type", "values", "group", "link", "attribute", "text"]
+            )
+        )
         shape = draw(st.lists(st.sampled_from([0, 1, 2, 3, 4, 6, 7]), max_size=4))
         dtype = draw(st.sampled_from(["<f4", "<f8", "<i8", "u1", "S5", ">f8", "<f2", "c16", "?"]))
         huge = draw(st.sampled_from([10**6, 10**9, 10**12, 10**15]))
-        actions.append((kind, draw(st.sampled_from(names)), shape, dtype, huge, draw(st.sampled_from(attributes)), draw(VALUES), draw(YAML)))
+        actions.append(
+            (
+                kind,
+                draw(st.sampled_from(names)),
+                shape,
+                dtype,
+                huge,
+                draw(st.sampled_from(attributes)),
+                draw(VALUES),
+                draw(YAML),
+            )
+        )
     return actions
 
 
@@ -359,7 +443,9 @@ def spoil(file: h5py.File, actions: list[tuple[Any, ...]]) -> None:
             file.create_dataset(name, tuple(shape), dtype)
         elif kind == "huge":
             tail = shown[1:] if len(shown) else ()
-            file.create_dataset(name, (huge, *tail), old_dtype(dtype), chunks=(1, *tail), maxshape=(None, *tail))
+            file.create_dataset(
+                name, (huge, *tail), old_dtype(dtype), chunks=(1, *tail), maxshape=(None, *tail)
+            )
         elif kind == "type":
             file.create_dataset(name, shown, dtype)
         elif kind == "values":
@@ -370,7 +456,9 @@ def spoil(file: h5py.File, actions: list[tuple[Any, ...]]) -> None:
         elif kind == "group":
             file.create_group(name)
         elif kind == "link":
-            file[name] = h5py.ExternalLink("/etc/hostname", "/x") if huge > 10**9 else h5py.SoftLink("/nowhere")
+            file[name] = (
+                h5py.ExternalLink("/etc/hostname", "/x") if huge > 10**9 else h5py.SoftLink("/nowhere")
+            )
 
 
 def old_dtype(dtype: str) -> str:
@@ -455,7 +543,9 @@ def test_bases(good, tmp_path) -> None:
 
 # --- paths, meshes, checkpoints, TFRecords ----------------------------------------------------------------
 
-LINES = st.lists(st.sampled_from(["0", "1.5", "nan", "inf", "-1e400", "", "a", '"', "0x1", "1_0", "\0", "é"]), max_size=9).map(",".join)
+LINES = st.lists(
+    st.sampled_from(["0", "1.5", "nan", "inf", "-1e400", "", "a", '"', "0x1", "1_0", "\0", "é"]), max_size=9
+).map(",".join)
 
 
 def test_csv_paths(tmp_path) -> None:
@@ -463,10 +553,18 @@ def test_csv_paths(tmp_path) -> None:
     good = header + "".join(f"{0.1 * i},0.1,0.1,0.2,0,0,0,1\n" for i in range(4))
 
     @cases(60)
-    @given(damaged(good.encode()) | st.lists(LINES, max_size=5).map(lambda rows: (header + "\n".join(rows)).encode()))
+    @given(
+        damaged(good.encode())
+        | st.lists(LINES, max_size=5).map(lambda rows: (header + "\n".join(rows)).encode())
+    )
     def check(content: bytes) -> None:
         (tmp_path / "path.csv").write_bytes(content)
-        body = {"kind": "body", "bed": BED, "duration": 0.2, "tool": {"shape": "box", "size": [0.1, 0.1, 0.1]}}
+        body = {
+            "kind": "body",
+            "bed": BED,
+            "duration": 0.2,
+            "tool": {"shape": "box", "size": [0.1, 0.1, 0.1]},
+        }
         refused_or_read(lambda: Scene.from_dict(body | {"path": read_path(tmp_path / "path.csv")}))
 
     check()
@@ -478,11 +576,18 @@ def test_meshes(tmp_path) -> None:
     binary = b"x" * 80 + struct.pack("<I", 4)
     for face in faces:
         binary += struct.pack("<12fH", 0, 0, 0, *(value for k in face for value in corners[k]), 0)
-    rows = "".join("facet\n" + "".join("vertex {} {} {}\n".format(*corners[k]) for k in face) for face in faces)
+    rows = "".join(
+        "facet\n" + "".join("vertex {} {} {}\n".format(*corners[k]) for k in face) for face in faces
+    )
     obj = "".join("v {} {} {}\n".format(*c) for c in corners) + "".join(
         f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces
     )
-    words = st.lists(st.sampled_from(["v 1 2 3", "f 1 2 3", "f 1/2 2 9", "f 1e9", "f -1 -2 -3", "v a b c", f"f {10**30} 1 2"]), max_size=6)
+    words = st.lists(
+        st.sampled_from(
+            ["v 1 2 3", "f 1 2 3", "f 1/2 2 9", "f 1e9", "f -1 -2 -3", "v a b c", f"f {10**30} 1 2"]
+        ),
+        max_size=6,
+    )
 
     @cases(60)
     @given(
@@ -518,7 +623,10 @@ def test_checkpoints(good, tmp_path) -> None:
         refused_or_read(play)
 
     @cases(30)
-    @given(st.sampled_from(sorted(state)), st.sampled_from(["missing", "huge", "shape", "type", "nan", "sparse", "none"]))
+    @given(
+        st.sampled_from(sorted(state)),
+        st.sampled_from(["missing", "huge", "shape", "type", "nan", "sparse", "none"]),
+    )
     def other_state(name: str, kind: str) -> None:
         value = state[name]
         changes = {
@@ -560,7 +668,10 @@ def test_published_files(tmp_path) -> None:
     data = struct.pack("<Q", len(one)) + b"crc!" + one + b"crc!"
 
     @cases(80)
-    @given(damaged(data) | st.just(data), changed({"dataset_split": {"valid": [186]}}) | st.just({"dataset_split": {"valid": [186]}}))
+    @given(
+        damaged(data) | st.just(data),
+        changed({"dataset_split": {"valid": [186]}}) | st.just({"dataset_split": {"valid": [186]}}),
+    )
     def check(content: bytes, about: Any) -> None:
         (tmp_path / "valid.tfrecord").write_bytes(content)
         (tmp_path / "metadata.json").write_text(json.dumps(about))

@@ -180,7 +180,9 @@ def _run_hydra() -> None:
             if _line_of(error) is not None:
                 raise
             # Composing runs nothing of ours: what goes wrong there is in the settings.
-            raise UserError(f"the settings cannot be put together: {type(error).__name__}: {error}") from error
+            raise UserError(
+                f"the settings cannot be put together: {type(error).__name__}: {error}"
+            ) from error
         require_own_objects(cfg)
         return cfg
 

@@ -140,6 +140,8 @@ def open_run(path: str | os.PathLike[str]) -> h5py.File:
         raise UserError(f"no such run file: {path}; check the path, or make one with `sgns simulate`")
     if path.is_dir():
         raise UserError(f"{path} is a folder, not a run file; give one of the .h5 files in it")
+    if not path.is_file():
+        raise UserError(f"{path} is a pipe or device, not a run file")
     try:
         with path.open("rb") as file:
             file.read(1)
