@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import importlib
 import json
 import logging
 import os
@@ -52,10 +53,10 @@ SIMULATE = [
     "dataset=quick",
     "dataset.path={data}",
     "dataset.draw=[{rake:[0.0,10.0,20.0],depth:[0.02,0.04]}]",
-    "dataset.runs=5",
+    "dataset.runs=4",
     *BED[1:],
     "scene.speed=0.04",
-    "scene.duration=3.0",
+    "scene.duration=2.0",
 ]
 REDUCE = [
     "reduce",
@@ -109,7 +110,7 @@ class Row:
     equal: int = 0
     """Those of them whose result was that of the undisturbed command, bit for bit."""
     orphans: int = 0
-    """Processes that outlived the command by more than ten seconds."""
+    """Processes that outlived the command by more than half a minute."""
     leftovers: int = 0
     """Hidden files beside a complete result."""
     undisturbed_s: float = 0.0
@@ -239,6 +240,8 @@ class Begun:
                 os.dup2(file.fileno(), 1)
                 os.dup2(file.fileno(), 2)
             sys.argv = ["sgns", *arguments]
+            # So that worker processes begin as those of `python -m sgns` do, without this file and its imports.
+            sys.modules["__main__"] = importlib.import_module("sgns.__main__")
             status = sgns_main()
             sys.stdout.flush()
         finally:
@@ -272,7 +275,7 @@ def kill_after(begun: Begun, seconds: float, worker: bool) -> str | None:
     return hit
 
 
-def outlived(family: set[int], most: float = 10.0) -> int:
+def outlived(family: set[int], most: float = 30.0) -> int:
     """How many processes are still there after `most` seconds."""
     end = time.perf_counter() + most
     while (alive := [pid for pid in family if is_running(pid)]) and time.perf_counter() < end:
