@@ -31,7 +31,7 @@ import h5py
 import numpy as np
 import torch
 
-from sgns.cli import main as sgns_main
+from sgns import cli
 from sgns.errors import UserError
 from sgns.learning.surrogate import load_surrogate, read_checkpoint
 from sgns.reduction import Basis
@@ -127,6 +127,8 @@ def main() -> int:
     asked = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     torch.set_num_threads(1)
+    for command in COMMANDS:  # here, so that no time of the commands goes into imports
+        importlib.import_module(cli.COMMANDS[command].module)
     done = {row.command: row for row in read_rows(asked.table)}
     with tempfile.TemporaryDirectory(prefix="sgns_kills_") as name:
         bench = Bench(Path(name))
@@ -242,7 +244,7 @@ class Begun:
             sys.argv = ["sgns", *arguments]
             # So that worker processes begin as those of `python -m sgns` do, without this file and its imports.
             sys.modules["__main__"] = importlib.import_module("sgns.__main__")
-            status = sgns_main()
+            status = cli.main()
             sys.stdout.flush()
         finally:
             os._exit(status)
