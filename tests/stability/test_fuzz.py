@@ -278,7 +278,7 @@ def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_overrides(good, empty_folder, nothing_long) -> None:
-    @cases(130)
+    @cases(60)
     @given(overrides())
     def check(arguments: list[str]) -> None:
         command, *rest = arguments
@@ -339,7 +339,7 @@ YAML = st.one_of(
     ).map("".join),
     VALUES.map(json.dumps),
     st.integers(1, 30).map(lambda n: "a: &a [x,x]\n" + "b: &a [*a,*a]\n" * n),
-    st.sampled_from([1, 90, 110, 10**5]).map(lambda n: "[" * n + "]" * n),
+    st.sampled_from([1, 90, 110, 5000]).map(lambda n: "[" * n + "]" * n),
 )
 
 
@@ -375,7 +375,7 @@ def test_dataset_yaml(good, tmp_path) -> None:
 def test_yaml_of_settings(empty_folder, good, nothing_long) -> None:
     (empty_folder / "conf" / "experiment").mkdir(parents=True)
 
-    @cases(40)
+    @cases(30)
     @given(
         YAML
         | changed({"scene": SCENE, "seed": 1, "hydra": {"verbose": True}, "defaults": ["_self_"]}).map(
@@ -437,6 +437,8 @@ def spoil(file: h5py.File, actions: list[tuple[Any, ...]]) -> None:
         if not isinstance(old, h5py.Dataset):
             continue
         shown = old.shape
+        if kind == "values" and old.size > 10**6:
+            continue
         values = old[...] if kind == "values" else None
         del file[name]
         if kind == "shape":
