@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-import importlib
+import importlib.util
 import json
 import logging
 import os
@@ -22,6 +22,8 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
+import types
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -243,10 +245,14 @@ class Begun:
                 os.dup2(file.fileno(), 2)
             sys.argv = ["sgns", *arguments]
             # So that worker processes begin as those of `python -m sgns` do, without this file and its imports.
-            sys.modules["__main__"] = importlib.import_module("sgns.__main__")
+            sys.modules["__main__"] = types.ModuleType("__main__")
+            sys.modules["__main__"].__spec__ = importlib.util.find_spec("sgns.__main__")
             status = cli.main()
-            sys.stdout.flush()
+        except BaseException:
+            traceback.print_exc()
         finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
             os._exit(status)
 
     def running(self) -> bool:
