@@ -195,6 +195,7 @@ class Dataset:
         split = content.get("split") if isinstance(content, dict) else None
         if not isinstance(split, dict) or not all(_are_names(split.get(s)) for s in SPLITS):
             raise UserError(f"{file} has no split into {', '.join(SPLITS)}; it was not made by sgns simulate")
+        split = {part: split[part] for part in SPLITS}
         if where:
             scenes = content.get("scenes")
             if not isinstance(scenes, dict) or not all(isinstance(scene, dict) for scene in scenes.values()):

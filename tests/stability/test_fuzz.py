@@ -15,6 +15,7 @@ import string
 import struct
 import sys
 import zipfile
+from collections import Counter
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -26,7 +27,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
-from hypothesis import HealthCheck, Phase, event, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from omegaconf import OmegaConf
 from synthetic import make_run
 from test_published import record
@@ -50,6 +51,17 @@ SECONDS = 10
 """Of computing time, that a case may take."""
 MEMORY = 2 << 30
 """Bytes of address space that a case may take beside what the tests have."""
+
+
+OUTCOMES: Counter[str] = Counter()
+
+
+@pytest.fixture(autouse=True)
+def outcomes(request: pytest.FixtureRequest) -> Any:
+    """Say with `pytest -s` how many cases there were: a test whose cases are all refused shows less than it seems."""
+    OUTCOMES.clear()
+    yield
+    print(f"\n{request.node.name}: {OUTCOMES['accepted']} cases accepted, {OUTCOMES['refused']} refused")
 
 
 def cases(count: int) -> Any:
@@ -89,9 +101,9 @@ def refused_or_read(action: Any) -> None:
     with bounded():
         try:
             action()
-            event("accepted")
+            OUTCOMES["accepted"] += 1
         except (UserError, SceneError) as error:
-            event("refused")
+            OUTCOMES["refused"] += 1
             assert str(error).strip() and len(str(error)) < 5000, error
 
 
@@ -292,7 +304,7 @@ def test_overrides(good, empty_folder, nothing_long) -> None:
         }[command]
         status, said = call(command, *given_before, *rest)
         assert status in (0, 2), (status, said)
-        event("accepted" if status == 0 or said.endswith(": begun\n") else "refused")
+        OUTCOMES["accepted" if status == 0 or said.endswith(": begun\n") else "refused"] += 1
         assert "Traceback" not in said and (status == 0 or said.count("\n") >= 1), said
         assert status == 0 or said.splitlines()[-1].startswith(f"sgns {command}: "), said
 
@@ -387,6 +399,7 @@ def test_yaml_of_settings(empty_folder, good, nothing_long) -> None:
         file.write_text("# @package _global_\n" + text, encoding="utf-8", errors="surrogatepass")
         status, said = call("simulate", "--config-dir", str(empty_folder / "conf"), *SMALL, "+experiment=x")
         assert status in (0, 2) and "Traceback" not in said, said
+        OUTCOMES["accepted" if status == 0 or said.endswith(": begun\n") else "refused"] += 1
 
     check()
 
