@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import logging
 import os
 import sys
 from pathlib import Path
@@ -164,6 +165,7 @@ def run_command(cfg: DictConfig) -> float | None:
 
 
 def _run_hydra() -> None:
+    logging.raiseExceptions = False  # a line that a full disk does not take is no reason for a traceback
     # With this variable Hydra passes errors on as they are, in place of its own block of text and status 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     import hydra
