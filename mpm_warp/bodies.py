@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .errors import SceneError
+from .inputs import read_bytes
 from .mesh_file import closed_mesh, read_mesh
 
 __all__ = ["Body", "Box", "Cylinder", "MeshBody", "Plate"]
@@ -228,9 +229,9 @@ class MeshBody(Body):
         if not self.file:
             raise SceneError("tool.file is missing; a mesh needs an STL or OBJ file")
         try:
-            digest = hashlib.blake2b(Path(self.file).read_bytes(), digest_size=8).hexdigest()
-        except OSError as error:
-            raise SceneError(f"tool.file: cannot read {self.file}: {error.strerror}") from None
+            digest = hashlib.blake2b(read_bytes(Path(self.file)), digest_size=8).hexdigest()
+        except (OSError, ValueError) as error:
+            raise SceneError(f"tool.file: cannot read {self.file}: {error}") from None
         if self.digest not in ("", digest):
             raise SceneError(
                 f"tool.file: {self.file} is not the file this scene was made with ({self.digest}, now {digest}); "

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from .errors import SceneError
+from .inputs import read_bytes
 
 __all__ = ["closed_mesh", "read_mesh"]
 
@@ -23,10 +24,10 @@ def read_mesh(file: Path) -> tuple[np.ndarray, np.ndarray]:
     if reader is None:
         raise SceneError(f"tool.file is {file}; allowed: {', '.join(f'*{s}' for s in readers)}")
     try:
-        vertices, triangles = reader(file.read_bytes())
+        vertices, triangles = reader(read_bytes(file))
     except OSError as error:
         raise SceneError(f"tool.file: cannot read {file}: {error.strerror}") from None
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise SceneError(f"tool.file: {file} is not a good {file.suffix[1:].upper()} file: {error}") from None
     if len(triangles) == 0:
         raise SceneError(f"tool.file: {file} holds no triangles")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,10 +21,13 @@ import yaml
 from omegaconf import OmegaConf
 
 from mpm_warp import Decision, Effects, Scene
+from mpm_warp.inputs import read_text
+from sgns.claim import claimed
 from sgns.errors import UserError
 from sgns.scene_effects import decided
 from sgns.settings import flattened
 from sgns.wholefile import write_whole
+from sgns.yaml_text import parse_yaml
 
 __all__ = ["SPLITS", "Campaign", "Dataset", "plan"]
 
@@ -68,18 +72,22 @@ class Campaign:
     def record(self) -> None:
         """Write dataset.yaml, or check that the folder's own says the same."""
         file = self.path / "dataset.yaml"
-        if file.exists():
-            if _read(file) != self.describe():
-                raise UserError(
-                    f"{self.path} holds a dataset made with other settings; give another dataset.path, or remove "
-                    "the folder to make this one"
-                )
-            return
         try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(file, yaml.safe_dump(self.describe(), sort_keys=False))
+            while not file.exists():
+                with claimed(
+                    file
+                ) as ours:  # of two campaigns that begin at once the second finds the first's
+                    if ours and not file.exists():
+                        write_whole(file, yaml.safe_dump(self.describe(), sort_keys=False))
+                        return
+                time.sleep(0.05)
         except OSError as error:
             raise UserError(f"cannot write {file}: {error.strerror}") from None
+        if _read(file) != self.describe():
+            raise UserError(
+                f"{self.path} holds a dataset made with other settings; give another dataset.path, or remove "
+                "the folder to make this one"
+            )
 
 
 def plan(
@@ -185,12 +193,16 @@ class Dataset:
             )
         content = _read(file)
         split = content.get("split") if isinstance(content, dict) else None
-        if not isinstance(split, dict) or not all(isinstance(split.get(s), list) for s in SPLITS):
+        if not isinstance(split, dict) or not all(_are_names(split.get(s)) for s in SPLITS):
             raise UserError(f"{file} has no split into {', '.join(SPLITS)}; it was not made by sgns simulate")
+        split = {part: split[part] for part in SPLITS}
         if where:
-            split = _chosen(split, content.get("scenes") or {}, where, file)
+            scenes = content.get("scenes")
+            if not isinstance(scenes, dict) or not all(isinstance(scene, dict) for scene in scenes.values()):
+                raise UserError(f"{file} does not say what the scenes are, which dataset.where asks for")
+            split = _chosen(split, scenes, where, file)
         dataset = cls(name=str(content.get("name", path.name)), path=path, split=split)
-        missing = [run for s in SPLITS for run in dataset.runs(s) if not run.exists()]
+        missing = [run for s in SPLITS for run in dataset.runs(s) if not os.path.exists(run)]
         if missing:
             raise UserError(
                 f"runs of {path} are missing: {len(missing)}, the first is {missing[0].name}; finish the dataset: "
@@ -203,6 +215,13 @@ class Dataset:
         if split not in SPLITS:
             raise UserError(f"split is {split!r}; allowed: {', '.join(SPLITS)}")
         return [self.path / "runs" / f"{name}.h5" for name in self.split[split]]
+
+
+def _are_names(names: Any) -> bool:
+    """Whether these are names of files in one folder."""
+    return isinstance(names, list) and all(
+        isinstance(name, str) and name and not set(name) & {"/", os.sep, "\0"} for name in names
+    )
 
 
 def _chosen(
@@ -219,7 +238,7 @@ def _chosen(
         there = {name: scene[key] for name, scene in known.items()}
         known = {name: scene for name, scene in known.items() if any(_same(there[name], a) for a in allowed)}
         if not known:
-            values = ", ".join(map(str, sorted(set(there.values()), key=str)))
+            values = ", ".join(sorted(set(map(str, there.values()))))
             raise UserError(f"dataset.where leaves no run: {key} is {allowed}; in {file} it is {values}")
     return {part: [name for name in names if name in known] for part, names in split.items()}
 
@@ -233,6 +252,6 @@ def _same(a: Any, b: Any) -> bool:
 
 def _read(file: Path) -> Any:
     try:
-        return yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        return parse_yaml(read_text(file))
+    except (OSError, ValueError) as error:
         raise UserError(f"cannot read {file}: {str(error).splitlines()[0]}") from None

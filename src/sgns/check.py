@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from omegaconf import OmegaConf
 
 from sgns.errors import UserError
 from sgns.runs import check_run
@@ -29,8 +32,8 @@ def run_files(paths: Iterable[str | Path]) -> list[Path]:
     """
     files: list[Path] = []
     for path in map(Path, paths):
-        if not path.is_dir():
-            if not path.exists():
+        if not os.path.isdir(path):  # unlike Path.is_dir, takes any name
+            if not os.path.exists(path):
                 raise UserError(f"{path}: no such file; give run files (.h5) or folders of them")
             files.append(path)
             continue
@@ -51,7 +54,10 @@ def main(cfg: DictConfig) -> float:
     Raises:
         UserError: A path is missing or a file has a problem; all problems have been listed before.
     """
-    files = run_files([cfg.files] if isinstance(cfg.files, str) else cfg.files)
+    named = [cfg.files] if isinstance(cfg.files, str) else OmegaConf.to_container(cfg)["files"]
+    if not isinstance(named, list) or not all(isinstance(path, str) for path in named):
+        raise UserError(f"files is {named!r}; it must be paths of run files, as in sgns check run.h5")
+    files = run_files(named)
     bad = 0
     for path in files:
         try:

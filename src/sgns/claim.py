@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
 
 try:
     import fcntl
@@ -33,24 +32,36 @@ def claimed(path: Path) -> Iterator[bool]:
         yield file is not None
     finally:
         if file is not None:
-            lock.unlink(
-                missing_ok=True
-            )  # before the lock is given up: who opened it meanwhile sees that it is gone
-            file.close()
+            with suppress(OSError):  # in some shared folders nobody may remove another user's file
+                lock.unlink()  # before the lock is given up: who opened it meanwhile sees that it is gone
+            os.close(file)
 
 
-def _locked(lock: Path) -> BinaryIO | None:
-    """The lock file, open; None when another process holds it."""
+def _locked(lock: Path) -> int | None:
+    """Descriptor of the lock file, locked; None when another process holds it."""
     while True:
-        file = lock.open("ab")
+        file = _opened(lock)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            file.close()
+            os.close(file)
             return None
         except OSError:  # no locks here
             return file
         with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
+            if os.path.samestat(os.fstat(file), lock.stat()):
                 return file
-        file.close()  # the process that held it removed it between our opening and locking it
+        os.close(file)  # the process that held it removed it between our opening and locking it
+
+
+def _opened(lock: Path) -> int:
+    """Descriptor of the lock file, which other users may open, too, whatever the umask."""
+    while True:
+        try:
+            file = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        except FileExistsError:
+            with suppress(FileNotFoundError):  # removed in between
+                return os.open(lock, os.O_RDWR)  # network file systems lock only what may be written
+        else:
+            os.fchmod(file, 0o666)
+            return file

@@ -16,12 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
+from mpm_warp.inputs import read_bytes, read_text
 from sgns.errors import UserError
 
 __all__ = ["PublishedRun", "excavation_case", "published_files", "read_published", "wheel_case"]
 
 _SUBSPACE = 6  # the particle type of a subspace node; all others are nodes of the rigid body
 _FREE = 0  # the particle type of a wheel's nodes; those of a blade, which is prescribed, are 3
+_MOST_BYTES = 1 << 33  # of a .tfrecord; the authors' largest has a tenth of that
 _MARGIN = 0.1  # the authors' bin starts at this coordinate on each axis [m]
 _BINS = {"excavation": (0.80, 0.60, 0.15), "wheel": (0.40, 0.19, 0.0583)}  # Lx, Ly, Lz [m]
 
@@ -103,17 +105,21 @@ def read_published(
     """
     folder = Path(folder)
     try:
-        metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
+        metadata = json.loads(read_text(folder / "metadata.json"))
         cases = metadata["dataset_split"].get(split)
-        records = list(_records((folder / f"{split}.tfrecord").read_bytes()))
+        records = list(_records(read_bytes(folder / f"{split}.tfrecord", _MOST_BYTES)))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, struct.error) as error:
         raise UserError(f"{folder} does not hold the published {split} runs: {error}") from None
     if cases is None:
         cases = [None] * len(records)
-    if not isinstance(cases, list) or len(cases) != len(records):
+    if not isinstance(cases, list) or not all(case is None or type(case) is int for case in cases):
+        raise UserError(f"{folder}: metadata.json does not name the {split} runs by their numbers")
+    if len(cases) != len(records):
         raise UserError(
             f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {len(records)}"
         )
+    if not records:
+        raise UserError(f"{folder}/{split}.tfrecord holds no run")
     try:
         return [_run(case, record, bin_size) for case, record in zip(cases, records, strict=True)]
     except (ValueError, KeyError, IndexError, struct.error) as error:

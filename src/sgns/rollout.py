@@ -266,6 +266,7 @@ def rollout_scene(
 
 def main(cfg: DictConfig) -> float:
     """The `sgns rollout` command; returns wall seconds per simulated second (steps with force)."""
+    from sgns.cost import require_space, run_cost
     from sgns.scenes import scene_from_config
     from sgns.simulator import Simulator
 
@@ -279,6 +280,7 @@ def main(cfg: DictConfig) -> float:
     if ignored:
         log.warning("the network follows the tool's path only; it does not know of %s", ", ".join(ignored))
     output = Path(cfg.output)
+    require_space(output.parent, run_cost(scene).size)
     timing = rollout_scene(simulator, scene, output, seed=cfg.seed, checkpoint=cfg.checkpoint)
     log.info("rolled out %d frames (%.3g s) into %s", scene.frame_count, timing.simulated, output)
     log.info("wall seconds per simulated second: %.3g stepping with force", timing.stepping_rate)

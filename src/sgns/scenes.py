@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import csv
+import io
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
 from mpm_warp import Scene
+from mpm_warp.inputs import read_text
 from sgns.errors import UserError
 
 __all__ = ["read_path", "scene_from_config"]
+
+
+_MOST_BYTES = 1 << 26
+"""Of a path file: a minute in steps of a millisecond takes a tenth of that."""
 
 
 def scene_from_config(cfg: DictConfig) -> Scene:
@@ -26,9 +32,8 @@ def read_path(file: Path) -> list[list[float]]:
     """Rows t, x, y, z, qx, qy, qz, qw of a CSV file with a header line."""
     wanted = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
     try:
-        with file.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.reader(stream))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = list(csv.reader(io.StringIO(read_text(file, _MOST_BYTES), newline="")))
+    except (OSError, ValueError, csv.Error) as error:
         raise UserError(f"scene.path: cannot read {file}: {error}") from None
     if not rows or [name.strip() for name in rows[0]] != wanted:
         raise UserError(f"scene.path: the first line of {file} must be {','.join(wanted)}")

@@ -3,23 +3,34 @@
 from __future__ import annotations
 
 import os
-import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from sgns.leftovers import hidden_beside, hold, remove_leftovers
 
 __all__ = ["whole_file", "write_whole"]
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A hidden path beside `path` to write to; it gets its name at the end, or is removed after an exception."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp")
+    """A hidden path beside `path` to write to; it gets its name at the end, or is removed after an exception.
+
+    Raises:
+        OSError: The disk does not take it; the error names `path`.
+    """
+    temporary = hidden_beside(path)
     try:
-        yield temporary
-        with temporary.open("r+b") as written:
-            os.fsync(written.fileno())
+        remove_leftovers(path)
+        with temporary.open("xb") as held:
+            hold(held)
+            yield temporary
+            os.fsync(held.fileno())
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename in (None, str(temporary)):  # a full disk is reported without a name
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

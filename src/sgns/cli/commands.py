@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import logging
 import os
 import sys
 from pathlib import Path
@@ -70,7 +71,16 @@ COMMANDS = {
 
 
 # What the system says when results cannot be written where they should go.
-_UNWRITABLE = (errno.EACCES, errno.EEXIST, errno.EISDIR, errno.ENOSPC, errno.ENOTDIR, errno.EROFS)
+_UNWRITABLE = (
+    errno.EACCES,
+    errno.EEXIST,
+    errno.EISDIR,
+    errno.ENAMETOOLONG,
+    errno.ENOTDIR,
+    errno.EPERM,
+    errno.EROFS,
+)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class _Stopped(BaseException):
@@ -159,11 +169,35 @@ def run_command(cfg: DictConfig) -> float | None:
 
 
 def _run_hydra() -> None:
+    logging.raiseExceptions = False  # a line that a full disk does not take is no reason for a traceback
     # With this variable Hydra passes errors on as they are, in place of its own block of text and status 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     import hydra
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
 
-    hydra.main(version_base="1.3", config_path="pkg://sgns.conf")(run_command)()
+    from sgns.cli.own_objects import require_own_objects
+
+    compose = ConfigLoaderImpl.load_configuration
+
+    def checked(self: ConfigLoaderImpl, *args: Any, **settings: Any) -> DictConfig:
+        try:
+            cfg = compose(self, *args, **settings)
+        except Exception as error:
+            if _line_of(error) is not None:
+                raise
+            # Composing runs nothing of ours: what goes wrong there is in the settings.
+            raise UserError(
+                f"the settings cannot be put together: {type(error).__name__}: {error}"
+            ) from error
+        require_own_objects(cfg)
+        return cfg
+
+    # Hydra makes objects right after it has composed the settings, and calls nobody in between.
+    ConfigLoaderImpl.load_configuration = checked
+    try:
+        hydra.main(version_base="1.3", config_path="pkg://sgns.conf")(run_command)()
+    finally:
+        ConfigLoaderImpl.load_configuration = compose
 
 
 def _help() -> str:
@@ -286,10 +320,21 @@ def _line_of(error: Exception) -> str | None:
     mpm_warp = sys.modules.get("mpm_warp")
     if mpm_warp is not None and isinstance(error, (mpm_warp.SceneError, mpm_warp.SolverStopped)):
         return _one_line(str(error))
+    if isinstance(error, OSError) and error.errno in _FULL:
+        where = "" if error.filename is None else f"{error.filename}: "
+        return f"{where}{error.strerror}; free some space; what is complete is kept, and the same command goes on"
     if isinstance(error, OSError) and error.errno in _UNWRITABLE and error.filename is not None:
         return f"{error.filename}: {error.strerror}; choose another output"
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "can't allocate" in str(error)):
+        reason = _one_line(str(error)) or "no reason given"
+        return (
+            f"more memory is needed than there is ({reason}); make the scene, the data or the network smaller"
+        )
     if "omegaconf" not in sys.modules:
         return None
+    taken_out = [argument for argument in sys.argv if argument.startswith("~")]
+    if taken_out and isinstance(error, (AttributeError, KeyError)):
+        return f"{' '.join(taken_out)}: what is taken out here is needed; leave this out"
     from sgns.cli.setting_errors import describe
 
     return describe(error)

@@ -42,6 +42,14 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
         raise UserError(f"checkpoint is {_shown(cfg.checkpoint)}; it must be a path")
     if "seed" in cfg and (not isinstance(cfg.seed, int) or isinstance(cfg.seed, bool) or cfg.seed < 0):
         raise UserError(f"seed is {_shown(cfg.seed)}; it must be a whole number, 0 or more")
+    modes = cfg.get("num_modes")
+    if modes is not None and (not isinstance(modes, int) or isinstance(modes, bool) or modes < 1):
+        raise UserError(f"num_modes is {_shown(modes)}; it must be a whole number, 1 or more, or null")
+    where = OmegaConf.select(cfg, "dataset.where")
+    if where is not None and not isinstance(where, DictConfig):
+        raise UserError(
+            f"dataset.where is {_shown(where)}; it must be keys of the scene with their values, or null"
+        )
     if "device" in cfg and not isinstance(cfg.device, str):
         raise UserError(f"device is {_shown(cfg.device)}; allowed: cpu, cuda")
 

@@ -265,6 +265,8 @@ def main(cfg: DictConfig) -> float:
     from sgns.simulator import Simulator
 
     new_rollouts = [cfg.new_rollouts] if isinstance(cfg.new_rollouts, str) else cfg.new_rollouts or []
+    if not isinstance(new_rollouts, Sequence):
+        raise UserError(f"new_rollouts is {new_rollouts!r}; it must be a list of run files, as [a.h5,b.h5]")
     if not isinstance(cfg.timing_repeats, int) or cfg.timing_repeats < 3:
         raise UserError(f"timing_repeats is {cfg.timing_repeats!r}; it must be a whole number, at least 3")
     if not isinstance(cfg.full_space, bool):

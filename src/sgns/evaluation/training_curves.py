@@ -29,8 +29,9 @@ def read_log(folder: Path) -> dict[str, np.ndarray]:
     if not folder.is_dir():
         return {}
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
+    # A training that was killed logs some steps again, and its files are out of order if the clock went back.
     return {
-        name: np.array([(event.step, event.value) for event in events.Scalars(name)], dtype=np.float64)
+        name: np.array(sorted({e.step: e.value for e in events.Scalars(name)}.items()), dtype=np.float64)
         for name in events.Tags()["scalars"]
         if name.startswith("loss/") or name in VALIDATION
     }

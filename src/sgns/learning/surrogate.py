@@ -8,7 +8,9 @@ network's is written by Lightning and also holds what is needed to go on trainin
 
 from __future__ import annotations
 
+import io
 import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from sgns.learning.training_range import TrainingRange
 from sgns.reduction.basis import Basis
 from sgns.wholefile import whole_file
 
-__all__ = ["Surrogate", "load_surrogate", "read_checkpoint"]
+__all__ = ["Surrogate", "load_surrogate", "read_checkpoint", "write_checkpoint"]
 
 _FORMAT = "sgns-surrogate"
 _FORMAT_VERSION = 2
@@ -39,6 +41,9 @@ _UNREADABLE = (
     AttributeError,
     IndexError,
     ImportError,
+    MemoryError,
+    ArithmeticError,
+    NotImplementedError,
 )
 
 
@@ -100,13 +105,24 @@ class Surrogate(nn.Module):
     def save(self, path: Path) -> None:
         """Write a checkpoint without anything to go on training from."""
         state = {f"{_PREFIX}{name}": value for name, value in self.state_dict().items()}
-        with whole_file(path) as temporary:
-            torch.save({"state_dict": state, "hyper_parameters": self.card}, temporary)
+        write_checkpoint({"state_dict": state, "hyper_parameters": self.card}, path)
 
     @property
     def start_latent(self) -> Tensor:
         """The common start in the basis [m], shape (r, 3), float64."""
         return self.basis.transform(self.start_positions.cpu())
+
+
+def write_checkpoint(content: dict[str, Any], path: Path) -> None:
+    """Write a checkpoint; it appears complete or not at all.
+
+    Raises:
+        OSError: The disk does not take it.
+    """
+    buffer = io.BytesIO()  # torch says of a full disk only that some position is unexpected
+    torch.save(content, buffer)
+    with whole_file(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -122,20 +138,21 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
             "<folder>/best.ckpt"
         )
     try:
+        _require_plain_archive(path)
         content = torch.load(path, map_location="cpu", weights_only=True)
     except _UNREADABLE as error:
         raise UserError(
             f"{path} cannot be read as a checkpoint; it is truncated or something else; train again"
         ) from error
     card = content.get("hyper_parameters") if isinstance(content, dict) else None
-    if not isinstance(card, dict) or card.get("format") != _FORMAT or "state_dict" not in content:
+    state = content.get("state_dict") if isinstance(content, dict) else None
+    if not isinstance(card, dict) or card.get("format") != _FORMAT or not isinstance(state, dict):
         raise UserError(
             f"{path} is not a checkpoint of sgns; use best.ckpt or last.ckpt of an output of sgns train"
         )
-    if int(card.get("format_version", 0)) > _FORMAT_VERSION:
+    if not isinstance(version := card.get("format_version", 0), int) or version > _FORMAT_VERSION:
         raise UserError(
-            f"{path} has format {card['format_version']}, newer than this program reads "
-            f"({_FORMAT_VERSION}); update sgns"
+            f"{path} has format {version!r}, newer than this program reads ({_FORMAT_VERSION}); update sgns"
         )
     return content
 
@@ -148,12 +165,14 @@ def load_surrogate(path: str | Path) -> Surrogate:
     """
     content = read_checkpoint(path)
     card = content["hyper_parameters"]
-    state = {
-        key.removeprefix(_PREFIX): value
-        for key, value in content["state_dict"].items()
-        if key.startswith(_PREFIX)
-    }
     try:
+        state = {
+            key.removeprefix(_PREFIX): value
+            for key, value in content["state_dict"].items()
+            if key.startswith(_PREFIX)
+        }
+        _require_own_values(state)
+        _require_described(state, card)
         tensors = {name: state[f"basis_{name}"] for name in ("mean", "modes", "eigenvalues")}
         basis = Basis.from_state(card["basis"] | tensors, where=str(path))
         surrogate = Surrogate(dynamics_of(card), basis, state["start_positions"], state["body_points"], card)
@@ -161,9 +180,56 @@ def load_surrogate(path: str | Path) -> Surrogate:
         surrogate.frame_rate  # noqa: B018  (present and a number)
         if not all(bool(value.isfinite().all()) for value in state.values() if value.is_floating_point()):
             raise ValueError("it holds numbers that are not finite")
-    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+    except UserError as error:
+        raise UserError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    except _UNREADABLE as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(
             f"{path} is a checkpoint whose parts do not fit together ({reason}); train again"
         ) from error
     return surrogate.eval().requires_grad_(False)
+
+
+def _require_plain_archive(path: Path) -> None:
+    """Refuses what `torch.save` does not write: archives with compressed parts, whose size nobody knows before, and
+    the formats of before them."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            compressed = any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist())
+    except (zipfile.BadZipFile, NotImplementedError) as error:
+        raise ValueError(str(error)) from error
+    if compressed:
+        raise ValueError("its parts are compressed")
+
+
+def _require_own_values(state: dict[str, Any]) -> None:
+    """Refuses tensors that claim more values than the file holds, by strides of zero."""
+    for name, value in state.items():
+        if not isinstance(value, Tensor) or value.layout != torch.strided:
+            raise ValueError(f"{name} is not a plain tensor")
+        if value.untyped_storage().nbytes() < value.numel() * value.element_size():
+            raise ValueError(f"{name} claims more values than there are")
+
+
+def _require_described(state: dict[str, Any], card: dict[str, Any]) -> None:
+    """Refuses a card that describes more than there is in the file, before it is built."""
+    model, scene = card["model"], card["scene"]
+    if not isinstance(scene, dict) or not isinstance(scene.get("bed", {}), dict):
+        raise ValueError("its card does not say what the scene is")
+    if model.get("kind", "network") == "polynomial":
+        inputs, terms = len(card["used"]), state["dynamics.weights"].shape[0]
+        groups = len(state["dynamics.inputs.mean"]) // (3 * int(card["num_modes"]))
+        if (
+            model["history"] > groups
+            or (inputs * (inputs + 1) // 2 if model["degree"] == 2 else inputs) > terms
+        ):
+            raise ValueError("its card describes other polynomials")
+        return
+    for key in ("hidden_layers", "message_passing_steps"):
+        if model[key] > len(state):
+            raise ValueError(f"model.{key} is {model[key]}, but there are {len(state)} tensors")
+    with torch.device("meta"):  # shapes without memory
+        described = dynamics_of(card).state_dict()
+    for name, value in described.items():
+        if state[f"dynamics.{name}"].shape != value.shape:
+            raise ValueError(f"{name} has not the shape {tuple(value.shape)} that its card says")

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import lightning as L
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins import TorchCheckpointIO
 from omegaconf import OmegaConf
 
 import sgns
@@ -36,7 +37,7 @@ from sgns.learning.polynomial_settings import FitSettings, PolynomialSettings
 from sgns.learning.polynomial_training import check_start, fit_polynomial
 from sgns.learning.statistics import fit_normalisation
 from sgns.learning.stepping import Dynamics
-from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint
+from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint, write_checkpoint
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.training_range import TrainingRange
 from sgns.learning.validation import ValidationRollouts
@@ -325,6 +326,18 @@ def make_folder(output: Path) -> None:
         ) from error
 
 
+class WholeCheckpoints(TorchCheckpointIO):
+    """Lightning's way of writing checkpoints, but none is ever seen half-written.
+
+    Its own writes to the machine's folder for temporary files and moves that, which is a copy where the results are on
+    another disk.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write it whole."""
+        write_checkpoint(checkpoint, Path(path))
+
+
 def make_trainer(
     output: Path,
     settings: TrainingSettings,
@@ -351,6 +364,7 @@ def make_trainer(
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
+        plugins=[WholeCheckpoints()],
     )
 
 

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from sgns.errors import UserError
-from sgns.wholefile import whole_file
+from sgns.hdf5 import BROKEN, own_dataset
+from sgns.runs.newfile import new_hdf5
 
 __all__ = ["CENTRINGS", "Basis"]
 
@@ -189,25 +190,19 @@ class Basis:
         Raises:
             UserError: If the file cannot be written.
         """
-        path = Path(path)
-        try:
-            with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
-                for key, value in self.state().items():
-                    if isinstance(value, Tensor):
-                        # Checksummed, so that a damaged file is an error and not a wrong basis.
-                        array = value.detach().cpu().numpy()
-                        file.create_dataset(key, data=array, chunks=True, fletcher32=True)
-                    elif isinstance(value, list):
-                        # A dataset, because an attribute holds 64 kB at most.
-                        file.create_dataset(key, data=json.dumps(value))
-                    else:
-                        file.attrs[key] = value
-                file.attrs["format"] = _FORMAT
-                file.attrs["si_unit"] = "mean: m; eigenvalues and variances: m2; modes: 1"
-        except OSError as error:
-            raise UserError(
-                f"cannot write the basis to {path}: {error}; choose a folder that exists and is writable"
-            ) from error
+        with new_hdf5(Path(path)) as file:
+            for key, value in self.state().items():
+                if isinstance(value, Tensor):
+                    # Checksummed, so that a damaged file is an error and not a wrong basis.
+                    array = value.detach().cpu().numpy()
+                    file.create_dataset(key, data=array, chunks=True, fletcher32=True)
+                elif isinstance(value, list):
+                    # A dataset, because an attribute holds 64 kB at most.
+                    file.create_dataset(key, data=json.dumps(value))
+                else:
+                    file.attrs[key] = value
+            file.attrs["format"] = _FORMAT
+            file.attrs["si_unit"] = "mean: m; eigenvalues and variances: m2; modes: 1"
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Basis:
@@ -224,9 +219,9 @@ class Basis:
                 if file.attrs.get("format") != _FORMAT:
                     raise UserError(f"{path}: an HDF5 file but not a basis; make one with `sgns reduce`")
                 state = {key: value for key, value in file.attrs.items()}
-                state["fitted_on"] = json.loads(file["fitted_on"][()])
-                state.update((key, torch.from_numpy(file[key][()])) for key in _ARRAYS)
-        except (OSError, ValueError, TypeError, KeyError, RuntimeError, AttributeError) as error:
+                state["fitted_on"] = json.loads(own_dataset(file, "fitted_on")[()])
+                state.update((key, torch.from_numpy(own_dataset(file, key)[()])) for key in _ARRAYS)
+        except (*BROKEN, AttributeError) as error:
             reason = " ".join(str(error).split())
             raise UserError(
                 f"{path}: not a readable basis, truncated or damaged ({reason}); fit again with `sgns reduce`"

@@ -28,13 +28,14 @@ from tqdm import tqdm
 
 from sgns.campaign import SPLITS, Dataset
 from sgns.errors import UserError
+from sgns.hdf5 import BROKEN, own_dataset
 from sgns.reduction.basis import CENTRINGS, Basis
 from sgns.reduction.choice import MEASURES, choose_modes
 from sgns.reduction.fitting import fit_runs, require_positions
 from sgns.reduction.incremental_pca import checked_device
 from sgns.runs import Run, frame_chunks
+from sgns.runs.newfile import new_hdf5
 from sgns.settings import check_fields
-from sgns.wholefile import whole_file
 
 __all__ = ["ReducedDataset", "ReducedRun", "reduce_dataset"]
 
@@ -253,7 +254,7 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
     if path.exists():
         try:
             return replace(read_reduced(path), name=run_path.stem)
-        except (OSError, KeyError, ValueError) as error:
+        except BROKEN as error:
             log.warning("%s is damaged (%s); reducing %s again", path, error, run_path)
     with Run(run_path) as run:
         parts = []
@@ -278,7 +279,7 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
 
 def write_reduced(path: Path, run: ReducedRun) -> None:
     """Write a reduced run; it appears complete or not at all."""
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(path) as file:
         for name in _SERIES:
             file.create_dataset(name, data=getattr(run, name))
         file.create_dataset("scene", data=json.dumps(run.scene))
@@ -290,10 +291,12 @@ def read_reduced(path: Path) -> ReducedRun:
     """Read a reduced run.
 
     Raises:
-        OSError, KeyError, ValueError: Not one.
+        One of sgns.hdf5.BROKEN: Not one.
     """
     with h5py.File(path, "r") as file:
         if file.attrs.get("format") != _FORMAT:
             raise ValueError("not a reduced run")
-        series = {name: file[name][()] for name in _SERIES}
-        return ReducedRun(name=str(file.attrs["name"]), scene=json.loads(file["scene"][()]), **series)
+        series = {name: own_dataset(file, name)[()] for name in _SERIES}
+        return ReducedRun(
+            name=str(file.attrs["name"]), scene=json.loads(own_dataset(file, "scene")[()]), **series
+        )

@@ -8,26 +8,19 @@ raise it.
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
-import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
-from uuid import uuid4
+
+import h5py
 
 from sgns.errors import UserError
+from sgns.leftovers import hidden_beside, hold, remove_leftovers
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
+__all__ = ["NewFile", "new_hdf5"]
 
-__all__ = ["NewFile"]
-
-log = logging.getLogger(__name__)
-
-_SUFFIX = ".partial"
 T = TypeVar("T")
 
 
@@ -49,17 +42,14 @@ class NewFile:
             raise UserError(f"{path} is a folder; give the name of a file, such as {path / 'run.h5'}")
         self.path = path
         self._error: BaseException | None = None
-        start = f".{path.name}.{socket.gethostname()}-"
-        self._temp = path.with_name(f"{start}{os.getpid()}-{uuid4().hex[:8]}{_SUFFIX}")
+        self._temp = hidden_beside(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            _remove_leftovers(path.parent, start)
+            remove_leftovers(path)
             self._file = open(self._temp, "xb+", buffering=0)
         except OSError as error:
             raise _cannot_write(path, error) from error
-        if fcntl is not None:
-            with contextlib.suppress(OSError):  # some file systems have no locks
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        hold(self._file)
 
     def check(self) -> None:
         """Raise what a read or write since the last check ran into."""
@@ -152,31 +142,20 @@ class NewFile:
             return otherwise
 
 
-def _remove_leftovers(folder: Path, start: str) -> None:
-    """Delete hidden files that begin with `start` and whose process on this machine was killed."""
-    if fcntl is None:
-        return
-    for found in folder.iterdir():
-        if not (found.name.startswith(start) and found.name.endswith(_SUFFIX)):
-            continue
-        pid = found.name[len(start) :].split("-")[0]
-        if not pid.isdecimal() or _alive(int(pid)):
-            continue
-        # A live process in a container may have a number that we cannot see; its lock shows that it is there.
-        with contextlib.suppress(OSError), found.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            found.unlink()
-            log.info("removed %s, left by a process that was killed", found)
+@contextmanager
+def new_hdf5(path: Path) -> Iterator[h5py.File]:
+    """An HDF5 file to fill; it appears under its name at the end, complete, or not at all.
 
-
-def _alive(pid: int) -> bool:
+    Raises:
+        UserError: the disk does not take it; nothing is left behind.
+    """
+    disk = NewFile(path)
     try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:
-        return True
-    return True
+        with h5py.File(disk, "w") as file:
+            yield file
+        disk.complete()
+    finally:
+        disk.discard()
 
 
 def _cannot_write(path: Path, error: OSError) -> UserError:

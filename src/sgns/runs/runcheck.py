@@ -12,18 +12,19 @@ import h5py
 import numpy as np
 
 from sgns.errors import UserError
+from sgns.hdf5 import BROKEN, own_dataset, own_object, require_own_view
 from sgns.poses import rotation_matrices
 from sgns.runs.runlayout import (
     ELEMENTS,
     PRODUCERS,
     one_line,
     open_run,
-    parse_yaml,
     read_attributes,
     structure_problems,
 )
 from sgns.runs.runwriter import ContentHash
 from sgns.runs.vtkhdf import view_problems
+from sgns.yaml_text import parse_yaml
 
 __all__ = ["check_run"]
 
@@ -33,8 +34,6 @@ QUATERNION_TOLERANCE = 1e-5
 """How far a quaternion's length may be from 1."""
 INTERVAL_TOLERANCE = 1e-2
 """How far the time between frames may be from 1 / frame_rate, as a share of it."""
-
-_BROKEN = (OSError, RuntimeError, KeyError, ValueError, TypeError)  # what h5py raises on damaged files
 
 
 def check_run(path: str | os.PathLike[str]) -> list[str]:
@@ -49,7 +48,7 @@ def check_run(path: str | os.PathLike[str]) -> list[str]:
     with file, np.errstate(all="ignore"):  # damaged numbers may be huge
         try:
             problems = structure_problems(file)
-        except _BROKEN as error:
+        except BROKEN as error:
             return [f"the file is damaged ({one_line(error)})"]
         checks = [_check_h5md, _check_attributes]
         if not problems:  # the rest relies on complete datasets of the right shapes
@@ -57,23 +56,24 @@ def check_run(path: str | os.PathLike[str]) -> list[str]:
         for check in checks:
             try:
                 problems += check(file)
-            except _BROKEN as error:
+            except BROKEN as error:
                 problems.append(f"the file is damaged ({one_line(error)})")
     return problems
 
 
 def _check_h5md(file: h5py.File) -> list[str]:
     problems = []
-    h5md = file.get("h5md")
+    h5md = own_object(file, "h5md")
     if not isinstance(h5md, h5py.Group):
         return ["group /h5md is missing"]
     if tuple(np.atleast_1d(h5md.attrs.get("version", ()))) != (1, 1):
         problems.append("attribute version of /h5md is not (1, 1)")
     for group, key in (("author", "name"), ("creator", "name"), ("creator", "version")):
-        if group not in h5md or key not in h5md[group].attrs:
+        found = own_object(h5md, group)
+        if found is None or key not in found.attrs:
             problems.append(f"attribute {key} of /h5md/{group} is missing")
     for group in ("soil", "body"):
-        box = file.get(f"particles/{group}/box")
+        box = own_object(file, f"particles/{group}/box")
         if box is None or "dimension" not in box.attrs or "boundary" not in box.attrs:
             problems.append(f"group /particles/{group}/box with dimension and boundary is missing")
     return problems
@@ -188,7 +188,10 @@ def _check_frames(file: h5py.File) -> list[str]:
     values = {name: file[f"{element.path}/value"] for name, element in ELEMENTS.items()}
     small = {name: values[name][...] for name in values if name not in ("position", "velocity")}
     small["time"] = file[f"{ELEMENTS['position'].path}/time"][...]
-    views = {"position": file.get("VTKHDF/Points"), "velocity": file.get("VTKHDF/PointData/velocity")}
+    views = {
+        "position": _view(file, "VTKHDF/Points"),
+        "velocity": _view(file, "VTKHDF/PointData/velocity"),
+    }
     frames, particles, _ = values["position"].shape
     found: dict[str, str] = {}  # the first problem of each kind
     content = ContentHash()
@@ -201,7 +204,7 @@ def _check_frames(file: h5py.File) -> list[str]:
                 found.setdefault(
                     f"{name} finite", f"{name} of particle {_first(~finite)} is not finite at frame {frame}"
                 )
-            if isinstance(view, h5py.Dataset) and view.shape == (frames * particles, 3):
+            if view is not None and view.shape == (frames * particles, 3):
                 seen = view[frame * particles : (frame + 1) * particles]
                 if not np.array_equal(seen, soil, equal_nan=True):
                     found.setdefault(f"{name} view", f"/VTKHDF shows another {name} at frame {frame}")
@@ -209,6 +212,18 @@ def _check_frames(file: h5py.File) -> list[str]:
     if content.hexdigest() != read_attributes(file)["content_hash"]:
         found["hash"] = "the data do not match content_hash: they were changed or damaged after the run"
     return list(found.values())
+
+
+def _view(file: h5py.File, path: str) -> h5py.Dataset | None:
+    """A dataset of this file's own values; what else may be there is reported with the view."""
+    try:
+        found = own_object(file, path)
+        if not isinstance(found, h5py.Dataset) or not found.is_virtual:
+            return own_dataset(file, path)
+        require_own_view(found)
+    except (KeyError, ValueError):
+        return None
+    return found
 
 
 def _first(wrong: np.ndarray) -> int | None:

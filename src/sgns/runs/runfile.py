@@ -15,7 +15,9 @@ import h5py
 import numpy as np
 
 from sgns.errors import UserError
-from sgns.runs.runlayout import ELEMENTS, one_line, open_run, parse_yaml, read_attributes, structure_problems
+from sgns.hdf5 import BROKEN
+from sgns.runs.runlayout import ELEMENTS, one_line, open_run, read_attributes, structure_problems
+from sgns.yaml_text import parse_yaml
 
 __all__ = ["Run"]
 
@@ -40,7 +42,7 @@ class Run:
             try:
                 problems = structure_problems(self._file)
                 self._attributes = read_attributes(self._file) if not problems else {}
-            except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            except BROKEN as error:
                 problems = [one_line(error)]
             if problems:
                 more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
@@ -177,7 +179,7 @@ class Run:
         if (name, part) not in self._cache:
             try:
                 self._cache[name, part] = self._dataset(name, part)[...].astype(np.float64)
-            except (OSError, RuntimeError) as error:
+            except BROKEN as error:
                 raise self._damaged(name, error) from error
         return self._cache[name, part].copy()
 
@@ -192,7 +194,7 @@ class Run:
             else:  # a frame is a chunk, so reading them one by one costs nothing extra
                 for row, frame in enumerate(index):
                     dataset.read_direct(out, np.s_[frame], np.s_[row])
-        except (OSError, RuntimeError) as error:
+        except BROKEN as error:
             raise self._damaged(name, error) from error
         return out
 

@@ -6,6 +6,7 @@ Letters: T frames, n soil particles, M body points.
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -13,9 +14,9 @@ from typing import Any
 
 import h5py
 import numpy as np
-import yaml
 
 from sgns.errors import UserError
+from sgns.hdf5 import BROKEN, own_dataset
 
 __all__ = [
     "ATTRIBUTES",
@@ -27,7 +28,6 @@ __all__ = [
     "one_line",
     "open_run",
     "package_version",
-    "parse_yaml",
     "read_attributes",
     "structure_problems",
     "write_text",
@@ -131,15 +131,6 @@ def one_line(error: object) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def parse_yaml(text: str) -> Any:
-    """Plain data from YAML text; ValueError if it is none, or has tags that would build Python objects."""
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same in C, where PyYAML has it
-    try:
-        return yaml.load(text, Loader=loader)
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # the last three: damaged text
-        raise ValueError(one_line(error)) from error
-
-
 def open_run(path: str | os.PathLike[str]) -> h5py.File:
     """The run file, open for reading; only that it is a run of ours is certain.
 
@@ -151,6 +142,8 @@ def open_run(path: str | os.PathLike[str]) -> h5py.File:
         raise UserError(f"no such run file: {path}; check the path, or make one with `sgns simulate`")
     if path.is_dir():
         raise UserError(f"{path} is a folder, not a run file; give one of the .h5 files in it")
+    if not path.is_file():
+        raise UserError(f"{path} is a pipe or device, not a run file")
     try:
         with path.open("rb") as file:
             file.read(1)
@@ -160,7 +153,7 @@ def open_run(path: str | os.PathLike[str]) -> h5py.File:
         raise UserError(f"{path} is not an HDF5 file; give a run made by `sgns simulate` or `sgns rollout`")
     try:
         file = h5py.File(path, "r")
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
+    except BROKEN as error:
         raise UserError(
             f"{path} is cut short or damaged and cannot be opened ({_reason(error)}); "
             "copy it again or repeat the run"
@@ -187,7 +180,7 @@ def _require_ours(file: h5py.File, path: Path) -> None:
     try:
         made_as = _text(file.attrs.get("format"))
         version = file.attrs.get("format_version")
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
+    except BROKEN as error:
         raise UserError(f"{path} is damaged ({_reason(error)}); copy it again or repeat the run") from error
     if not isinstance(made_as, str) or made_as != FORMAT:
         raise UserError(
@@ -234,6 +227,9 @@ def _attribute_problems(file: h5py.File) -> list[str]:
     for name, kind in kinds.items():
         if name in values and not isinstance(values[name], kind):
             problems.append(f"root attribute {name!r} has the wrong type ({type(values[name]).__name__})")
+    digest = values.get("content_hash")  # it becomes the name of a file
+    if isinstance(digest, str) and not re.fullmatch("[0-9a-f]{32}", digest):
+        problems.append(f"root attribute 'content_hash' is {digest[:40]!r}, not 32 hexadecimal digits")
     return problems
 
 
@@ -243,10 +239,15 @@ def _element_problems(file: h5py.File, element: Element, counts: dict[str, int])
     problems = []
     for part in ("value", "step", "time"):
         path = f"{element.path}/{part}"
-        found = file.get(path)
-        if not isinstance(found, h5py.Dataset):
+        try:
+            found = own_dataset(file, path)
+        except KeyError:
             problems.append(f"dataset /{path} is missing")
-        elif found.dtype.kind not in ("iu" if part == "step" else "f"):
+            continue
+        except ValueError as error:
+            problems.append(str(error))
+            continue
+        if found.dtype.kind not in ("iu" if part == "step" else "f"):
             problems.append(f"dataset /{path} has the wrong type {found.dtype}")
         else:
             datasets[part] = found

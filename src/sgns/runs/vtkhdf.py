@@ -10,6 +10,8 @@ from __future__ import annotations
 import h5py
 import numpy as np
 
+from sgns.hdf5 import own_dataset, own_object, require_own_view
+
 __all__ = ["view_problems", "write_view"]
 
 _GROUP = "VTKHDF"
@@ -67,7 +69,7 @@ def _virtual(group: h5py.Group, name: str, source: h5py.Dataset) -> None:
 
 def view_problems(file: h5py.File, frames: int, particles: int) -> list[str]:
     """Where /VTKHDF does not fit the H5MD arrays, in words; the values behind it are not compared."""
-    group = file.get(_GROUP)
+    group = own_object(file, _GROUP)
     if not isinstance(group, h5py.Group):
         return ["group /VTKHDF is missing: ParaView cannot open the file"]
     problems = []
@@ -88,13 +90,15 @@ def view_problems(file: h5py.File, frames: int, particles: int) -> list[str]:
         "Steps/PointDataOffsets/velocity": np.arange(frames) * particles,
     }
     for name, values in expected.items():
-        found = group.get(name)
-        if not isinstance(found, h5py.Dataset):
+        try:
+            found = own_dataset(group, name)
+        except KeyError:
             problems.append(f"dataset /VTKHDF/{name} is missing")
-        elif not np.array_equal(found[...], values):
+            continue
+        if not np.array_equal(found[...], values):
             problems.append(f"dataset /VTKHDF/{name} does not fit {frames} frames of {particles} particles")
     for name in ("Points", "PointData/velocity"):
-        found = group.get(name)
+        found = own_object(group, name)
         if not isinstance(found, h5py.Dataset):
             problems.append(f"dataset /VTKHDF/{name} is missing")
         elif found.shape != (frames * particles, 3):
@@ -102,4 +106,6 @@ def view_problems(file: h5py.File, frames: int, particles: int) -> list[str]:
             problems.append(f"dataset /VTKHDF/{name} has shape {found.shape}, expected {expected_shape}")
         elif not found.is_virtual:
             problems.append(f"dataset /VTKHDF/{name} is a copy, not a view")
+        else:
+            require_own_view(found)
     return problems

@@ -1,0 +1,420 @@
+"""Kill commands at random moments, repeat them, and compare what comes out with what an undisturbed command makes.
+
+    python experiments/stability/kills.py [--kills 20] [--seed 0] [--table kills.csv] [simulate reduce train rollout]
+
+Each command runs in a process of its own, which is killed (SIGKILL) after a random share of the time that the
+undisturbed command takes. What is then on disk under its final name is read through; then the same command runs again.
+When it completes, its result is compared bit for bit and it begins anew in an empty folder, until it has been killed
+often enough.
+A campaign's worker processes are killed, too. A command with a row in the table is not repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import importlib.util
+import json
+import logging
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import types
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+
+from sgns import cli
+from sgns.errors import UserError
+from sgns.learning.surrogate import load_surrogate, read_checkpoint
+from sgns.reduction import Basis
+from sgns.reduction.reduced import read_reduced
+from sgns.runs import Run, check_run
+
+log = logging.getLogger(__name__)
+
+BED = [
+    "scene=quick_excavation",
+    "scene.bed.size=[0.4,0.2,0.16]",
+    "scene.bed.spacing=0.04",
+    "scene.blade.length=0.1",
+    "scene.blade.width=0.1",
+    "scene.blade.thickness=0.08",
+]
+SIMULATE = [
+    "simulate",
+    "dataset=quick",
+    "dataset.path={data}",
+    "dataset.draw=[{rake:[0.0,10.0,20.0],depth:[0.02,0.04]}]",
+    "dataset.runs=4",
+    *BED[1:],
+    "scene.speed=0.04",
+    "scene.duration=2.0",
+]
+REDUCE = [
+    "reduce",
+    "dataset.path={data}",
+    "reduction.max_modes=24",
+    "reduction.num_modes=8",
+    "output={folder}",
+]
+TRAIN = [
+    "train",
+    "dataset.path={data}",
+    "reduction.max_modes=24",
+    "reduction.num_modes=8",
+    "model.hidden_width=16",
+    "model.message_passing_steps=1",
+    "training.max_steps=100",
+    "training.validate_every=20",
+    "training.warmup_steps=10",
+    "training.threads=1",
+    "output={folder}",
+]
+ROLLOUT = [
+    "rollout",
+    *BED,
+    "scene.rake=15.0",
+    "scene.speed=0.003",
+    "scene.duration=60.0",
+    "checkpoint={checkpoint}",
+    "output={folder}/rollout.h5",
+]
+COMMANDS = {"simulate": SIMULATE, "reduce": REDUCE, "train": TRAIN, "rollout": ROLLOUT}
+
+
+@dataclass
+class Row:
+    """What happened to one command."""
+
+    command: str
+    kills: int = 0
+    """SIGKILLs that hit a running process."""
+    kills_of_workers: int = 0
+    """Those of them that hit a campaign's worker process instead of the command itself."""
+    kills_with_results: int = 0
+    """Those after which some files of the result were complete."""
+    kills_while_writing: int = 0
+    """Those that left a hidden half of a file."""
+    corrupt: int = 0
+    """Files under their final name that were not whole."""
+    completed: int = 0
+    """Times that the command was complete at last, each after some kills."""
+    equal: int = 0
+    """Those of them whose result was that of the undisturbed command, bit for bit."""
+    orphans: int = 0
+    """Processes that outlived the command by more than half a minute."""
+    leftovers: int = 0
+    """Hidden files beside a complete result."""
+    undisturbed_s: float = 0.0
+    """Time of the undisturbed command, the imports of its first process left out [s]."""
+
+
+def main() -> int:
+    """Kill, repeat, compare; returns 0 if nothing was lost."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("commands", nargs="*", help=f"of {', '.join(COMMANDS)}; all of them by default")
+    parser.add_argument("--kills", type=int, default=20, help="of each command, at least")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    parser.add_argument("--table", type=Path, default=Path(__file__).with_name("kills.csv"))
+    asked = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+    torch.set_num_threads(1)
+    for command in COMMANDS:  # here, so that no time of the commands goes into imports
+        importlib.import_module(cli.COMMANDS[command].module)
+    done = {row.command: row for row in read_rows(asked.table)}
+    with tempfile.TemporaryDirectory(prefix="sgns_kills_") as name:
+        bench = Bench(Path(name))
+        for command in asked.commands or COMMANDS:
+            if command in done and done[command].kills >= asked.kills:
+                log.info("%s: already in %s", command, asked.table)
+                continue
+            chance = np.random.default_rng([asked.seed, list(COMMANDS).index(command)])
+            done[command] = bench.killed_often(command, asked.kills, chance)
+            write_rows(asked.table, [done[name] for name in COMMANDS if name in done])
+            log.info("%s", done[command])
+    return int(any(not nothing_lost(done[name]) for name in asked.commands or COMMANDS))
+
+
+def nothing_lost(row: Row) -> bool:
+    """Whether the command came through."""
+    return row.equal == row.completed > 0 and row.corrupt == row.orphans == row.leftovers == 0
+
+
+class Bench:
+    """Undisturbed results of all commands, each made when first needed, and room for disturbed ones."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.seconds: dict[str, float] = {}
+
+    def killed_often(self, command: str, kills: int, chance: np.random.Generator) -> Row:
+        """Kill the command again and again."""
+        reference, seconds = self.undisturbed(command), self.seconds[command]
+        row, folder = Row(command, undisturbed_s=round(seconds, 2)), self.folder / f"{command}_killed"
+        while row.kills < kills or row.completed == 0:
+            given = self.given(command, folder)
+            begun = self.begin(command, folder)
+            # A command with nothing left to do would be over before the signal.
+            delay = chance.uniform(0.0, seconds) if row.kills < kills else np.inf
+            of_worker = command == "simulate" and bool(chance.integers(2))
+            hit = kill_after(begun, delay, of_worker)
+            row.kills += hit is not None
+            row.kills_of_workers += hit == "worker"
+            row.orphans += outlived(begun.family)
+            wrong = broken(folder)
+            row.corrupt += len(wrong)
+            for line in wrong:
+                log.info("%s: %s", command, line)
+            if hit is not None:
+                files = [path for path in folder.rglob("*") if path.is_file() and path not in given]
+                row.kills_while_writing += any(path.suffix == ".partial" for path in files)
+                row.kills_with_results += any(
+                    path.suffix in READERS and path.name[0] != "." for path in files
+                )
+                continue
+            if begun.status != 0:
+                raise RuntimeError(f"{command} ended with {begun.status}: {begun.log.read_text()}")
+            row.completed += 1
+            row.equal += same(reference, folder)
+            row.leftovers += sum(path.name.startswith(".") for path in folder.rglob("*") if path.is_file())
+            shutil.rmtree(folder)
+        shutil.rmtree(folder, ignore_errors=True)
+        return row
+
+    def undisturbed(self, command: str) -> Path:
+        """Folder of the result of the undisturbed command."""
+        folder = self.folder / command
+        if command not in self.seconds:
+            self.given(command, folder)
+            began = time.perf_counter()
+            process = self.begin(command, folder)
+            kill_after(process, np.inf, False)
+            self.seconds[command] = time.perf_counter() - began
+            if process.status != 0:
+                raise RuntimeError(f"{command}: {process.log.read_text()}")
+        return folder
+
+    def given(self, command: str, folder: Path) -> set[Path]:
+        """Files that a command finds in its folder: the dataset, beside which the reduced runs go."""
+        folder.mkdir(parents=True, exist_ok=True)
+        if command not in ("reduce", "train"):
+            return set()
+        source, data = self.undisturbed("simulate") / "data", folder / "data"
+        if not data.exists():
+            shutil.copytree(source, data)
+        return {data / path.relative_to(source) for path in source.rglob("*")}
+
+    def begin(self, command: str, folder: Path) -> Begun:
+        """Begin a command with its result in `folder`; a checkpoint is that of the undisturbed training."""
+        places = {"folder": folder, "data": folder / "data", "checkpoint": ""}
+        if command == "rollout":
+            places["checkpoint"] = self.undisturbed("train") / "best.ckpt"
+        arguments = COMMANDS[command]
+        for name, place in places.items():
+            arguments = [argument.replace(f"{{{name}}}", str(place)) for argument in arguments]
+        return Begun(arguments, self.folder / "log.txt")
+
+
+class Begun:
+    """A command in a process of its own, made by a fork so that no time goes into imports."""
+
+    def __init__(self, arguments: list[str], log: Path) -> None:
+        self.log = log
+        self.family: set[int] = set()
+        """The process and all its descendants that were seen."""
+        self.status: int | None = None
+        self.pid = os.fork()
+        if self.pid == 0:
+            self._be(arguments)
+
+    def _be(self, arguments: list[str]) -> None:
+        status = 1
+        try:
+            with self.log.open("w") as file:
+                os.dup2(file.fileno(), 1)
+                os.dup2(file.fileno(), 2)
+            sys.argv = ["sgns", *arguments]
+            # So that worker processes begin as those of `python -m sgns` do, without this file and its imports.
+            sys.modules["__main__"] = types.ModuleType("__main__")
+            sys.modules["__main__"].__spec__ = importlib.util.find_spec("sgns.__main__")
+            status = cli.main()
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(status)
+
+    def running(self) -> bool:
+        """Whether the process is still there."""
+        self.family |= {self.pid, *descendants(self.pid)}
+        if self.status is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            if pid:
+                self.status = os.waitstatus_to_exitcode(status)
+        return self.status is None
+
+
+def kill_after(begun: Begun, seconds: float, worker: bool) -> str | None:
+    """Kill a command or one of its worker processes; says which was hit, None if it ended by itself before."""
+    end = time.perf_counter() + seconds
+    while begun.running() and time.perf_counter() < end:
+        time.sleep(0.005)
+    if begun.status is not None:
+        return None
+    workers = [pid for pid in descendants(begun.pid) if "spawn_main" in command_line(pid)]
+    hit = "worker" if worker and workers else "command"
+    os.kill(workers[0] if hit == "worker" else begun.pid, signal.SIGKILL)
+    while begun.running():  # a command whose worker was killed ends by itself
+        time.sleep(0.005)
+    if begun.status == 0:
+        return None  # there was nothing left to do
+    assert begun.status in (-signal.SIGKILL, 2), (begun.status, begun.log.read_text())
+    return hit
+
+
+def outlived(family: set[int], most: float = 30.0) -> int:
+    """How many processes are still there after `most` seconds."""
+    end = time.perf_counter() + most
+    while (alive := [pid for pid in family if is_running(pid)]) and time.perf_counter() < end:
+        time.sleep(0.02)
+    for pid in alive:
+        os.kill(pid, signal.SIGKILL)
+    return len(alive)
+
+
+def descendants(pid: int) -> list[int]:
+    """Numbers of a process's children and their children."""
+    try:
+        children = [int(n) for n in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+    return [one for child in children for one in (child, *descendants(child))]
+
+
+def command_line(pid: int) -> str:
+    """Command line of a process; empty if it is gone."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_text()
+    except OSError:
+        return ""
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process is there and not only waits for its end to be noticed."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def results(folder: Path) -> Iterator[tuple[Path, Callable[[Path], Any]]]:
+    """Files under their final names, each with its reader: what it gives must be the same every time."""
+    for path in sorted(folder.rglob("*")):
+        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if path.is_file() and not hidden and path.suffix in READERS:
+            yield path, READERS[path.suffix]
+        elif path.name == "dataset.yaml":
+            yield path, Path.read_bytes
+
+
+def broken(folder: Path) -> list[str]:
+    """What is wrong with the files that a command left under their final names."""
+    wrong = []
+    for path, read in results(folder):
+        try:
+            read(path)
+        except (UserError, OSError, KeyError, ValueError) as error:
+            wrong.append(f"{path}: {error}")
+    return wrong
+
+
+def same(folder: Path, other: Path) -> bool:
+    """Whether two complete results hold the same, times of the clock left out."""
+    one, two = ({path.relative_to(top): read(path) for path, read in results(top)} for top in (folder, other))
+    if one.keys() != two.keys():
+        log.info("different files: %s", sorted(map(str, one.keys() ^ two.keys())))
+    different = [str(name) for name in one.keys() & two.keys() if one[name] != two[name]]
+    if different:
+        log.info("different: %s", sorted(different))
+    return one.keys() == two.keys() and not different
+
+
+def read_hdf5(path: Path) -> Any:
+    """Content of a run, a reduced run or a basis; runs are checked through."""
+    with h5py.File(path) as file:
+        kind = file.attrs["format"]
+    if kind == b"sgns-run":
+        if problems := check_run(path):
+            raise ValueError("; ".join(problems))
+        with Run(path) as run:
+            return run.content_hash, run.scene
+    if kind == "sgns-basis":
+        return {key: as_bytes(value) for key, value in Basis.load(path).state().items()}
+    return {key: as_bytes(value) for key, value in asdict(read_reduced(path)).items()}
+
+
+def read_tensors(path: Path) -> Any:
+    """Everything in a checkpoint that a training goes on from."""
+    load_surrogate(path)
+    content = read_checkpoint(path)
+    kept = ("state_dict", "hyper_parameters", "optimizer_states", "lr_schedulers", "global_step", "callbacks")
+    return {key: as_bytes(content[key]) for key in kept}
+
+
+def read_json(path: Path) -> Any:
+    """Values of a training.json but its time."""
+    return {key: value for key, value in json.loads(path.read_text()).items() if key != "seconds"}
+
+
+READERS: dict[str, Callable[[Path], Any]] = {
+    ".h5": read_hdf5,
+    ".ckpt": read_tensors,
+    ".json": read_json,
+    ".csv": Path.read_bytes,
+}
+
+
+def as_bytes(value: Any) -> Any:
+    """Plain values whose comparison is bit for bit."""
+    if isinstance(value, torch.Tensor):
+        value = value.numpy()
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return {key: as_bytes(one) for key, one in value.items()}
+    return [as_bytes(one) for one in value] if isinstance(value, (list, tuple)) else value
+
+
+def read_rows(table: Path) -> list[Row]:
+    """Rows of an earlier call."""
+    if not table.exists():
+        return []
+    kinds = {field.name: type(field.default) for field in fields(Row) if field.name != "command"}
+    with table.open(newline="") as file:
+        return [
+            Row(**{k: kinds[k](v) if k in kinds else v for k, v in row.items()})
+            for row in csv.DictReader(file)
+        ]
+
+
+def write_rows(table: Path, rows: list[Row]) -> None:
+    """The table of all rows."""
+    with table.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Row)])
+        writer.writeheader()
+        writer.writerows(map(asdict, rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,54 @@
+"""Plain data from YAML text that anybody may have written."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+__all__ = ["parse_yaml"]
+
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same in C, where PyYAML has it
+_DEEPEST = 100
+_MOST = 1_000_000
+
+
+def parse_yaml(text: str) -> Any:
+    """Plain data; tags that would build Python objects are refused.
+
+    Raises:
+        ValueError: It is no YAML, has such tags, is nested more than 100 deep (deep nesting would end the process), or
+            stands for more than a million values, since a few lines of aliases can stand for more than fits in memory.
+    """
+    try:
+        _require_moderate(text)
+        return yaml.load(text, Loader=_LOADER)
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # the last three: damaged text
+        raise ValueError(" ".join(str(error).split()) or type(error).__name__) from error
+
+
+def _require_moderate(text: str) -> None:
+    sizes: dict[str, int] = {}  # of what aliases stand for
+    unfinished: list[tuple[str | None, int]] = [(None, 0)]  # anchor and values so far, the innermost last
+
+    def count(anchor: str | None, size: int) -> None:
+        outer, so_far = unfinished[-1]
+        if so_far + size > _MOST:
+            raise ValueError(f"it stands for more than {_MOST} values")
+        unfinished[-1] = outer, so_far + size
+        if anchor is not None:
+            sizes[anchor] = size
+
+    for event in yaml.parse(text, Loader=_LOADER):
+        if isinstance(event, yaml.CollectionStartEvent):
+            unfinished.append((event.anchor, 1))
+            if len(unfinished) > _DEEPEST:
+                raise ValueError(f"it is nested more than {_DEEPEST} deep")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            count(*unfinished.pop())
+        elif isinstance(event, yaml.ScalarEvent):
+            count(event.anchor, 1)
+        elif isinstance(event, yaml.AliasEvent):
+            if event.anchor not in sizes:
+                raise ValueError(f"alias {event.anchor} has no value yet")
+            count(None, sizes[event.anchor])

@@ -1,0 +1,365 @@
+"""Nothing that is read from a person or a file is executed, and no file makes another one be read or written.
+
+Every hostile file tries to leave a canary; none may appear.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import sys
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+import yaml
+from hydra.core.global_hydra import GlobalHydra
+from synthetic import make_run
+from tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
+
+from mpm_warp import SceneError
+from mpm_warp.mesh_file import read_mesh
+from sgns.campaign import Dataset
+from sgns.cli import main
+from sgns.errors import UserError
+from sgns.learning.surrogate import load_surrogate, read_checkpoint
+from sgns.learning.training import train
+from sgns.published import read_published
+from sgns.reduction import Basis
+from sgns.reduction.reduced import read_reduced, reduce_dataset
+from sgns.runs import Run, check_run
+from sgns.scenes import read_path
+from sgns.yaml_text import parse_yaml
+
+SECRET = "canary-in-another-file"
+
+
+@pytest.fixture
+def canary(tmp_path: Path) -> Path:
+    """A file that appears when something was executed."""
+    return tmp_path / "canary"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A good checkpoint."""
+    folder = tmp_path_factory.mktemp("trained")
+    settings = TRAINING | {"max_steps": 2, "validate_every": 2}
+    train(reduced(folder / "data"), num_modes=4, model=MODEL, training=settings, output=folder / "out")
+    return folder / "out" / "best.ckpt"
+
+
+class Touch:
+    """Leaves the canary when it is unpickled."""
+
+    def __init__(self, canary: Path) -> None:
+        self.canary = canary
+
+    def __reduce__(self):
+        return (Path.touch, (self.canary,))
+
+
+def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
+    """The line with which a command refuses its settings."""
+    GlobalHydra.instance().clear()
+    monkeypatch.setattr(sys, "argv", ["sgns", *arguments])
+    assert main() == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1, said
+    return said
+
+
+# --- checkpoints ------------------------------------------------------------------------------------------
+
+
+def test_pickles_in_checkpoints(trained, tmp_path, canary) -> None:
+    Touch(canary).__reduce__()[0](canary)
+    assert canary.exists()  # the canary works
+    canary.unlink()
+    content = torch.load(trained, weights_only=True)
+    hostile = tmp_path / "a.ckpt"
+    for place in ("state_dict", "hyper_parameters"):
+        torch.save(content | {place: content[place] | {"x": Touch(canary)}}, hostile)
+        with pytest.raises(UserError, match="cannot be read as a checkpoint"):
+            load_surrogate(hostile)
+    hostile.write_bytes(pickle.dumps({"state_dict": Touch(canary)}))
+    with pytest.raises(UserError, match="cannot be read as a checkpoint"):
+        read_checkpoint(hostile)
+    torch.save(content | {"callbacks": Touch(canary)}, hostile, _use_new_zipfile_serialization=False)
+    with pytest.raises(UserError, match="cannot be read as a checkpoint"):
+        read_checkpoint(hostile)
+    assert not canary.exists()
+
+
+def test_a_hostile_last_checkpoint_is_not_gone_on_from(tmp_path, canary) -> None:
+    data = reduced(tmp_path / "data")
+    output = tmp_path / "out"
+    settings = TRAINING | {"max_steps": 2, "validate_every": 2}
+    train(data, num_modes=4, model=MODEL, training=settings, output=output)
+    content = torch.load(output / "last.ckpt", weights_only=True)
+    torch.save(content | {"loops": Touch(canary)}, output / "last.ckpt")
+    (output / "training.json").unlink()
+    with pytest.raises(UserError, match="cannot be read as a checkpoint"):
+        train(data, num_modes=4, model=MODEL, training=settings, output=output)
+    assert not canary.exists()
+
+
+def test_targets_in_checkpoints(trained, tmp_path, canary) -> None:
+    content = torch.load(trained, weights_only=True)
+    call = {"_target_": "pathlib.Path.touch", "_args_": [str(canary)]}
+    for card in (call, content["hyper_parameters"] | {"model": call}, content["hyper_parameters"] | call):
+        torch.save(content | {"hyper_parameters": card}, tmp_path / "a.ckpt")
+        try:
+            load_surrogate(tmp_path / "a.ckpt")
+        except UserError as error:
+            assert "\n" not in str(error)
+    assert not canary.exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("message_passing_steps", 10**12), ("hidden_width", 10**9), ("history", 10**9)]
+)
+def test_a_checkpoint_that_describes_a_larger_network_than_it_holds(trained, tmp_path, key, value) -> None:
+    content = torch.load(trained, weights_only=True)
+    card = content["hyper_parameters"]
+    torch.save(
+        content | {"hyper_parameters": card | {"model": card["model"] | {key: value}}}, tmp_path / "a.ckpt"
+    )
+    with pytest.raises(UserError, match="do not fit together"):
+        load_surrogate(tmp_path / "a.ckpt")
+
+
+def test_a_checkpoint_that_claims_more_values_than_it_holds(trained, tmp_path) -> None:
+    content = torch.load(trained, weights_only=True)
+    huge = {"surrogate.start_positions": torch.zeros(1).expand(10**12)}
+    torch.save(content | {"state_dict": content["state_dict"] | huge}, tmp_path / "a.ckpt")
+    with pytest.raises(UserError, match="claims more values"):
+        load_surrogate(tmp_path / "a.ckpt")
+    with (
+        zipfile.ZipFile(trained) as old,
+        zipfile.ZipFile(tmp_path / "b.ckpt", "w", zipfile.ZIP_DEFLATED) as new,
+    ):
+        for part in old.infolist():
+            new.writestr(part.filename, old.read(part))
+    with pytest.raises(UserError, match="cannot be read as a checkpoint"):
+        load_surrogate(tmp_path / "b.ckpt")
+
+
+# --- settings ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "+scene.x={_target_: pathlib.Path.touch, _args_: [CANARY]}",
+        "+hydra.callbacks.x={_target_: pathlib.Path.touch, _args_: [CANARY]}",
+        "hydra.launcher._target_=pathlib.Path.touch",
+        "++hydra.sweeper._target_=pathlib.Path.touch",
+        "++hydra.job_logging.handlers.console={class: pathlib.Path.touch, self: CANARY}",
+        "++hydra.job_logging.handlers.console.stream=ext://hostile_module.x",
+    ],
+)
+def test_targets_in_overrides(empty_folder, canary, override, capsys, monkeypatch) -> None:
+    (empty_folder / "hostile_module.py").write_text(f"open({str(canary)!r}, 'w')")
+    monkeypatch.syspath_prepend(empty_folder)
+    said = refused(capsys, monkeypatch, "simulate", override.replace("CANARY", str(canary)))
+    assert "cannot name Python objects" in said
+    assert not canary.exists()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "scene:\n  x:\n    _target_: pathlib.Path.touch\n    _args_: ['CANARY']",
+        "hydra:\n  callbacks:\n    x:\n      _target_: pathlib.Path.touch\n      _args_: ['CANARY']",
+        "hydra:\n  job_logging:\n    handlers:\n      x:\n        (): pathlib.Path.touch\n        self: CANARY",
+        "scene:\n  name: !!python/object/apply:pathlib.Path.touch ['CANARY']",
+        "scene:\n  name: !!python/object/new:pathlib.Path ['CANARY']",
+    ],
+)
+def test_files_of_settings(empty_folder, canary, text, capsys, monkeypatch) -> None:
+    folder = empty_folder / "conf" / "experiment"
+    folder.mkdir(parents=True)
+    (folder / "x.yaml").write_text("# @package _global_\n" + text.replace("CANARY", str(canary)))
+    said = refused(capsys, monkeypatch, "simulate", "--config-dir", "conf", "experiment=x")
+    assert "cannot name Python objects" in said or "could not determine a constructor" in said
+    assert not canary.exists()
+
+
+# --- YAML in data -----------------------------------------------------------------------------------------
+
+TAGS = ["!!python/object/apply:pathlib.Path.touch [{}]", "!!python/name:os.system", "!!python/module:this"]
+
+
+@pytest.mark.parametrize("tag", TAGS)
+def test_tags_in_yaml(tmp_path, canary, tag) -> None:
+    text = f"a: {tag.format(canary)}"
+    with pytest.raises(ValueError, match="could not determine a constructor"):
+        parse_yaml(text)
+    path = make_run(tmp_path / "a.h5", frames=2, n=3)
+    with h5py.File(path, "r+") as file:
+        file.attrs["scene"] = np.bytes_(text.encode())
+    with Run(path) as run, pytest.raises(UserError, match="scene is damaged"):
+        run.scene  # noqa: B018
+    assert any("is not YAML" in problem for problem in check_run(path))
+    (tmp_path / "dataset.yaml").write_text(text)
+    with pytest.raises(UserError, match="cannot read"):
+        Dataset.open(tmp_path)
+    assert not canary.exists() and "this" not in sys.modules
+
+
+def test_resolvers_in_data_stay_text(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("SGNS_SECRET", SECRET)
+    scene = {"name": "${oc.env:SGNS_SECRET}", "gravity": "${oc.decode:'9.81'}"}
+    with Run(make_run(tmp_path / "a.h5", frames=2, n=3, scene=scene)) as run:
+        assert run.scene["name"] == scene["name"] and run.scene["gravity"] == scene["gravity"]
+    data = make_dataset(tmp_path / "data", scene=scene)
+    found = reduce_dataset(data, REDUCTION, progress=False)
+    assert found.runs("train")[0].scene["name"] == scene["name"]
+
+
+def test_aliases_that_stand_for_more_than_fits_in_memory(tmp_path) -> None:
+    bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n"
+    bomb += "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 15))
+    for text in (bomb, "a: &a [*a]", "[" * 10**5):
+        (tmp_path / "dataset.yaml").write_text(text)
+        with pytest.raises(UserError, match="cannot read"):
+            Dataset.open(tmp_path)
+
+
+# --- HDF5 -------------------------------------------------------------------------------------------------
+
+
+def hostile_hdf5(path: Path, name: str, kind: str) -> None:
+    """Let a dataset show the values of another file."""
+    with h5py.File(path, "r+") as file:
+        old = file[name]
+        shape, dtype = old.shape, old.dtype
+        other = path.with_name("other.h5")
+        with h5py.File(other, "w") as source:
+            source["x"] = old[...]
+        raw = path.with_name("raw")
+        raw.write_bytes(old[...].tobytes())
+        del file[name]
+        if kind == "external link":
+            file[name] = h5py.ExternalLink(str(other), "/x")
+        elif kind == "soft link":
+            file["aside"] = h5py.ExternalLink(str(other), "/x")
+            file[name] = h5py.SoftLink("/aside")
+        elif kind == "virtual":
+            layout = h5py.VirtualLayout(shape=shape, dtype=dtype)
+            layout[...] = h5py.VirtualSource(str(other), "x", shape=shape, dtype=dtype)
+            file.create_virtual_dataset(name, layout)
+        elif kind == "raw data elsewhere":
+            file.create_dataset(name, shape, dtype, external=[(str(raw), 0, raw.stat().st_size)])
+        else:
+            file.create_dataset(name, (10**12, *shape[1:]), dtype, chunks=(1, *shape[1:]))
+
+
+KINDS = ["external link", "soft link", "virtual", "raw data elsewhere", "claims 1e12 rows"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "name", ["particles/soil/position/value", "observables/body/force/value", "VTKHDF/Points"]
+)
+def test_runs_that_point_elsewhere_or_claim_too_much(tmp_path, kind, name) -> None:
+    path = make_run(tmp_path / "a.h5", frames=3, n=4)
+    hostile_hdf5(path, name, kind)
+    assert check_run(path) != []
+    if not name.startswith("VTKHDF"):  # nobody but ParaView reads that
+        with pytest.raises(UserError, match="not a complete run"):
+            Run(path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bases_and_reduced_runs_that_point_elsewhere_or_claim_too_much(tmp_path, kind) -> None:
+    folder = reduced(tmp_path).folder
+    hostile_hdf5(folder / "basis.h5", "modes", kind)
+    with pytest.raises(UserError, match="not a readable basis"):
+        Basis.load(folder / "basis.h5")
+    run = next(path for path in folder.glob("*.h5") if path.name not in ("basis.h5", "other.h5"))
+    hostile_hdf5(run, "latent", kind)
+    with pytest.raises(ValueError, match="latent"):
+        read_reduced(run)
+
+
+def test_a_content_hash_does_not_name_a_file_elsewhere(tmp_path) -> None:
+    make_dataset(tmp_path / "data")
+    with h5py.File(tmp_path / "data" / "runs" / "a.h5", "r+") as file:
+        file.attrs["content_hash"] = np.bytes_(b"../../../canary")
+    with pytest.raises(UserError, match="content_hash"):
+        reduce_dataset(Dataset.open(tmp_path / "data"), REDUCTION, progress=False)
+    assert not list(tmp_path.rglob("canary*"))
+
+
+def test_names_of_runs_do_not_leave_the_dataset(tmp_path) -> None:
+    split = {"train": ["../../elsewhere"], "validation": [], "test": []}
+    (tmp_path / "dataset.yaml").write_text(yaml.safe_dump({"split": split}))
+    with pytest.raises(UserError, match="has no split"):
+        Dataset.open(tmp_path)
+
+
+# --- everything else that is read -------------------------------------------------------------------------
+
+
+def test_numpy_archives_with_objects_are_nothing_that_is_read(tmp_path, canary) -> None:
+    np.savez(tmp_path / "a.npz", x=np.array([Touch(canary)], dtype=object))
+    content = (tmp_path / "a.npz").read_bytes()
+    for name, read in (
+        ("a.ckpt", load_surrogate),
+        ("a.h5", Run),
+        ("basis.h5", Basis.load),
+        ("a.csv", read_path),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(UserError):
+            read(tmp_path / name)
+    for name in ("a.stl", "a.obj"):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(SceneError):
+            read_mesh(tmp_path / name)
+    (tmp_path / "metadata.json").write_text(json.dumps({"dataset_split": {}}))
+    (tmp_path / "valid.tfrecord").write_bytes(content)
+    with pytest.raises(UserError):
+        read_published(tmp_path)
+    assert not canary.exists()
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "too large", "folder"])
+def test_inputs_that_never_end(tmp_path, kind) -> None:
+    def place(name: str) -> Path:
+        path = tmp_path / name
+        if kind == "pipe":
+            os.mkfifo(path)
+        elif kind == "device":
+            path.symlink_to("/dev/zero")
+        elif kind == "folder":
+            path.mkdir()
+        else:
+            with path.open("wb") as file:
+                file.truncate(1 << 40)  # without a block on the disk
+        return path
+
+    for name in ("a.stl", "a.obj"):
+        with pytest.raises(SceneError):
+            read_mesh(place(name))
+    with pytest.raises(UserError, match="cannot read"):
+        read_path(place("a.csv"))
+    with pytest.raises(UserError):
+        load_surrogate(place("a.ckpt"))
+    with pytest.raises(UserError):
+        Run(place("a.h5"))
+    with pytest.raises(UserError):
+        Basis.load(place("basis.h5"))
+    place("dataset.yaml")
+    with pytest.raises(UserError):
+        Dataset.open(tmp_path)
+    (tmp_path / "metadata.json").write_text(json.dumps({"dataset_split": {}}))
+    place("valid.tfrecord")
+    with pytest.raises(UserError):
+        read_published(tmp_path)
