@@ -9,6 +9,8 @@ from omegaconf import OmegaConf
 from test_simulate import SMALL, sgns
 
 from mpm_warp import Bed, Effects, Excavation, Plate, Scene, Solver, SolverStopped
+from mpm_warp.batch import all_together
+from sgns import campaign_runs
 from sgns.continuation import continued
 from sgns.errors import UserError
 from sgns.runs import Run, check_run
@@ -78,6 +80,7 @@ def test_going_on_with_half_the_step(stopped):
     assert done.returncode == 0, done.stderr
     assert check_run(output) == []
     assert not kept.exists()  # it has served its purpose
+    assert campaign_runs._done(output, small())  # a campaign takes it for its own
     reference = list(Solver(small(courant=0.3)).frames())
     with Run(output) as run:
         assert run.frame_count == small().frame_count
@@ -119,6 +122,18 @@ def test_it_may_stop_again(stopped, monkeypatch):
         assert "stops it again" in run.stopped
         assert run.extra["continued"] == [{"frame": LAST, "changed": {"courant": 0.3}}]
     assert read_state(kept).frame == LAST + 1
+
+
+def test_a_campaign_says_where_its_run_is_kept(stops, tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign_runs, "_frames_done", [0])
+    output = tmp_path / "runs" / "1.h5"
+    task = campaign_runs._make(
+        0, small().to_dict(), output, Effects(), Effects().described(), 0, "cpu", "float32"
+    )
+    ((_, (kind, words)),) = all_together([task], 1, "cpu")
+    assert kind == "failed"
+    assert f"continue_from={stopped_path(output)}" in words
+    assert check_run(stopped_path(output))[0].startswith("the run stopped after 4 good frames")
 
 
 @pytest.mark.parametrize(
