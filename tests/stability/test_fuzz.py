@@ -355,7 +355,15 @@ YAML = st.one_of(
 )
 
 
-def test_yaml_of_data(good, tmp_path) -> None:
+@pytest.fixture
+def runs(tmp_path: Path) -> None:
+    """Files that are looked for, not into."""
+    (tmp_path / "runs").mkdir()
+    for name in "abc":
+        (tmp_path / "runs" / f"{name}.h5").touch()
+
+
+def test_yaml_of_data(tmp_path, runs) -> None:
     @cases(100)
     @given(YAML, st.booleans())
     def check(text: str, alone: bool) -> None:
@@ -363,16 +371,16 @@ def test_yaml_of_data(good, tmp_path) -> None:
             parse_yaml(text)
         content = text if alone else f"split: {{train: [a], validation: [], test: []}}\n{text}"
         (tmp_path / "dataset.yaml").write_text(content, encoding="utf-8", errors="surrogatepass")
-        refused_or_read(lambda: Dataset.open(tmp_path, {"gravity": 9.81}))
+        refused_or_read(lambda: Dataset.open(tmp_path, {"gravity": 9.81} if alone else None))
 
     check()
 
 
-def test_dataset_yaml(good, tmp_path) -> None:
+def test_dataset_yaml(tmp_path, runs) -> None:
     content = {
         "name": "a",
         "split": {"train": ["a", "b"], "validation": [], "test": ["c"]},
-        "scenes": {"a": {"gravity": 1.0}},
+        "scenes": {key: {"gravity": 1.0} for key in "abc"},
     }
 
     @cases(60)
@@ -397,7 +405,7 @@ def test_yaml_of_settings(empty_folder, good, nothing_long) -> None:
     def check(text: str) -> None:
         file = empty_folder / "conf" / "experiment" / "x.yaml"
         file.write_text("# @package _global_\n" + text, encoding="utf-8", errors="surrogatepass")
-        status, said = call("simulate", "--config-dir", str(empty_folder / "conf"), *SMALL, "+experiment=x")
+        status, said = call("simulate", "--config-dir", str(empty_folder / "conf"), *SMALL, "experiment=x")
         assert status in (0, 2) and "Traceback" not in said, said
         OUTCOMES["accepted" if status == 0 or said.endswith(": begun\n") else "refused"] += 1
 

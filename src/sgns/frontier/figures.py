@@ -194,20 +194,19 @@ def reduction_figure(points: Sequence[Point], title: str) -> bytes:
         line = sorted((p for p in points if p.axis == axis), key=lambda p: p.modes)
         x, y = [p.cost for p in line], [p.own_position_rmse_mm for p in line]
         axes.plot(x, y, "D-", color=f"C{number}", ms=4, lw=1, label=axis)
-        for point in line:
-            axes.annotate(
-                f"{point.modes:g}",
-                (point.cost, point.own_position_rmse_mm),
-                xytext=(4, 4 + 8 * number),
-                textcoords="offset points",
-                fontsize=7,
-                color=f"C{number}",
-            )
     frozen = [p.frozen_rmse_mm for p in points if p.frozen_rmse_mm > 0]
     if frozen:
         axes.axhline(frozen[0], color="0.5", ls=":", lw=1, label="nothing moves")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, title="numbers: r")
+    settle(figure)
+    axes.autoscale(False)
+    place_labels(
+        axes,
+        [p.cost for p in points],
+        [p.own_position_rmse_mm for p in points],
+        [f"{p.modes:g}" for p in points],
+    )
     return png(figure)
 
 

@@ -28,9 +28,14 @@ MEASURES = {
 def main(cfg: DictConfig) -> None:
     """The command."""
     study = Study.from_settings(OmegaConf.to_container(cfg.study, resolve=True), Path(cfg.output))
-    for axis in axes_of(cfg.axis):
+    axes = axes_of(cfg.axis)
+    for axis in axes:
         module, function = MEASURES[axis]
         getattr(importlib.import_module(module), function)(study)
+    if axes and not any(study.store.has(s.name, "solver", s.reference.label) for s in study.scenes):
+        # Another process is still at it; what was measured here is kept.
+        log.info("no reference is there yet, so nothing can be judged; later: sgns frontier axis=none")
+        return
     page = write_study(study, gathered(study))
     log.info("%s and the table and figures beside it", page)
 

@@ -47,6 +47,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return output
 
 
+def test_an_axis_may_be_done_before_the_reference(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        main(settings(tmp_path, "reduction"))
+    assert "no reference is there yet" in caplog.text
+    with pytest.raises(UserError, match="no points"):
+        main(settings(tmp_path, "none"))
+
+
 def test_a_study_gives_a_table_figures_and_a_page(folder: Path) -> None:
     points = {p.label: p for p in read_points(folder / "points.csv")}
     assert set(points) == {"finer", "base", "float64"}
