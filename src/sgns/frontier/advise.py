@@ -125,6 +125,11 @@ def advice(points: Sequence[Point], wish: Wish) -> list[str]:
             lines.append(
                 f"    the reference itself is only known to {band:g}{unit}: nothing can be shown to be better"
             )
+    if point.kind == "surrogate" and wish.columns != OWN and not math.isnan(point.own_force_nrmse):
+        lines.append(
+            f"  against the solver that made its training runs: force NRMSE {point.own_force_nrmse:.3g}, particles "
+            f"{point.own_position_rmse_mm:.3g} mm; where this is much larger, the rest is luck"
+        )
     reference = next((p for p in points if p.scene == wish.scene and p.axis == "reference"), None)
     against = f"against the solver at {reference.label}" if reference else "against the study's reference"
     if wish.columns == OWN:

@@ -25,7 +25,9 @@ from sgns.wholefile import whole_file, write_whole
 __all__ = ["write_study"]
 
 WIDE = """
-.wide figure { min-width: 56rem; } .wide figcaption { position: sticky; left: 0; }
+.wide figure { min-width: 56rem; }
+.wide figcaption { position: sticky; left: 0; max-width: min(46rem, calc(100vw - 2rem)); }
+figure { margin-bottom: 1.5rem; }
 tr.best td { font-weight: 600; }
 """
 
@@ -124,12 +126,15 @@ def scene_figures(scene: StudyScene, points: Sequence[Point]) -> list[ReportFigu
 
 def scene_content(scene: StudyScene, points: Sequence[Point], figures: Sequence[ReportFigure]) -> str:
     """Words, pictures and table of a scene."""
-    bands = ", ".join(f"{COLUMNS[key].split(',')[0]} {value:g}" for key, value in scene.bands.items())
+    bands = ", ".join(
+        f"{COLUMNS[key].split(',')[0]} {value:g}{' mm' if key.endswith('_mm') else ''}"
+        for key, value in scene.bands.items()
+    )
     cases = "; ".join(f"{name}: {' '.join(changes)}" for name, changes in scene.settings["cases"].items())
     words = note(
-        f"Reference: {scene.reference.label} ({' '.join(scene.reference.set)}). Its own error, from "
-        f"experiments/reference: {bands or 'not known'}; a point below that is not shown to be better than another "
-        f"below it. Cases that every error is taken over: {cases}. Settings that a label does not name are those of "
+        f"Reference: {scene.reference.label} ({' '.join(scene.reference.set)}). How wrong it may be "
+        f"itself (where from: conf/study): {bands or 'not known'}; points below that cannot be told apart. "
+        f"Cases that every error is taken over: {cases}. Settings that a label does not name are those of "
         f"scene={scene.settings['scene']}."
     )
     pictures = "".join(f'<div class="wide">{picture(figure)}</div>' for figure in figures)

@@ -43,7 +43,9 @@ def test_the_fastest_that_is_good_enough_is_named_with_its_command() -> None:
     lines = answer("error.force=0.25")
     assert lines[0] == "use: solver, coarse"
     assert "sgns simulate scene=quick_excavation output=run.h5" in lines[1]
-    assert answer("error.force=0.4")[0] == "use: surrogate, r = 8"
+    surrogate = answer("error.force=0.4")
+    assert surrogate[0] == "use: surrogate, r = 8"
+    assert any("its training runs: force NRMSE 0.26" in line for line in surrogate)
     assert answer("error.position=0.004")[0] == "use: solver, coarse"  # in metres
 
 
