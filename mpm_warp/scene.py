@@ -7,7 +7,8 @@ import json
 import math
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import cached_property
-from typing import Any, ClassVar, get_args, get_type_hints
+from types import UnionType
+from typing import Any, ClassVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -369,8 +370,8 @@ def _build(cls: type, data: dict[str, Any], where: str) -> Any:
             raise SceneError(f"{where}.{key} is {value!r}; allowed: true, false")
         elif hints[key] is int:
             value = _number(value, f"{where}.{key}", int)
-        elif isinstance(value, list):
-            value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
+        else:
+            value = _plain(value, hints[key], f"{where}.{key}")
         values[key] = value
     return cls(**values)
 
@@ -381,6 +382,24 @@ def _chosen(shapes: dict[str, type], value: Any, where: str) -> type:
     if shape not in shapes:
         raise SceneError(f"{where}.shape is {shape!r}; allowed: {', '.join(shapes)}")
     return shapes[shape]
+
+
+def _plain(value: Any, hint: Any, where: str) -> Any:
+    """A value of a type made of texts, numbers, tuples and None; other types are not looked into."""
+    parts = get_args(hint)
+    if get_origin(hint) is UnionType:
+        kinds = [part for part in parts if part is not type(None)]
+        return None if value is None and len(kinds) < len(parts) else _plain(value, kinds[0], where)
+    if hint is str and not isinstance(value, str):
+        raise SceneError(f"{where} is {value!r}; it must be text")
+    if hint in (int, float):
+        return _number(value, where, hint)
+    if get_origin(hint) is tuple:
+        count = None if parts[-1] is ... else len(parts)
+        if not isinstance(value, (list, tuple)) or count not in (None, len(value)):
+            raise SceneError(f"{where} is {value!r}; it must be a list of {count or 'some'} values")
+        return tuple(_plain(one, parts[0], f"{where}[{i}]") for i, one in enumerate(value))
+    return value
 
 
 def _number(value: Any, where: str, kind: type) -> Any:

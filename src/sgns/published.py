@@ -133,6 +133,8 @@ def _run(case: int | None, record: bytes, bin_size: tuple[float, float, float] |
     nodes = nodes.reshape(len(nodes), len(types), 3)[1:]
     force = np.array([np.frombuffer(f, dtype="<f4") for f in frames["force"]], dtype=float).reshape(-1, 3)[1:]
     context = [np.frombuffer(f, dtype="<f4") for f in frames.get("step_context", [b""] * (len(nodes) + 1))]
+    if not (len(nodes) and np.isfinite(nodes).all() and np.isfinite(force).all()):
+        raise ValueError("a run has no frames, or values that are not finite")
     soil = types == _SUBSPACE
     kind = "wheel" if bool((types == _FREE).any()) else "excavation"
     lx, _, lz = bin_size or _BINS[kind]
