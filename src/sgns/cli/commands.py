@@ -12,6 +12,7 @@ import importlib
 import logging
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
@@ -190,6 +191,9 @@ def _run_hydra() -> None:
                 f"the settings cannot be put together: {type(error).__name__}: {error}"
             ) from error
         require_own_objects(cfg)
+        verbose = cfg.hydra.verbose
+        if not isinstance(verbose, (bool, str, Sequence)):
+            raise UserError(f"hydra.verbose is {verbose!r}; it must be true, false, or names of loggers")
         return cfg
 
     # Hydra makes objects right after it has composed the settings, and calls nobody in between.
