@@ -108,7 +108,7 @@ def write_rollout(
     began = time.perf_counter()
     rate = float(simulator.frame_rate)
     latent = torch.as_tensor(rollout.latent)
-    particle_count = len(simulator.start_positions)
+    particle_count, excess = len(simulator.start_positions), rollout.excess
     with RunWriter(
         path,
         scene=scene,
@@ -124,6 +124,8 @@ def write_rollout(
             "checkpoint_version": simulator.card.get("package_version"),
             "checkpoint_settings": simulator.card.get("settings", {}),
             "history": given_frames,
+            "outside_training": None if excess is None else excess.largest,
+            "outside_training_words": None if excess is None else excess.words(),
         },
     ) as writer:
         previous = None
@@ -242,9 +244,14 @@ def unlearned(known: Mapping[str, Any], asked: Mapping[str, Any], told: Sequence
 def rollout_scene(
     simulator: Simulator, scene: Scene, path: str | Path, *, seed: int = 0, checkpoint: str | Path = ""
 ) -> RolloutTiming:
-    """Rolls a scene that was never simulated out, from the common start at rest, into a run file."""
+    """Rolls a scene that was never simulated out, from the common start at rest, into a run file.
+
+    Warns where path or soil leave what the training runs covered.
+    """
     with single_thread():
         rollout = simulator.rollout(scene.body_poses(), scene.body_points(), values=scene.to_dict())
+    if rollout.excess is not None and (words := rollout.excess.words()):
+        log.warning("%s: forces and soil are a guess there", words)
     began = time.perf_counter()
     write_rollout(path, simulator, scene.to_dict(), rollout, seed=seed, checkpoint=checkpoint)
     writing = time.perf_counter() - began

@@ -8,8 +8,9 @@ Letters: B paths, T frames, n particles, M body points, N body nodes, d history 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from sgns.errors import UserError
 from sgns.learning.body import BodyTrack, body_track
 from sgns.learning.context import context_of
 from sgns.learning.surrogate import Surrogate, load_surrogate
+from sgns.learning.training_range import Excess
 from sgns.poses import check_poses, fitted_poses, in_world_frame
 from sgns.reduction.basis import Basis
 
@@ -45,6 +47,15 @@ class State:
     torque: np.ndarray
     pose: np.ndarray
     _basis: Basis = field(repr=False)
+    _excess: Callable[[], Excess | None] = field(repr=False)
+
+    @property
+    def outside(self) -> float:
+        """How far this frame is from all that the training runs covered [1]: the distance of the worst of the tool's
+        pose and motion, the soil's modes and their velocity, and the context from its training range, in widths of
+        that range. 0: inside every range; above 0.05 the answer is a guess; NaN: the checkpoint does not know."""
+        found = self._excess()
+        return np.nan if found is None else float(found.amount[-1])
 
     def soil(self) -> np.ndarray:
         """Positions of all particles [m], shape (n, 3); decoded when asked for."""
@@ -70,6 +81,13 @@ class Rollout:
     poses: np.ndarray
     body_points: np.ndarray
     wall_time_s: float
+    _excess: Callable[[], Excess | None] = field(repr=False)
+
+    @cached_property
+    def excess(self) -> Excess | None:
+        """How far every frame is outside the training runs' range, see `State.outside`, and in what; None: the
+        checkpoint does not know."""
+        return self._excess()
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +227,7 @@ class Simulator:
             values = scene.to_dict()
         elif scene is not None:
             pose = np.atleast_2d(np.asarray(scene, dtype=np.float64))[0]
-        self._frame, self._points = 0, points
+        self._frame, self._points, self._values = 0, points, values
         self._stepper = self._dynamics.stepper(len(points), self._context_of(values))
         self._poses: list[np.ndarray] = []
         if history is None:
@@ -225,7 +243,7 @@ class Simulator:
                 )
         self._latent = latent.clone()[None].to(self.device)
         nothing = np.zeros(3)
-        return State(0, self._newest(), nothing, nothing.copy(), self._pose_now(), self.basis)
+        return self._state(nothing, nothing.copy(), self._pose_now())
 
     def step(self, tool_pose: np.ndarray) -> State:
         """Move the tool to its next pose and the soil with it.
@@ -254,7 +272,7 @@ class Simulator:
         self._poses = [*self._poses[1:], pose]
         self._frame += 1
         force, torque = (part[0].cpu().numpy() for part in (step.force, step.torque))
-        return State(self._frame, self._newest(), force, torque, pose, self.basis)
+        return self._state(force, torque, pose)
 
     def rollout(
         self,
@@ -311,7 +329,8 @@ class Simulator:
             nodes = path.body.position[0, padding:].cpu().numpy()
             poses = self._predicted_poses(poses, nodes, points)
             world = nodes if self._dynamics.settings.body_nodes == "points" else in_world_frame(poses, points)
-        return Rollout(states, force, torque, poses, world, wall_time)
+        excess = partial(self._excess_of, poses, points, states, values)
+        return Rollout(states, force, torque, poses, world, wall_time, excess)
 
     def rollouts(
         self,
@@ -376,6 +395,26 @@ class Simulator:
             return fitted_poses(points, nodes)
         return np.concatenate([nodes[:, 0], poses[:, 3:]], axis=1)
 
+    def _state(self, force: np.ndarray, torque: np.ndarray, pose: np.ndarray) -> State:
+        """The newest state."""
+        # How far it is outside takes the frame before as well, for velocities; before any pose nobody can tell.
+        poses = np.stack(self._poses[-2:]) if self._poses else pose[None]
+        latent = self._latent[0, -len(poses) :].cpu().numpy()
+        excess = partial(self._excess_of, poses, self._points, latent, self._values)
+        return State(self._frame, latent[-1].copy(), force, torque, pose, self.basis, excess)
+
+    def _excess_of(
+        self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, values: Mapping[str, Any] | None
+    ) -> Excess | None:
+        """How far frames are outside the training range; body points (M, 3) in the body frame."""
+        known, keys = self._surrogate.training_range, self.context_keys
+        if known is None or not np.isfinite(poses).all():
+            return None
+        numbers = context_of(self.scene if values is None else values, keys).tolist()
+        return known.excess(
+            poses, in_world_frame(poses, points), latent, dict(zip(keys, numbers, strict=True))
+        )
+
     def _context_of(self, values: Mapping[str, Any] | None) -> Tensor:
         scene = self.scene if values is None else values
         return torch.as_tensor(context_of(scene, self._dynamics.context_keys))[None].to(self.device)
@@ -394,9 +433,6 @@ class Simulator:
         if not bool(torch.isfinite(latent).all()):
             raise UserError("the latent history holds values that are not finite; every value must be")
         return latent
-
-    def _newest(self) -> np.ndarray:
-        return self._latent[0, -1].cpu().numpy().copy()
 
     def _pose_now(self) -> np.ndarray:
         return self._poses[-1] if self._poses else np.full(7, np.nan)

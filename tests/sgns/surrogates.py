@@ -12,6 +12,7 @@ from synthetic import make_run
 
 from sgns.evaluation.metrics import VectorErrors
 from sgns.evaluation.scores import Scores
+from sgns.learning.training_range import Excess
 from sgns.poses import in_world_frame
 from sgns.reduction import Basis, IncrementalPCA
 from sgns.runs import Run
@@ -27,6 +28,7 @@ class FakeRollout:
     poses: np.ndarray
     body_points: np.ndarray
     wall_time_s: float
+    excess: Excess | None = None
 
 
 @dataclass

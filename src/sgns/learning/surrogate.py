@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from sgns.errors import UserError
 from sgns.learning.kinds import dynamics_of
 from sgns.learning.stepping import Dynamics
+from sgns.learning.training_range import TrainingRange
 from sgns.reduction.basis import Basis
 from sgns.wholefile import whole_file
 
@@ -49,7 +50,10 @@ class Surrogate(nn.Module):
         basis: Modes of the soil; as many as the dynamics has.
         start_positions: Common start of the soil at rest [m], shape (n, 3).
         body_points: Body points in the body frame [m], shape (M, 3).
-        card: Plain values: frame_rate [Hz], scene, and any provenance.
+        card: Plain values: frame_rate [Hz], scene, training_range (see `TrainingRange.plain`), and any provenance.
+
+    Attributes:
+        training_range: What the training runs covered; None in a checkpoint from before it was kept.
     """
 
     basis_mean: Tensor
@@ -79,6 +83,8 @@ class Surrogate(nn.Module):
             self.register_buffer(f"basis_{name}", state.pop(name))
         self.register_buffer("start_positions", start_positions.double())
         self.register_buffer("body_points", body_points.double())
+        known = card.get("training_range")
+        self.training_range = None if known is None else TrainingRange.from_plain(known)
         self.card = dict(card) | {
             "format": _FORMAT,
             "format_version": _FORMAT_VERSION,
@@ -153,7 +159,9 @@ def load_surrogate(path: str | Path) -> Surrogate:
         surrogate = Surrogate(dynamics_of(card), basis, state["start_positions"], state["body_points"], card)
         surrogate.load_state_dict(state)
         surrogate.frame_rate  # noqa: B018  (present and a number)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        if not all(bool(value.isfinite().all()) for value in state.values() if value.is_floating_point()):
+            raise ValueError("it holds numbers that are not finite")
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(
             f"{path} is a checkpoint whose parts do not fit together ({reason}); train again"

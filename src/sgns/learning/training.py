@@ -38,6 +38,7 @@ from sgns.learning.statistics import fit_normalisation
 from sgns.learning.stepping import Dynamics
 from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
+from sgns.learning.training_range import TrainingRange
 from sgns.learning.validation import ValidationRollouts
 from sgns.poses import in_body_frame
 from sgns.reduction.reduced import ReducedDataset, ReducedRun, reduce_dataset
@@ -223,7 +224,9 @@ def surrogate_of(dynamics: Dynamics, reduced: ReducedDataset, card: dict[str, An
     first = reduced.runs("train")[0]
     points = torch.as_tensor(in_body_frame(first.pose[0], first.body_points[0]))
     basis = reduced.basis.sliced(dynamics.num_modes)
-    return Surrogate(dynamics, basis, torch.as_tensor(reduced.start_positions), points, card)
+    known = TrainingRange.of(reduced.runs("train"), dynamics.num_modes, dynamics.context_keys)
+    start = torch.as_tensor(reduced.start_positions)
+    return Surrogate(dynamics, basis, start, points, card | {"training_range": known.plain()})
 
 
 def prepared(
