@@ -82,6 +82,7 @@ def write_rollout(
     seed: int = 0,
     checkpoint: str | Path = "",
     given_frames: int = 1,
+    stopped: str = "",
 ) -> Path:
     """Decodes a rollout and writes it as a run file (producer `rollout`).
 
@@ -96,15 +97,36 @@ def write_rollout(
         seed: recorded seed.
         checkpoint: file that the simulator was loaded from; recorded with its settings.
         given_frames: how many frames at the start are no predictions; recorded as `history`.
+        stopped: why the rollout ends before its path does; recorded.
 
     Returns:
         The path written.
 
     Raises:
-        UserError: the rollout is not finite, or the file cannot be written.
+        UserError: the rollout is not finite, when the frames before that are in `<name>.stopped.h5` instead; or the
+            file cannot be written.
     """
-    path = Path(path)
-    require_finite(path, rollout)
+    path, whole = Path(path), finite_frames(rollout)
+    if whole < len(rollout.latent):
+        kept = path.with_suffix(f".stopped{path.suffix}")
+        reason = (
+            f"the rollout for {path.name} is not finite from frame {whole} on: the network is not stable on this "
+            "path; train longer, or use a checkpoint with a higher validation skill"
+        )
+        if whole > 0:
+            write_rollout(
+                kept,
+                simulator,
+                scene,
+                rollout.until(whole),
+                effects=effects,
+                seed=seed,
+                checkpoint=checkpoint,
+                given_frames=given_frames,
+                stopped=reason,
+            )
+            reason += f"; the frames before are in {kept}"
+        raise UserError(reason)
     began = time.perf_counter()
     rate = float(simulator.frame_rate)
     latent = torch.as_tensor(rollout.latent)
@@ -126,6 +148,7 @@ def write_rollout(
             "history": given_frames,
             "outside_training": None if excess is None else excess.largest,
             "outside_training_words": None if excess is None else excess.words(),
+            **({"stopped": stopped} if stopped else {}),
         },
     ) as writer:
         previous = None
@@ -145,18 +168,12 @@ def write_rollout(
     return path
 
 
-def require_finite(path: Path, rollout: Rollout) -> None:
-    """Refuses a rollout whose network ran away from the numbers it knows."""
+def finite_frames(rollout: Rollout) -> int:
+    """Frames before the first in which a rollout is not finite."""
     latent = np.asarray(rollout.latent, dtype=np.float64).reshape(len(rollout.latent), -1)
-    finite = np.isfinite(np.hstack([latent, np.asarray(rollout.force), np.asarray(rollout.torque)])).all(
-        axis=1
-    )
-    if not finite.all():
-        raise UserError(
-            f"the rollout for {path.name} is not finite from frame {int(np.argmin(finite))} on: the "
-            "network is not stable on this path; train longer, or use a checkpoint with a higher "
-            "validation skill"
-        )
+    parts = [latent, np.asarray(rollout.force), np.asarray(rollout.torque), np.asarray(rollout.poses)]
+    finite = np.isfinite(np.hstack(parts)).all(axis=1)
+    return len(finite) if finite.all() else int(np.argmin(finite))
 
 
 def require_known_bed(simulator: Simulator, scene: Scene, checkpoint: str | Path) -> None:
@@ -265,7 +282,9 @@ def main(cfg: DictConfig) -> float:
     from sgns.simulator import Simulator
 
     scene = scene_from_config(cfg)
-    simulator = Simulator.load(cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes)
+    simulator = Simulator.load(
+        cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes, hold_at_rest=cfg.hold_at_rest
+    )
     require_same_freedom(simulator, scene, cfg.checkpoint)
     require_known_bed(simulator, scene, cfg.checkpoint)
     ignored = unlearned(simulator.scene, scene.to_dict(), simulator.context_keys)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from torch import Tensor
 from sgns.errors import UserError
 from sgns.learning.body import BodyTrack, body_track
 from sgns.learning.context import context_of
+from sgns.learning.prediction import Step
 from sgns.learning.surrogate import Surrogate, load_surrogate
 from sgns.learning.training_range import Excess
 from sgns.poses import check_poses, fitted_poses, in_world_frame
@@ -83,6 +84,14 @@ class Rollout:
     wall_time_s: float
     _excess: Callable[[], Excess | None] = field(repr=False)
 
+    def until(self, frames: int) -> Rollout:
+        """The rollout of the first frames."""
+        series = ("latent", "force", "torque", "poses", "body_points")
+        excess = None if self.excess is None else self.excess.until(frames)
+        return replace(
+            self, **{name: getattr(self, name)[:frames] for name in series}, _excess=lambda: excess
+        )
+
     @cached_property
     def excess(self) -> Excess | None:
         """How far every frame is outside the training runs' range, see `State.outside`, and in what; None: the
@@ -116,9 +125,16 @@ class Simulator:
         surrogate: Network, basis and start.
         device: "cpu" or "cuda".
         num_modes: Of the soil, the first of those it was trained with; None: all.
+        hold_at_rest: Whether the soil stays as it is while a prescribed tool has rested for d frames.
     """
 
-    def __init__(self, surrogate: Surrogate, device: str = "cpu", num_modes: int | None = None) -> None:
+    def __init__(
+        self,
+        surrogate: Surrogate,
+        device: str = "cpu",
+        num_modes: int | None = None,
+        hold_at_rest: bool = True,
+    ) -> None:
         try:
             self.device = torch.device(device)
             self._surrogate = surrogate.to(self.device).eval()
@@ -129,19 +145,22 @@ class Simulator:
         self._dynamics, self.basis = surrogate.dynamics, surrogate.basis
         if num_modes is not None:
             self._dynamics, self.basis = self._dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
+        self._dynamics.holds_rest = hold_at_rest
         self.start_positions = surrogate.start_positions.cpu().numpy()
         self.body_points = surrogate.body_points.cpu().numpy()
         self._start_latent = self.basis.transform(surrogate.start_positions.cpu())
         self.reset()
 
     @classmethod
-    def load(cls, path: str | Path, device: str = "cpu", num_modes: int | None = None) -> Simulator:
+    def load(
+        cls, path: str | Path, device: str = "cpu", num_modes: int | None = None, hold_at_rest: bool = True
+    ) -> Simulator:
         """From a checkpoint written by `sgns train`; arguments as of the class.
 
         Raises:
             UserError: The file is missing, truncated or not such a checkpoint.
         """
-        return cls(load_surrogate(path), device, num_modes)
+        return cls(load_surrogate(path), device, num_modes, hold_at_rest)
 
     @property
     def frame_rate(self) -> float:
@@ -255,7 +274,7 @@ class Simulator:
             The state after the step.
 
         Raises:
-            UserError: The pose is not finite or its quaternion not of unit length.
+            UserError: The pose is not finite or its quaternion not of unit length, or the answer is not finite.
         """
         pose = check_poses(tool_pose, f"tool pose of frame {self._frame + 1}")[0]
         if not self._poses:
@@ -265,7 +284,10 @@ class Simulator:
         body = self._track(window, in_world_frame(window, self._points)).frames(slice(1, None))
         with torch.inference_mode():
             step = self._stepper.advance(self._latent, body)
-            self._latent = torch.cat([self._latent[:, 1:], step.latent[:, None]], dim=1)
+            held = self._dynamics.held(body) is not None
+            following = self._latent[:, -1:] if held else step.latent[:, None]
+            self._require_finite(following, step)
+            self._latent = torch.cat([self._latent[:, 1:], following], dim=1)
         if self.predicts_body:
             there = body.position[0, -2] + step.displacement[0]
             pose = self._predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
@@ -394,6 +416,16 @@ class Simulator:
         if self._dynamics.settings.body_nodes == "points":
             return fitted_poses(points, nodes)
         return np.concatenate([nodes[:, 0], poses[:, 3:]], axis=1)
+
+    def _require_finite(self, following: Tensor, step: Step) -> None:
+        """Refuses a step that says nothing; the simulator stays where it was."""
+        found = {"the soil's state": following, "the force": step.force, "the torque": step.torque}
+        bad = [name for name, part in found.items() if not bool(torch.isfinite(part).all())]
+        if bad:
+            raise UserError(
+                f"{bad[0]} is not finite at frame {self._frame + 1}, likely because the tool's pose of that frame lies "
+                f"far from everything the network knows; frame {self._frame} is kept: step to another pose, or reset"
+            )
 
     def _state(self, force: np.ndarray, torque: np.ndarray, pose: np.ndarray) -> State:
         """The newest state."""

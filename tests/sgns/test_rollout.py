@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from surrogates import FakeSimulator, fitted, small_dataset
 
 from sgns.errors import UserError
+from sgns.learning.training_range import Excess
 from sgns.rollout import (
     RolloutTiming,
     bed_differences,
@@ -101,16 +104,43 @@ def test_differences_of_equal_beds_still_say_something():
     assert "arrangement" in bed_differences({"bed": {"spacing": 1}}, {"bed": {"spacing": 1}})
 
 
-def test_rollout_that_runs_away_leaves_nothing_behind(simulator, tmp_path):
-    def explode(latent, history):
-        latent[7:] = np.inf
-        return latent
+def explode(latent, history):
+    latent[7:] = np.inf
+    return latent
 
+
+def test_of_a_rollout_that_runs_away_the_frames_before_are_kept(simulator, tmp_path):
+    rollout_scene(simulator, FakeScene(simulator), tmp_path / "whole.h5")
     simulator.mistake = explode
-    target = tmp_path / "out"
-    with pytest.raises(UserError, match="not finite from frame 7"):
-        rollout_scene(simulator, FakeScene(simulator), target / "r.h5")
-    assert not target.exists() or not list(target.iterdir())
+    with pytest.raises(
+        UserError, match=r"not finite from frame 7 .*the frames before are in .*r\.stopped\.h5"
+    ):
+        rollout_scene(simulator, FakeScene(simulator), tmp_path / "r.h5")
+    assert not (tmp_path / "r.h5").exists()
+    check_run(tmp_path / "r.stopped.h5")
+    with Run(tmp_path / "r.stopped.h5") as run, Run(tmp_path / "whole.h5") as whole:
+        assert run.frame_count == 7
+        assert "not finite from frame 7" in run.extra["stopped"] and "stopped" not in whole.extra
+        np.testing.assert_array_equal(run.positions(), whole.positions(slice(0, 7)))
+
+
+def test_a_rollout_that_never_was_finite_leaves_nothing_behind(simulator, tmp_path):
+    simulator.mistake = lambda latent, history: np.full_like(latent, np.nan)
+    with pytest.raises(UserError, match="not finite from frame 0"):
+        rollout_scene(simulator, FakeScene(simulator), tmp_path / "out" / "r.h5")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_path_unlike_the_training_runs_is_told_and_recorded(simulator, tmp_path, caplog):
+    answer = simulator.rollout
+    excess = Excess(np.array([0.0] * 8 + [0.7] * 4), ["load"] * 12)
+    simulator.rollout = lambda *a, **k: replace(answer(*a, **k), excess=excess)
+    rollout_scene(simulator, FakeScene(simulator), tmp_path / "a.h5")
+    words = "from frame 8 on the path is unlike the training runs; at frame 8 load is 0.7 times its training range"
+    assert words in caplog.text and "guess" in caplog.text
+    with Run(tmp_path / "a.h5") as run:
+        assert run.extra["outside_training"] == 0.7
+        assert run.extra["outside_training_words"].startswith(words)
 
 
 def test_rates_are_per_simulated_second():

@@ -194,3 +194,90 @@ def test_fewer_modes_than_it_was_trained_with(trained) -> None:
     np.testing.assert_array_equal(simulator.step(run.pose[3]).latent, rollout.latent[3])
     with pytest.raises(UserError, match="trained with 4 modes and cannot have 5; allowed: 1 to 4"):
         Simulator.load(folder / "pose" / "best.ckpt", num_modes=5)
+
+
+@pytest.mark.parametrize("kind", ["pose", "points", "polynomial"])
+def test_soil_is_held_while_the_tool_rests(trained, kind) -> None:
+    data, folder = trained
+    path = data.runs("test")[0].pose
+    pause = np.concatenate([path[:7], path[6:7].repeat(20, axis=0), path[7:]])
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    rollout = simulator.rollout(pause)
+    d = simulator.history
+    held = rollout.latent[5 + d : 27]
+    # The tool has to rest for d frames before the soil does.
+    np.testing.assert_array_equal(held, held[:1].repeat(len(held), axis=0))
+    assert (rollout.latent[4 + d] != held[0]).any() and (rollout.latent[27] != held[0]).any()
+    simulator.reset(pause)
+    for t in range(1, len(pause)):
+        state = simulator.step(pause[t])
+        np.testing.assert_array_equal(state.latent, rollout.latent[t])
+    drifting = Simulator.load(folder / kind / "best.ckpt", hold_at_rest=False).rollout(pause)
+    np.testing.assert_array_equal(drifting.latent[: 6 + d], rollout.latent[: 6 + d])
+    assert (np.diff(drifting.latent[6 + d : 27], axis=0) != 0).any()
+
+
+@pytest.mark.parametrize("kind", ["pose", "polynomial"])
+def test_it_says_how_far_a_path_is_outside(trained, kind) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    run = data.runs("train")[0]
+    assert np.isnan(simulator.reset().outside)
+    path = run.pose.copy()
+    path[9:, 1] += 1.0
+    rollout = simulator.rollout(path)
+    # The network has hardly been trained: its soil leaves the range as well, but not as far.
+    assert rollout.excess.amount[:9].max() < 1 < rollout.excess.amount[9:].min()
+    assert rollout.excess.quantity[9] == "the tool's displacement per frame (y)"
+    simulator.reset(path)
+    told = [0.0] + [simulator.step(pose).outside for pose in path[1:]]
+    np.testing.assert_allclose(told, rollout.excess.amount, rtol=1e-12)
+
+
+def test_a_checkpoint_from_before_cannot_say_it(trained, tmp_path) -> None:
+    data, folder = trained
+    content = torch.load(folder / "pose" / "best.ckpt", weights_only=True)
+    del content["hyper_parameters"]["training_range"]
+    torch.save(content, tmp_path / "old.ckpt")
+    simulator = Simulator.load(tmp_path / "old.ckpt")
+    assert simulator.rollout(data.runs("test")[0].pose).excess is None
+    assert np.isnan(simulator.reset(data.runs("test")[0].pose).outside)
+
+
+def test_a_checkpoint_that_is_not_finite_is_refused(trained, tmp_path) -> None:
+    _, folder = trained
+    content = torch.load(folder / "pose" / "best.ckpt", weights_only=True)
+    name = next(name for name in content["state_dict"] if name.endswith("weight"))
+    content["state_dict"][name][0] = float("nan")
+    torch.save(content, tmp_path / "bad.ckpt")
+    with pytest.raises(UserError, match="not finite"):
+        Simulator.load(tmp_path / "bad.ckpt")
+
+
+@pytest.mark.parametrize("kind", ["pose", "points"])
+def test_nothing_runs_away_far_from_everything(trained, kind) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    path = data.runs("test")[0].pose.repeat(50, axis=0)
+    path[100:, :3] += 1e6 * np.sin(np.arange(len(path) - 100))[:, None]
+    rollout = simulator.rollout(path)
+    low, high = (bound.numpy() for bound in simulator._dynamics.reach())
+    assert (rollout.latent >= low).all() and (rollout.latent <= high).all()
+    assert np.isfinite(rollout.force).all()
+
+
+def test_an_answer_that_is_not_finite_stops_and_keeps_the_frame_before(trained) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / "pose" / "best.ckpt")
+    path = data.runs("test")[0].pose
+    expected = simulator.rollout(path[:4])
+    simulator.reset(path)
+    for pose in path[1:3]:
+        simulator.step(pose)
+    far = path[3].copy()
+    far[0] = 1e300
+    with pytest.raises(UserError, match="not finite at frame 3"):
+        simulator.step(far)
+    state = simulator.step(path[3])
+    assert state.frame == 3
+    np.testing.assert_array_equal(state.latent, expected.latent[3])

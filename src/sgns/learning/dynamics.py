@@ -22,6 +22,10 @@ from sgns.learning.stepping import Dynamics, unrolled
 
 __all__ = ["LatentDynamics", "Path", "Prediction", "Step"]
 
+# No latent position goes further than this from its mean, in deviations: training runs stay within a few. It keeps a
+# rollout finite that has left everything it knows.
+_REACH = 30.0
+
 
 class LatentDynamics(Dynamics):
     """Graph network on modes and body nodes, with the statistics that make its inputs and outputs of order
@@ -203,10 +207,16 @@ class LatentDynamics(Dynamics):
         following = latent[:, -1] + self.change.denormalise(prediction.change[:, : self.num_modes])
         if self.settings.predicts == "acceleration":
             following = following + (latent[:, -1] - latent[:, -2])
+        following = torch.clamp(following, *self.reach())
         displacement = body.motion[:, -1, :, :3]
         if self.predicts_body:
             displacement = torch.where(self.free > 0, self.body_displacement(prediction, body), displacement)
         return Step(following, force.sum(-2), torque.sum(-2), displacement)
+
+    def reach(self) -> tuple[Tensor, Tensor]:
+        """Smallest and largest latent positions that a step may lead to [m], shape (r, 3) each."""
+        half = _REACH * self.position.scale
+        return self.position.mean - half, self.position.mean + half
 
     def body_displacement(self, prediction: Prediction, body: BodyTrack) -> Tensor:
         """How the body nodes move in the network's eyes [m], on all axes, shape (B, N, 3)."""
@@ -223,7 +233,7 @@ class LatentDynamics(Dynamics):
             return super().unroll(latent, body, context)
         stepper = self.stepper(body.position.shape[-2], context)
         if self.predicts_body:
-            return unrolled(stepper.advance, latent, body, self.predicts_body)
+            return unrolled(stepper.advance, latent, body, self.predicts_body)  # a free body: nothing is held
         d, frames = self.history, body.position.shape[1]
         states = torch.empty((1, frames, *latent.shape[2:]), dtype=torch.float64, device=latent.device)
         states[:, :d] = latent

@@ -96,6 +96,7 @@ class PathStepper:
         self.load_mean = torch.cat([load.mean for load in loads])
         self.change_mean, self.change_scale = dynamics.change.mean, dynamics.change.scale
         self.accelerates = dynamics.settings.predicts == "acceleration"
+        self.nearest, self.furthest = dynamics.reach()
 
     def known(self, body: BodyTrack) -> Known:
         """What is known of the body (1, T, N, ...) in each of its windows of d frames."""
@@ -148,6 +149,7 @@ class PathStepper:
         following.add_(self.change_mean).add_(latent[-1])
         if self.accelerates:
             following.add_(self.velocity[-1])
+        torch.clamp(following, self.nearest, self.furthest, out=following)
         return following, decoded[:, 3:].sum(0, dtype=torch.float64).mul_(self.load_scale).add_(
             self.load_mean
         )
@@ -179,7 +181,11 @@ class PathStepper:
         with torch.inference_mode():
             known = self.known(body)
             loads = self.load_mean.new_empty(len(states) - d, len(self.load_mean))
+            held = self.dynamics.held(body)
+            rests = None if held is None else held[0].tolist()
             for k, (features, places) in enumerate(zip(known.features[1:], known.places[1:], strict=True)):
                 latent = states[k : k + d]
                 states[k + d], loads[k] = self.outcome(self.decoded(latent, features, places), latent)
+                if rests is not None and rests[k + 1]:
+                    states[k + d] = latent[-1]
             return loads

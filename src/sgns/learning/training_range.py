@@ -44,6 +44,10 @@ class Excess(NamedTuple):
         """Over all frames [1]; NaN where a frame is not finite."""
         return float(self.amount.max())
 
+    def until(self, frames: int) -> Excess:
+        """Of the first frames."""
+        return Excess(self.amount[:frames], self.quantity[:frames])
+
     def words(self) -> str:
         """Where a noteworthy excess begins and what it is at its largest; nothing if there is none."""
         beyond = ~(self.amount <= NOTEWORTHY)
@@ -134,6 +138,8 @@ def quantities(
     moved, place = track.motion[:, 0].numpy(), np.asarray(poses)[:, :3]
     heights = points[:, :, 2].min(axis=1) if points.shape[1] else place[:, 2]
     latent = np.asarray(latent, dtype=np.float64).reshape(len(place), -1)
+    with np.errstate(invalid="ignore"):  # of a soil that is not finite
+        velocity = np.diff(latent, axis=0, prepend=latent[:1])
     return {
         "the tool's position": place,
         "the tool's lowest point": heights[:, None],
@@ -141,7 +147,7 @@ def quantities(
         "the tool's displacement per frame": moved[:, :3],
         "the tool's rotation per frame": moved[:, 3:],
         "the soil's state": latent,
-        "the soil's velocity": np.diff(latent, axis=0, prepend=latent[:1]),
+        "the soil's velocity": velocity,
         **{key: np.full((len(place), 1), value) for key, value in context.items()},
     }
 
