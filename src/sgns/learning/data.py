@@ -21,7 +21,7 @@ from sgns.learning.context import context_of
 if TYPE_CHECKING:
     from sgns.reduction.reduced import ReducedRun
 
-__all__ = ["Batch", "NoiseScales", "TrainingWindows", "WindowDataModule", "random_walk"]
+__all__ = ["Batch", "NoiseScales", "TrainingWindows", "WindowDataModule", "random_walk", "require_finite"]
 
 # Streams of random numbers that must not be the same.
 _CHOICE, _NOISE, _BODY_NOISE = 0, 1, 2
@@ -122,6 +122,7 @@ class TrainingWindows:
         latent, tracks, force, torque, targets, of_run = [], [], [], [], [], []
         offset, pad = 0, history - 1
         for number, run in enumerate(runs):
+            require_finite(run)
             latent.append(pad_start(torch.as_tensor(run.latent[:, :num_modes]), pad))
             track = body_track(run.pose, run.body_points, body_nodes)
             tracks.append(BodyTrack(*(pad_start(part, pad) for part in track)))
@@ -142,10 +143,6 @@ class TrainingWindows:
             raise UserError(
                 f"the training runs are too short: to learn {horizon} step{'s' * (horizon > 1)} at once they need at "
                 f"least {horizon + 1} frames"
-            )
-        if not bool(torch.isfinite(self.latent).all()):
-            raise UserError(
-                "a reduced training run holds values that are not finite; find it with: sgns check <run.h5>"
             )
         # Windows of one batch have the same number of body nodes.
         nodes = self.body_nodes[self.of_run[self.targets]]
@@ -202,6 +199,24 @@ class TrainingWindows:
         while True:
             yield self.batch(step, size, noise)
             step += 1
+
+
+def require_finite(run: ReducedRun) -> None:
+    """Refuses a run of which one number would spoil everything that is learned; the line says where it is."""
+    series = {
+        "the soil's modes are": run.latent,
+        "the body's pose is": run.pose,
+        "the body's points are": run.body_points,
+        "the force is": run.force,
+        "the torque is": run.torque,
+    }
+    for what, values in series.items():
+        bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
+        if bad.any():
+            raise UserError(
+                f"{what} not finite at frame {int(bad.argmax())} of the reduced run {run.name}; check the run with: "
+                f"sgns check {run.name}.h5, and simulate it again, or remove it"
+            )
 
 
 def filled(parts: Sequence[Tensor]) -> list[Tensor]:

@@ -71,6 +71,7 @@ class RolloutValidation(L.Callback):
 
     def validate(self, trainer: L.Trainer, module: SurrogateTraining, step: int) -> None:
         """Measure, log, save."""
+        module.require_finite_weights()
         module.eval()
         score = self.rollouts.measure(module.surrogate.dynamics)
         module.train()

@@ -28,6 +28,8 @@ __all__ = ["SurrogateTraining", "TrainingSettings"]
 SCHEDULES = ("cosine", "exponential")
 LOSSES = ("change", "force", "torque")
 CHANGE_OF = ("free", "all")
+# A training whose loss is this many times that of its first step learns no more.
+_DIVERGED = 1e4
 
 
 @dataclass(frozen=True)
@@ -137,6 +139,7 @@ class SurrogateTraining(L.LightningModule):
         super().__init__()
         self.surrogate = surrogate
         self.settings = settings
+        self.first_loss: float | None = None
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Squared errors of the normalised quantities, unweighted: summed over axes, averaged over the nodes that
@@ -191,16 +194,24 @@ class SurrogateTraining(L.LightningModule):
         return dynamics.with_modes(int(draw.integers(1, dynamics.num_modes + 1)))
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
-        """The weighted loss; stops the training when it is not finite."""
+        """The weighted loss; stops the training when it is not finite or has grown beyond measure."""
         losses = self.losses(batch)
         loss = sum(self.settings.loss[name] * value for name, value in losses.items())
         assert isinstance(loss, Tensor)
-        if not bool(torch.isfinite(loss)):
+        total = float(loss.detach())
+        if self.first_loss is None:
+            self.first_loss = total
+        cure = (
+            f"likely the learning rate is too high: lower training.learning_rate (now "
+            f"{self.settings.learning_rate:g}) or training.gradient_clip (now {self.settings.gradient_clip})"
+        )
+        if not math.isfinite(total):
             worst = next((name for name, value in losses.items() if not bool(torch.isfinite(value))), "loss")
+            raise UserError(f"the {worst} loss is {total} at step {self.global_step}; {cure}")
+        if total > _DIVERGED * self.first_loss > 0:
             raise UserError(
-                f"the {worst} loss is {float(loss.detach())} at step {self.global_step}; likely the learning rate "
-                f"is too high: lower training.learning_rate (now {self.settings.learning_rate:g}) or set "
-                "training.gradient_clip"
+                f"the training diverges: the loss is {total:.3g} at step {self.global_step} and was "
+                f"{self.first_loss:.3g} in the first; {cure}"
             )
         for name, value in losses.items():
             self.log(f"loss/{name}", value.detach())
@@ -218,6 +229,20 @@ class SurrogateTraining(L.LightningModule):
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self.settings.rate)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
+    def require_finite_weights(self) -> None:
+        """For before a checkpoint is written: the one of before is worth more than one that is not finite."""
+        for name, weight in self.surrogate.named_parameters():
+            if not bool(torch.isfinite(weight).all()):
+                raise UserError(
+                    f"the weights {name} are not finite after step {self.global_step}; likely the learning rate is too "
+                    f"high: lower training.learning_rate (now {self.settings.learning_rate:g})"
+                )
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The card makes the checkpoint self-contained."""
         checkpoint["hyper_parameters"] = self.surrogate.card
+        checkpoint["first_loss"] = self.first_loss
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """A resumed training knows how it began."""
+        self.first_loss = checkpoint.get("first_loss")

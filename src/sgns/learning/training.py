@@ -166,7 +166,15 @@ def train(
         with quiet_lightning():
             trainer = make_trainer(output, settings, device, callbacks, logger)
             began = time.perf_counter()
-            fit(trainer, module, data, output / "last.ckpt" if resumed else None)
+            try:
+                fit(trainer, module, data, output / "last.ckpt" if resumed else None)
+            except UserError as error:
+                if not (output / "best.ckpt").exists():
+                    raise
+                raise UserError(
+                    f"{error}; the best checkpoint of before is kept, to go on from into another output: "
+                    f"checkpoint={output / 'best.ckpt'}"
+                ) from error
             seconds = time.perf_counter() - began
         score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
         about = {"steps": settings.max_steps}

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sgns.learning.body import BodyTrack, body_track
 from sgns.learning.context import context_of
-from sgns.learning.data import filled, pad_start
+from sgns.learning.data import filled, pad_start, require_finite
 from sgns.learning.stepping import Dynamics
 
 if TYPE_CHECKING:
@@ -63,6 +63,8 @@ class ValidationRollouts:
         body_nodes: str,
         context: Sequence[str] = (),
     ) -> None:
+        for run in runs:
+            require_finite(run)
         self.names = [run.name for run in runs]
         self.lengths = [len(run.latent) for run in runs]
         longest = max(self.lengths)

@@ -237,7 +237,12 @@ def fitted_basis(
         with Run(run_path) as run:
             arrangement = run.arrangement_hash
             for frames in frame_chunks(run.particle_count, run.frame_count):
-                pca.partial_fit(run.positions(frames))
+                positions = run.positions(frames)
+                try:
+                    pca.partial_fit(positions)
+                except UserError:
+                    require_positions(run_path, frames.start, positions)
+                    raise
         names.append(run_path.stem)
     rank = pca.rank(settings["centring"])
     if rank == 0:
@@ -250,6 +255,17 @@ def fitted_basis(
     return basis
 
 
+def require_positions(path: Path, first: int, positions: np.ndarray) -> None:
+    """Refuses positions (t, n, 3) of a run from its frame `first` on that are no numbers; the line says where."""
+    bad = ~np.isfinite(positions)
+    if bad.any():
+        frame, particle, axis = (int(i) for i in np.argwhere(bad)[0])
+        raise UserError(
+            f"{path}: the position of particle {particle} along {'xyz'[axis]} is {positions[frame, particle, axis]} "
+            f"at frame {first + frame}; simulate this run again, or remove it"
+        )
+
+
 def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
     """The cached reduced run, or a new one."""
     if path.exists():
@@ -258,14 +274,21 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
         except (OSError, KeyError, ValueError) as error:
             log.warning("%s is damaged (%s); reducing %s again", path, error, run_path)
     with Run(run_path) as run:
-        latent = torch.cat(
-            [
-                basis.transform(run.positions(frames)).cpu()
-                for frames in frame_chunks(run.particle_count, run.frame_count)
-            ]
-        ).numpy()
+        parts = []
+        for frames in frame_chunks(run.particle_count, run.frame_count):
+            positions = run.positions(frames)
+            parts.append(basis.transform(positions).cpu())
+            if not bool(parts[-1].isfinite().all()):
+                require_positions(run_path, frames.start, positions)
         reduced = ReducedRun(
-            run_path.stem, latent, run.time, run.pose, run.body_points, run.force, run.torque, run.scene
+            run_path.stem,
+            torch.cat(parts).numpy(),
+            run.time,
+            run.pose,
+            run.body_points,
+            run.force,
+            run.torque,
+            run.scene,
         )
     write_reduced(path, reduced)
     return reduced

@@ -19,6 +19,7 @@ from sgns.learning.dynamics import Path
 from sgns.learning.trainee import TrainingSettings
 from sgns.learning.training import main, train
 from sgns.learning.validation import ValidationRollouts
+from sgns.simulator import Simulator
 
 
 @pytest.fixture(scope="module")
@@ -226,3 +227,60 @@ def test_the_command(tmp_path) -> None:
     assert json.loads((tmp_path / "out" / "training.json").read_text())["skill"] == skill
     card = torch.load(tmp_path / "out" / "best.ckpt", weights_only=True)["hyper_parameters"]
     assert card["settings"]["preset"] == "default" and card["settings"]["dataset"] == "tiny"
+
+
+def poisoned(data, split: str, what: str):
+    """The data with one number that is none in the second run of a split."""
+    runs = {name: data.runs(name) for name in ("train", "validation", "test")}
+    values = getattr(runs[split][1], what).copy()
+    values[7].flat[-1] = np.nan
+    runs[split][1] = replace(runs[split][1], **{what: values})
+    return replace(data, _runs=runs)
+
+
+@pytest.mark.parametrize("what", ["latent", "pose", "body_points", "force", "torque"])
+@pytest.mark.parametrize(("split", "name"), [("train", "b"), ("validation", "f")])
+def test_one_poisoned_number_is_named(data, tmp_path, what, split, name) -> None:
+    with pytest.raises(
+        UserError, match=rf"not finite at frame 7 of the reduced run {name};.*sgns check {name}\.h5"
+    ):
+        run(poisoned(data, split, what), tmp_path)
+
+
+def test_a_training_that_diverges_stops_and_keeps_its_best(data, tmp_path, monkeypatch) -> None:
+    """From step 12 on the rate is a thousand times what it should be; step 10 was judged and saved."""
+    rate = TrainingSettings.rate
+    monkeypatch.setattr(
+        TrainingSettings, "rate", lambda self, step: rate(self, step) * (1e3 if step > 11 else 1)
+    )
+    with pytest.raises(
+        UserError, match=r"diverges: the loss is .* at step 1\d and was .*best\.ckpt"
+    ) as caught:
+        run(data, tmp_path / "ill", max_steps=60, validate_every=10)
+    assert "\n" not in str(caught.value)
+    assert torch.load(tmp_path / "ill" / "best.ckpt", weights_only=True)["global_step"] == 10
+    assert np.isfinite(Simulator.load(tmp_path / "ill" / "best.ckpt").mean_force).all()
+    assert not (tmp_path / "ill" / "training.json").exists()
+
+
+def test_weights_that_are_not_finite_are_not_saved(data, tmp_path, monkeypatch) -> None:
+    """Gradients that are not finite spoil the weights though the loss was finite: step 10 is saved, step 20 is not."""
+    clip = module.SurrogateTraining.configure_gradient_clipping
+
+    def spoil(self, optimizer, *args, **kw) -> None:
+        clip(self, optimizer, *args, **kw)
+        if self.global_step == 19:
+            next(self.surrogate.dynamics.network.parameters()).grad[0] = torch.nan
+
+    monkeypatch.setattr(module.SurrogateTraining, "configure_gradient_clipping", spoil)
+    with pytest.raises(UserError, match=r"the weights .* are not finite after step 20; .*best\.ckpt"):
+        run(data, tmp_path, max_steps=30)
+    for name in ("best.ckpt", "last.ckpt"):
+        content = torch.load(tmp_path / name, weights_only=True)
+        assert content["global_step"] == 10
+        assert all(value.isfinite().all() for value in content["state_dict"].values())
+
+
+def test_a_resumed_training_knows_its_first_loss(data, tmp_path) -> None:
+    run(data, tmp_path)
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["first_loss"] > 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -129,3 +130,16 @@ def test_the_gpu_reduces_alike(tmp_path) -> None:
     np.testing.assert_allclose(gpu.basis.modes, cpu.basis.modes, atol=1e-8)
     for a, b in zip(gpu.runs("test"), cpu.runs("test"), strict=True):
         np.testing.assert_allclose(a.latent, b.latent, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["c", "e"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_positions_that_are_no_numbers_are_named(tmp_path, name, value) -> None:
+    """Of a training run while the basis is fitted, of a validation run while it is reduced."""
+    dataset = make_dataset(tmp_path)
+    path = tmp_path / "runs" / f"{name}.h5"
+    with h5py.File(path, "r+") as file:
+        file["particles/soil/position/value"][6, 17, 2] = value
+    with pytest.raises(UserError, match=rf"{name}\.h5: .*particle 17 along z is {value} at frame 6"):
+        reduce_dataset(dataset, REDUCTION)
+    assert not list((tmp_path / "reduced").rglob("*.tmp*"))
