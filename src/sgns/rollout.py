@@ -82,7 +82,6 @@ def write_rollout(
     seed: int = 0,
     checkpoint: str | Path = "",
     given_frames: int = 1,
-    stopped: str = "",
 ) -> Path:
     """Decodes a rollout and writes it as a run file (producer `rollout`).
 
@@ -97,7 +96,6 @@ def write_rollout(
         seed: recorded seed.
         checkpoint: file that the simulator was loaded from; recorded with its settings.
         given_frames: how many frames at the start are no predictions; recorded as `history`.
-        stopped: why the rollout ends before its path does; recorded.
 
     Returns:
         The path written.
@@ -107,29 +105,17 @@ def write_rollout(
             file cannot be written.
     """
     path, whole = Path(path), finite_frames(rollout)
+    reason = ""
     if whole < len(rollout.latent):
-        kept = path.with_suffix(f".stopped{path.suffix}")
         reason = (
             f"the rollout for {path.name} is not finite from frame {whole} on: the network is not stable on this "
             "path; train longer, or use a checkpoint with a higher validation skill"
         )
-        if whole > 0:
-            write_rollout(
-                kept,
-                simulator,
-                scene,
-                rollout.until(whole),
-                effects=effects,
-                seed=seed,
-                checkpoint=checkpoint,
-                given_frames=given_frames,
-                stopped=reason,
-            )
-            reason += f"; the frames before are in {kept}"
-        raise UserError(reason)
+        if whole == 0:
+            raise UserError(reason)
     began = time.perf_counter()
     rate = float(simulator.frame_rate)
-    latent = torch.as_tensor(rollout.latent)
+    latent = torch.as_tensor(rollout.latent[:whole])
     particle_count, excess = len(simulator.start_positions), rollout.excess
     with RunWriter(
         path,
@@ -148,7 +134,6 @@ def write_rollout(
             "history": given_frames,
             "outside_training": None if excess is None else excess.largest,
             "outside_training_words": None if excess is None else excess.words(),
-            **({"stopped": stopped} if stopped else {}),
         },
     ) as writer:
         previous = None
@@ -164,7 +149,10 @@ def write_rollout(
                     rollout.torque[frame],
                 )
                 previous = position
-        writer.finish(float(rollout.wall_time_s) + time.perf_counter() - began)
+        wall_time = float(rollout.wall_time_s) + time.perf_counter() - began
+        if reason:
+            raise UserError(f"{reason}; the frames before are in {writer.stop(wall_time, reason)}")
+        writer.finish(wall_time)
     return path
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -83,14 +83,6 @@ class Rollout:
     body_points: np.ndarray
     wall_time_s: float
     _excess: Callable[[], Excess | None] = field(repr=False)
-
-    def until(self, frames: int) -> Rollout:
-        """The rollout of the first frames."""
-        series = ("latent", "force", "torque", "poses", "body_points")
-        excess = None if self.excess is None else self.excess.until(frames)
-        return replace(
-            self, **{name: getattr(self, name)[:frames] for name in series}, _excess=lambda: excess
-        )
 
     @cached_property
     def excess(self) -> Excess | None:

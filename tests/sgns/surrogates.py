@@ -30,10 +30,6 @@ class FakeRollout:
     wall_time_s: float
     excess: Excess | None = None
 
-    def until(self, frames: int) -> FakeRollout:
-        series = ("latent", "force", "torque", "poses", "body_points")
-        return replace(self, **{name: getattr(self, name)[:frames] for name in series})
-
 
 @dataclass
 class FakeDataset:

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 __all__ = ["NOTEWORTHY", "Excess", "TrainingRange"]
 
 NOTEWORTHY = 0.05
-"""Excess above which a path is called unlike the training runs. Held-out runs of the same kind stay below a fifth of
-it (experiments/stability/)."""
+"""Excess above which a path is called unlike the training runs; held-out runs of the same kind stay below it
+(experiments/stability/)."""
 
 # A component that varies less than the others of its quantity is given this share of their range as its own.
 _FLOOR = 0.1
@@ -43,10 +43,6 @@ class Excess(NamedTuple):
     def largest(self) -> float:
         """Over all frames [1]; NaN where a frame is not finite."""
         return float(self.amount.max())
-
-    def until(self, frames: int) -> Excess:
-        """Of the first frames."""
-        return Excess(self.amount[:frames], self.quantity[:frames])
 
     def words(self) -> str:
         """Where a noteworthy excess begins and what it is at its largest; nothing if there is none."""

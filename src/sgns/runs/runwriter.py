@@ -201,13 +201,13 @@ class RunWriter:
         self._complete(wall_time_s, self.path)
         stopped_path(self.path).unlink(missing_ok=True)  # of an earlier attempt
 
-    def stop(self, wall_time_s: float, reason: str, state: State) -> Path:
+    def stop(self, wall_time_s: float, reason: str, state: State | None = None) -> Path:
         """Complete the file with the frames so far, as a stopped run beside the one it was to be (stopped.py).
 
         Args:
             wall_time_s: time it took so far [s].
             reason: why there are no more frames.
-            state: at the last of them, to go on from.
+            state: at the last of them, to go on from; a rollout has none.
 
         Returns:
             The file's path.
@@ -215,7 +215,8 @@ class RunWriter:
         if self._file is None:
             raise ValueError("the run is already finished or discarded; make a new RunWriter")
         write_text(self._file, "stopped", reason)
-        write_state(self._file, state)
+        if state is not None:
+            write_state(self._file, state)
         path = stopped_path(self.path)
         self._complete(wall_time_s, path)
         return path
