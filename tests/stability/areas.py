@@ -8,7 +8,12 @@ from case import Case
 
 __all__ = ["AREAS", "cases"]
 
-AREAS = {"solver": "solver_cases"}
+AREAS = {
+    "solver": "solver_cases",
+    "reduction": "reduction_cases",
+    "training": "training_cases",
+    "rollout": "rollout_cases",
+}
 """Area -> module beside this one."""
 
 

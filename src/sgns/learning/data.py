@@ -128,7 +128,8 @@ class TrainingWindows:
             tracks.append(BodyTrack(*(pad_start(part, pad) for part in track)))
             force.append(pad_start(torch.as_tensor(run.force), pad))
             torque.append(pad_start(torch.as_tensor(run.torque), pad))
-            targets.append(torch.arange(offset + history, offset + pad + len(run.latent) - (horizon - 1)))
+            first, end = offset + history, offset + pad + len(run.latent) - (horizon - 1)
+            targets.append(torch.arange(first, max(first, end)))  # none of a run shorter than the horizon
             of_run.append(torch.full((pad + len(run.latent),), number))
             offset += pad + len(run.latent)
         self.latent = torch.cat(latent)

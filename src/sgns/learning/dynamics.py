@@ -22,10 +22,6 @@ from sgns.learning.stepping import Dynamics, unrolled
 
 __all__ = ["LatentDynamics", "Path", "Prediction", "Step"]
 
-# No latent position goes further than this from its mean, in deviations: training runs stay within a few. It keeps a
-# rollout finite that has left everything it knows.
-_REACH = 30.0
-
 
 class LatentDynamics(Dynamics):
     """Graph network on modes and body nodes, with the statistics that make its inputs and outputs of order
@@ -213,10 +209,9 @@ class LatentDynamics(Dynamics):
             displacement = torch.where(self.free > 0, self.body_displacement(prediction, body), displacement)
         return Step(following, force.sum(-2), torque.sum(-2), displacement)
 
-    def reach(self) -> tuple[Tensor, Tensor]:
-        """Smallest and largest latent positions that a step may lead to [m], shape (r, 3) each."""
-        half = _REACH * self.position.scale
-        return self.position.mean - half, self.position.mean + half
+    def latent_statistics(self) -> tuple[Tensor, Tensor]:
+        """As for all `Dynamics`."""
+        return self.position.mean, self.position.scale
 
     def body_displacement(self, prediction: Prediction, body: BodyTrack) -> Tensor:
         """How the body nodes move in the network's eyes [m], on all axes, shape (B, N, 3)."""

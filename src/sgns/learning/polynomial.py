@@ -155,6 +155,12 @@ class PolynomialDynamics(Dynamics):
         factors = torch.nn.functional.pad(held, (1, 0), value=1.0)
         return factors[:, self.terms[:, 0]] * factors[:, self.terms[:, 1]]
 
+    def latent_statistics(self) -> tuple[Tensor, Tensor]:
+        """As for all `Dynamics`: the newest latent position is the first of the inputs."""
+        modes = slice(0, 3 * self.num_modes)
+        mean, scale = self.inputs.mean[modes], self.inputs.scale[modes]
+        return mean.unflatten(0, (-1, 3)), scale.unflatten(0, (-1, 3))
+
     def outputs(self) -> list[Standardiser]:
         """Statistics of the outputs in their order."""
         return [self.velocity, self.body_displacement, self.force, self.torque]
@@ -169,4 +175,5 @@ class PolynomialDynamics(Dynamics):
         displacement = body.motion[:, -1, :, :3].clone()
         displacement[..., self.free] = rise[:, None]
         following = latent[:, -1] + velocity.unflatten(1, (self.num_modes, 3))
+        following = torch.clamp(following, *self.reach())
         return Step(following, force, torque, displacement)

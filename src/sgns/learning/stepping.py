@@ -23,6 +23,9 @@ __all__ = ["Dynamics", "Stepper", "resting", "unrolled"]
 
 # A body that moves less than this in a frame [m, rad] rests: round-off of poses, not motion.
 _STILL = 1e-9
+# No latent position goes further than this from its mean, in deviations; training runs stay within about half of it. It
+# keeps a rollout finite that has left everything the dynamics know.
+_REACH = 10.0
 
 
 class Stepper(Protocol):
@@ -84,6 +87,15 @@ class Dynamics(nn.Module):
         Raises:
             UserError: More modes than it was trained with.
         """
+
+    @abstractmethod
+    def latent_statistics(self) -> tuple[Tensor, Tensor]:
+        """Mean and deviation of the latent positions in the training windows [m], shape (r, 3) each."""
+
+    def reach(self) -> tuple[Tensor, Tensor]:
+        """Smallest and largest latent positions that a step leads to [m], shape (r, 3) each."""
+        mean, scale = self.latent_statistics()
+        return mean - _REACH * scale, mean + _REACH * scale
 
     @abstractmethod
     def advance(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Step:

@@ -232,7 +232,8 @@ def surrogate_of(dynamics: Dynamics, reduced: ReducedDataset, card: dict[str, An
     first = reduced.runs("train")[0]
     points = torch.as_tensor(in_body_frame(first.pose[0], first.body_points[0]))
     basis = reduced.basis.sliced(dynamics.num_modes)
-    known = TrainingRange.of(reduced.runs("train"), dynamics.num_modes, dynamics.context_keys)
+    sees_points = dynamics.settings.body_nodes == "points"
+    known = TrainingRange.of(reduced.runs("train"), dynamics.num_modes, dynamics.context_keys, sees_points)
     start = torch.as_tensor(reduced.start_positions)
     return Surrogate(dynamics, basis, start, points, card | {"training_range": known.plain()})
 

@@ -26,6 +26,7 @@ NOTEWORTHY = 0.05
 # A component that varies less than the others of its quantity is given this share of their range as its own.
 _FLOOR = 0.1
 _AXES = ("x", "y", "z")
+_POINTS = "the number of the tool's points"
 
 
 class Excess(NamedTuple):
@@ -69,13 +70,24 @@ class TrainingRange:
     high: dict[str, np.ndarray]
 
     @classmethod
-    def of(cls, runs: Sequence[ReducedRun], num_modes: int, context: Sequence[str]) -> TrainingRange:
-        """Of the first modes of some runs, and of the numbers of their scenes that the dynamics are told."""
+    def of(
+        cls, runs: Sequence[ReducedRun], num_modes: int, context: Sequence[str], points: bool = False
+    ) -> TrainingRange:
+        """Of the first modes of some runs, and of the numbers of their scenes that the dynamics are told.
+
+        Args:
+            runs: The training runs.
+            num_modes: r.
+            context: Keys of the scene.
+            points: Whether the dynamics see the body's points, so that their number counts, too.
+        """
         low: dict[str, np.ndarray] = {}
         high: dict[str, np.ndarray] = {}
         for run in runs:
             numbers = dict(zip(context, context_of(run.scene, context), strict=True))
             found = quantities(run.pose, run.body_points, run.latent[:, :num_modes], numbers)
+            if not points:
+                del found[_POINTS]
             for name, values in found.items():
                 low[name] = np.minimum(low.get(name, np.inf), values.min(axis=0))
                 high[name] = np.maximum(high.get(name, -np.inf), values.max(axis=0))
@@ -117,7 +129,9 @@ class TrainingRange:
             context: Numbers of the scene by their keys.
         """
         amounts, names = [], []
-        for name, values in quantities(poses, points, latent, context).items():
+        found = quantities(poses, points, latent, context)
+        for name in self.low:
+            values = found[name]
             low, high = (side[name][: values.shape[1]] for side in (self.low, self.high))
             amounts.append(np.maximum(np.maximum(low - values, values - high), 0.0) / widths(low, high))
             names += [f"{name}{of}" for of in components(name, values.shape[1])]
@@ -139,6 +153,7 @@ def quantities(
     return {
         "the tool's position": place,
         "the tool's lowest point": heights[:, None],
+        _POINTS: np.full((len(place), 1), float(points.shape[1])),
         "the tool's orientation": track.orientation[:, 0].numpy(),
         "the tool's displacement per frame": moved[:, :3],
         "the tool's rotation per frame": moved[:, 3:],

@@ -9,6 +9,7 @@ import pytest
 import torch
 from tiny import MODEL, reduced
 
+from sgns.errors import UserError
 from sgns.learning.data import NoiseScales, TrainingWindows, generator, random_walk
 from sgns.learning.dynamics import LatentDynamics
 from sgns.learning.model_settings import ModelSettings
@@ -22,6 +23,9 @@ def data(tmp_path_factory):
 
 def windows_of(data, history: int = 3, seed: int = 0) -> TrainingWindows:
     return TrainingWindows(data.runs("train"), 4, history, "pose", seed)
+
+
+SERIES = ("latent", "time", "pose", "body_points", "force", "torque")
 
 
 def still(scale: float | torch.Tensor = 0.0) -> NoiseScales:
@@ -139,6 +143,14 @@ def test_a_horizon_gives_as_many_targets(data) -> None:
     np.testing.assert_array_equal(batch.force[19], run.force[10:14])
     assert batch.body.position.shape[1] == 2 + 4
     np.testing.assert_array_equal(batch.body.position[19, -1, 0], run.pose[13, :3])
+
+
+def test_runs_shorter_than_the_horizon_are_left_out_and_named_if_all_are(data) -> None:
+    runs = data.runs("train")
+    short = replace(runs[0], **{name: getattr(runs[0], name)[:3] for name in SERIES})
+    assert len(TrainingWindows([short, runs[1]], 4, 3, "pose", horizon=4)) == 10
+    with pytest.raises(UserError, match="too short: to learn 4 steps at once they need at least 5 frames"):
+        TrainingWindows([short], 4, 3, "pose", horizon=4)
 
 
 def test_context_is_that_of_the_run(data) -> None:

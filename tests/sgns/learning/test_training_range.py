@@ -81,6 +81,15 @@ def test_fewer_modes_are_compared_with_the_first(data, known) -> None:
     assert excess(known, run, latent=run.latent[:, :2]).largest == 0.0
 
 
+def test_the_number_of_points_counts_where_they_are_seen(data) -> None:
+    run, number = data.runs("train")[0], {"depth": data.runs("train")[0].scene["depth"]}
+    for seen in (True, False):
+        known = TrainingRange.of(data.runs("train"), 4, ("depth",), points=seen)
+        found = known.excess(run.pose, run.body_points[:, :1], run.latent[:, :4], number)
+        assert ("the number of the tool's points" in found.quantity) == seen
+        assert (found.largest == pytest.approx(14 / 15)) == seen
+
+
 def test_what_never_varied_has_a_unit_of_its_own() -> None:
     np.testing.assert_allclose(widths(np.array([0.0, 3.0]), np.array([10.0, 3.0])), [10.0, 1.0])
     np.testing.assert_allclose(widths(np.array([0.0, -4.0]), np.array([0.0, -4.0])), [4.0, 4.0])

@@ -1,0 +1,258 @@
+"""Hard cases of the reduction.
+
+Letters: t frames, n particles, r modes.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+import yaml
+from case import Case
+from refusals import unsaid
+from tiny import REDUCTION, make_dataset
+
+from sgns.campaign import Dataset
+from sgns.reduction import Basis, IncrementalPCA
+from sgns.reduction.reduced import reduce_dataset
+
+__all__ = ["CASES"]
+
+
+def soil(t: int = 40, n: int = 60, rank: int | None = None, offset: float = 0.0, seed: int = 0) -> np.ndarray:
+    """A bed of 1 m whose particles move by 0.1 m in `rank` ways; (t, n, 3) [m]."""
+    chance = np.random.default_rng(seed)
+    rank = min(3 * t, n) if rank is None else rank
+    ways = chance.normal(size=(rank, n)) * 0.8 ** np.arange(rank)[:, None]
+    moved = 0.1 * np.einsum("tak,kn->tna", chance.normal(size=(t, 3, rank)), ways) / np.linalg.norm(ways[0])
+    return chance.uniform(size=(n, 3)) + moved + offset
+
+
+def fitted(positions: np.ndarray, modes: int, batch: int = 7, centring: str = "particle_axis") -> Basis:
+    """All modes up to a number, of frames given in batches."""
+    pca = IncrementalPCA(modes)
+    for first in range(0, len(positions), batch):
+        pca.partial_fit(positions[first : first + batch])
+    return pca.basis(centring, pca.rank(centring))
+
+
+def askew(basis: Basis) -> float:
+    """Largest entry of |U'U - 1|."""
+    gram = basis.modes.T @ basis.modes
+    return float((gram - torch.eye(len(gram))).abs().max())
+
+
+def missed(basis: Basis, positions: np.ndarray) -> float:
+    """Largest error of projecting and reconstructing [m]."""
+    return float((basis.inverse(basis.transform(positions)) - torch.as_tensor(positions)).abs().max())
+
+
+def turned(a: Basis, b: Basis) -> float:
+    """Sine of the largest angle between two subspaces."""
+    rest = b.modes - a.modes @ (a.modes.T @ b.modes)
+    return float(torch.linalg.matrix_norm(rest, ord=2))
+
+
+def rank_deficient() -> tuple[float, str]:
+    positions = soil(rank=5)
+    basis = fitted(positions, 16)
+    return abs(basis.num_modes - 5), f"reconstruction to {missed(basis, positions):.1e} m"
+
+
+def constant() -> float:
+    pca = IncrementalPCA(8)
+    pca.partial_fit(np.repeat(soil(t=1), 50, axis=0))
+    return pca.rank()
+
+
+def constant_dataset() -> tuple[float, str]:
+    with tempfile.TemporaryDirectory() as folder:
+        dataset = make_dataset(Path(folder))
+        for path in (Path(folder) / "runs").iterdir():
+            with h5py.File(path, "r+") as file:
+                values = file["particles/soil/position/value"]
+                values[...] = values[:1].repeat(len(values), axis=0)
+        return unsaid(lambda: reduce_dataset(dataset, REDUCTION), "nothing moves", "rank 0", "simulate")
+
+
+def duplicates() -> float:
+    positions = soil(t=30, n=40)
+    twice = np.concatenate([np.repeat(positions, 3, axis=0)] * 2, axis=1)
+    basis = fitted(twice, 24)
+    return max(askew(basis), float((basis.modes[:40] - basis.modes[40:]).abs().max()))
+
+
+def huge_offset() -> float:
+    positions = soil(rank=6)
+    return turned(fitted(positions, 6), fitted(positions + 1e6, 6))
+
+
+def huge_offset_in_float32() -> tuple[float, str]:
+    """float32 keeps 6 cm at 1e6 m, and nothing moves more than that: all there is to be seen is rounding."""
+    pca = IncrementalPCA(16)
+    pca.partial_fit((0.01 * soil(rank=6) + 1e6).astype(np.float32))
+    return pca.rank(), ""
+
+
+def offset_in_float32() -> tuple[float, str]:
+    """float32 keeps 8 um at 100 m, which resolves the six ways of moving and makes none of its own."""
+    pca = IncrementalPCA(16)
+    pca.partial_fit((soil(t=100, rank=6) + 100.0).astype(np.float32))
+    return abs(pca.rank() - 6), ""
+
+
+def wide() -> float:
+    return askew(fitted(soil(t=4, n=100_000), 12))
+
+
+def tall() -> float:
+    positions = soil(t=20_000, n=3)
+    return missed(fitted(positions, 3, batch=997), positions[::100])
+
+
+def one_particle() -> float:
+    positions = soil(t=50, n=1)
+    return missed(fitted(positions, 4), positions)
+
+
+def one_frame() -> tuple[float, str]:
+    pca = IncrementalPCA(4)
+    pca.partial_fit(soil(t=1))
+    return unsaid(lambda: pca.basis(num_modes=2), "rank 0", "1 frames", "add runs")
+
+
+def one_run() -> tuple[float, str]:
+    """A dataset whose training split is one run, whose modes are asked for to the last."""
+    with tempfile.TemporaryDirectory() as folder:
+        make_dataset(Path(folder))
+        split = {"train": ["a"], "validation": ["e", "f"], "test": ["g"]}
+        (Path(folder) / "dataset.yaml").write_text(yaml.safe_dump({"name": "tiny", "split": split}))
+        dataset = Dataset.open(Path(folder))
+        reduced = reduce_dataset(dataset, REDUCTION | {"max_modes": 40, "num_modes": 1})
+        return askew(reduced.basis), f"{len(dataset.runs('train'))} run, {reduced.basis.num_modes} modes"
+
+
+def batches_of_one() -> float:
+    positions = soil(t=300, n=50)
+    one, many = fitted(positions, 8, batch=1), fitted(positions, 8, batch=300)
+    return float((one.modes - many.modes).abs().max())
+
+
+def modes_of_all_sizes() -> float:
+    """Ways of moving from 1 m down to 1e-12 m."""
+    chance = np.random.default_rng(1)
+    ways = np.linalg.qr(chance.normal(size=(80, 24)))[0].T * 10.0 ** -np.linspace(0, 12, 24)[:, None]
+    return askew(fitted(np.einsum("tak,kn->tna", chance.normal(size=(60, 3, 24)), ways), 24))
+
+
+def equal_modes() -> float:
+    """All directions alike: any basis is as good, but it has to be one."""
+    positions = np.random.default_rng(2).normal(size=(200, 40, 3))
+    basis = fitted(positions, 8)
+    return max(askew(basis), float(basis.displacement_energy(8) > 1))
+
+
+def tiny_motion() -> float:
+    """A bed of 1 m whose soil moves by 1e-9 m."""
+    still, moving = soil(t=1, rank=4), soil(rank=4)
+    small = still + 1e-8 * (moving - moving.mean(0))
+    return turned(fitted(moving, 4), fitted(small, 4))
+
+
+def truncated_stream() -> tuple[float, str]:
+    """300 directions that hardly fall off, of which 8 + 16 are tracked."""
+    chance = np.random.default_rng(3)
+    ways = np.linalg.qr(chance.normal(size=(400, 300)))[0].T * 0.995 ** np.arange(300)[:, None]
+    positions = np.einsum("tak,kn->tna", chance.normal(size=(400, 3, 300)), ways)
+    rows = (positions - positions.mean(0)).transpose(0, 2, 1).reshape(-1, 400)
+    best = float((np.linalg.svd(rows, compute_uv=False)[:8] ** 2).sum())
+    basis = fitted(positions, 8, batch=11)
+    got = float(((rows @ basis.modes.numpy()) ** 2).sum())
+    return 100 * (1 - got / best), ""
+
+
+def poisoned(split: str, value: float) -> Callable[[], tuple[float, str]]:
+    """One particle of one frame of one run is no number."""
+
+    def measure() -> tuple[float, str]:
+        name = {"train": "b", "validation": "f"}[split]
+        with tempfile.TemporaryDirectory() as folder:
+            dataset = make_dataset(Path(folder))
+            with h5py.File(Path(folder) / "runs" / f"{name}.h5", "r+") as file:
+                file["particles/soil/position/value"][9, 31, 1] = value
+            words = f"{name}.h5", "particle 31", "along y", "frame 9", str(value)
+            return unsaid(lambda: reduce_dataset(dataset, REDUCTION), *words)
+
+    return measure
+
+
+def beyond_the_rank() -> tuple[float, str]:
+    with tempfile.TemporaryDirectory() as folder:
+        dataset = make_dataset(Path(folder), n=5)
+        return unsaid(
+            lambda: reduce_dataset(dataset, REDUCTION | {"num_modes": 6}),
+            "num_modes is 6",
+            "give 3 modes",
+            "at most 3",
+        )
+
+
+def mixture_of_beds() -> tuple[float, str]:
+    with tempfile.TemporaryDirectory() as folder:
+        dataset = make_dataset(Path(folder))
+        make_dataset(Path(folder) / "other", n=51)
+        (Path(folder) / "other" / "runs" / "c.h5").replace(Path(folder) / "runs" / "c.h5")
+        return unsaid(lambda: reduce_dataset(dataset, REDUCTION), "c.h5", "one basis serves one bed")
+
+
+ORTHONORMAL = "modes stay orthonormal"
+NO_MODES = "no mode is made of nothing"
+NAMED = "refused in one line that says what and where"
+
+CASES = [
+    Case("rank 5 of 60", "directions beyond the rank are round-off", NO_MODES, "modes too many or too few", 0, "modes",
+         rank_deficient, quick=True),
+    Case("soil that never moves", "all variances are zero", NO_MODES, "modes", 0, "modes", constant, quick=True),
+    Case("dataset that never moves", "there is no subspace", NAMED, "words lacking", 0, "words", constant_dataset),
+    Case("every particle and frame several times", "columns and rows depend on each other",
+         "twins stay twins, modes orthonormal", "largest deviation", 1e-9, "1", duplicates, quick=True),
+    Case("bed 1000 km from the origin", "layout 1e7 times the motion", "the same subspace as at the origin",
+         "sine of the angle between", 1e-6, "1", huge_offset, quick=True),
+    Case("1000 km in float32, motion below rounding", "all variation is rounding", NO_MODES, "modes", 0, "modes",
+         huge_offset_in_float32, quick=True),
+    Case("100 m from the origin in float32", "rounding is full-rank noise", NO_MODES, "modes too many or too few", 0,
+         "modes", offset_in_float32, quick=True),
+    Case("100 000 particles, 4 frames", "many more columns than rows", ORTHONORMAL, "largest entry of |U'U - 1|", 1e-12,
+         "1", wide),
+    Case("3 particles, 20 000 frames", "many more rows than columns", "all modes reconstruct everything",
+         "largest error", 1e-12, "m", tall, quick=True),
+    Case("one particle", "one column", "all modes reconstruct everything", "largest error", 1e-12, "m", one_particle,
+         quick=True),
+    Case("one frame", "nothing to compare with", NAMED, "words lacking", 0, "words", one_frame, quick=True),
+    Case("one training run, all modes", "rows follow each other", ORTHONORMAL, "largest entry of |U'U - 1|", 1e-12, "1",
+         one_run),
+    Case("batches of one frame", "blocks fill up frame by frame", "how the stream is cut does not matter",
+         "largest difference of modes", 0, "1", batches_of_one, quick=True),
+    Case("modes from 1 m down to 1 pm", "a Gram matrix squares the singular values", ORTHONORMAL,
+         "largest entry of |U'U - 1|", 1e-12, "1", modes_of_all_sizes, quick=True),
+    Case("all variances alike", "eigenvectors are not determined", ORTHONORMAL, "largest entry of |U'U - 1|", 1e-12,
+         "1", equal_modes, quick=True),
+    Case("soil moves by a nanometre", "motion is 1e-9 of the layout", "the same subspace as of a large motion",
+         "sine of the angle between", 1e-5, "1", tiny_motion, quick=True),
+    Case("300 alike directions, 24 tracked", "what is dropped comes back", "little is lost against the exact modes",
+         "variance lost", 5, "%", truncated_stream),
+    Case("NaN in a training run", "one number spoils a basis", NAMED, "words lacking", 0, "words",
+         poisoned("train", np.nan), quick=True),
+    Case("infinity in a training run", "one number spoils a basis", NAMED, "words lacking", 0, "words",
+         poisoned("train", np.inf)),
+    Case("NaN in a validation run", "one number spoils the choice of checkpoint", NAMED, "words lacking", 0, "words",
+         poisoned("validation", np.nan), quick=True),
+    Case("more modes than the data has", "5 particles that move in 3 ways", NAMED, "words lacking", 0, "words",
+         beyond_the_rank, quick=True),
+    Case("runs of two beds", "columns mean different particles", NAMED, "words lacking", 0, "words", mixture_of_beds),
+]  # fmt: skip

@@ -1,0 +1,335 @@
+"""Hard cases of the training and of the network alone."""
+
+from __future__ import annotations
+
+import copy
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from case import Case
+from refusals import unsaid
+from torch import nn
+from trained import fresh_data, poisoned, synthetic_data, synthetic_network, train_synthetic
+
+from sgns.learning.data import TrainingWindows
+from sgns.learning.dynamics import LatentDynamics
+from sgns.learning.monitoring import StepProgress
+from sgns.learning.trainee import SurrogateTraining, TrainingSettings
+from sgns.simulator import Simulator
+
+__all__ = ["CASES"]
+
+
+@contextmanager
+def folder() -> Iterator[Path]:
+    """A folder for what is trained."""
+    with tempfile.TemporaryDirectory() as path:
+        yield Path(path)
+
+
+def content(path: Path) -> dict[str, Any]:
+    """All of a checkpoint."""
+    return torch.load(path, weights_only=True)
+
+
+def poison(split: str, what: str) -> Callable[[], tuple[float, str]]:
+    """One number of one frame of one run is none."""
+
+    def measure() -> tuple[float, str]:
+        name = {"train": "b", "validation": "f"}[split]
+        with folder() as output:
+            words = f"reduced run {name}", "frame 7", f"sgns check {name}.h5"
+            return unsaid(lambda: train_synthetic(poisoned(synthetic_data(), split, what), output), *words)
+
+    return measure
+
+
+def exploding_rate(factor: float) -> Callable[[], tuple[float, str]]:
+    """The rate grows from step 12 on; step 10 was judged and saved, and nothing of it may be lost."""
+
+    def measure() -> tuple[float, str]:
+        rate = TrainingSettings.rate
+
+        def ill(settings: TrainingSettings, step: int) -> float:
+            return rate(settings, step) * (factor if step > 11 else 1.0)
+
+        with folder() as output:
+            with patch.object(TrainingSettings, "rate", ill):
+                lacking, note = unsaid(
+                    lambda: train_synthetic(synthetic_data(), output, max_steps=60),
+                    "learning_rate", "at step 1", "best.ckpt",
+                )  # fmt: skip
+            steps = content(output / "best.ckpt")["global_step"]
+            finite = np.isfinite(Simulator.load(output / "best.ckpt").rollout(a_path()).latent).all()
+            return lacking + abs(steps - 10) + (not finite), note
+
+    return measure
+
+
+def a_path() -> np.ndarray:
+    """Poses of the test run."""
+    return synthetic_data().runs("test")[0].pose
+
+
+def far_too_high_rate() -> tuple[float, str]:
+    """No step is sound, so no checkpoint may be kept."""
+    training = {"learning_rate": 1e30, "final_learning_rate": 1e30, "gradient_clip": None, "warmup_steps": 0}
+    with folder() as output:
+        lacking, note = unsaid(
+            lambda: train_synthetic(synthetic_data(), output, **training), "learning_rate", "at step"
+        )
+        return lacking + len(list(output.glob("*.ckpt"))), note
+
+
+def spoilt_gradient() -> tuple[float, str]:
+    """A gradient that is not finite in step 19; step 10 was saved and step 20 may not be."""
+    clip = SurrogateTraining.configure_gradient_clipping
+
+    def spoil(module: SurrogateTraining, *args: Any, **kw: Any) -> None:
+        clip(module, *args, **kw)
+        if module.global_step == 19:
+            next(module.surrogate.dynamics.network.parameters()).grad[0] = math.nan
+
+    with folder() as output:
+        with patch.object(SurrogateTraining, "configure_gradient_clipping", spoil):
+            lacking, note = unsaid(
+                lambda: train_synthetic(synthetic_data(), output, max_steps=30),
+                "the weights",
+                "after step 20",
+            )
+        return lacking + sum(
+            content(output / f"{name}.ckpt")["global_step"] != 10 for name in ("best", "last")
+        ), note
+
+
+class Interrupted(Exception):
+    """In place of a key or a power cut."""
+
+
+def resumed(stops: tuple[int, ...], **training: Any) -> Callable[[], tuple[float, str]]:
+    """Largest difference of weights, optimiser and schedule between a training that was interrupted and one that was
+    not."""
+
+    def measure() -> tuple[float, str]:
+        def run(output: Path) -> float:
+            return train_synthetic(synthetic_data(), output, max_steps=24, validate_every=6, **training)
+
+        with folder() as output:
+            whole = run(output / "whole")
+            for stop in stops:
+
+                def interrupt(callback: Any, trainer: Any, *args: Any, at: int = stop) -> None:
+                    if trainer.global_step == at:
+                        raise Interrupted
+
+                try:
+                    with patch.object(StepProgress, "on_train_batch_end", interrupt):
+                        run(output / "parts")
+                except Interrupted:
+                    continue
+                return math.nan, f"it was not interrupted at step {stop}"
+            difference = abs(run(output / "parts") - whole)
+            a, b = (content(output / name / "last.ckpt") for name in ("whole", "parts"))
+            for key in ("state_dict", "optimizer_states", "lr_schedulers", "global_step", "first_loss"):
+                difference = max(difference, unlike(a[key], b[key]))
+            return difference, f"interrupted after steps {', '.join(map(str, stops))}"
+
+    return measure
+
+
+def unlike(a: Any, b: Any) -> float:
+    """Largest difference between two nested values; infinite where they are of another shape or not numbers."""
+    if isinstance(a, dict):
+        return max((unlike(a[key], b[key]) for key in a), default=0.0) if a.keys() == b.keys() else math.inf
+    if isinstance(a, (list, tuple)):
+        return max(map(unlike, a, b), default=0.0) if len(a) == len(b) else math.inf
+    if isinstance(a, torch.Tensor):
+        same = a.shape == b.shape and bool(((a == b) | (a.isnan() & b.isnan())).all())
+        return 0.0 if same else float((a.double() - b.double()).abs().max())
+    return 0.0 if a == b else math.inf
+
+
+def no_variance() -> tuple[float, str]:
+    """Largest normalised feature or target of any window of runs that are all the same and whose tool never turns."""
+    data = fresh_data(scene={"depth": 0.05, "speed": 0.1, "rake": 0.0, "motion": "ramp"})
+    with folder() as output:
+        skill = train_synthetic(data, output, max_steps=60, validate_every=60, learning_rate=5e-3)
+        dynamics = Simulator.load(output / "best.ckpt")._dynamics
+    windows = TrainingWindows(data.runs("train"), 4, 3, "pose", 0)
+    batch = windows.windows(windows.targets)
+    values = [
+        dynamics._mode_features(batch.history),
+        dynamics.body_features(batch.shown_body),
+        dynamics.force.normalise(batch.force),
+        dynamics.torque.normalise(batch.torque),
+        dynamics.change.normalise(batch.latent[:, -1] - batch.latent[:, -2]),
+    ]
+    largest = max(float(value.abs().max()) for value in values)
+    return largest if math.isfinite(skill) else math.nan, f"validation skill {skill:.3f}"
+
+
+def no_force() -> tuple[float, str]:
+    """Runs in which the tool never feels anything: what force is predicted."""
+    data = synthetic_data()
+    runs = {
+        name: [replace(run, force=0 * run.force, torque=0 * run.torque) for run in data.runs(name)]
+        for name in ("train", "validation", "test")
+    }
+    with folder() as output:
+        train_synthetic(
+            replace(data, _runs=runs), output, max_steps=150, validate_every=150, learning_rate=5e-3
+        )
+        found = Simulator.load(output / "best.ckpt").rollout(a_path())
+    return float(np.abs(found.force).max()), ""
+
+
+def coinciding_nodes() -> float:
+    """Gradients that are not finite where two modes are at one place, over a horizon of three steps: the length of an
+    edge of no length has no direction."""
+    data = synthetic_data()
+    with folder() as output:
+        with patch.object(SurrogateTraining, "losses", spy := Losses(SurrogateTraining.losses)):
+            train_synthetic(data, output, max_steps=3, horizon=3, validate_every=3, noise=0.0)
+        return spy.bad
+
+
+class Losses:
+    """Takes a loss on a batch whose modes all are at one place, and counts gradients that are not finite."""
+
+    def __init__(self, losses: Callable[..., dict[str, torch.Tensor]]) -> None:
+        self.losses = losses
+        self.bad = 0.0
+
+    def __get__(self, module: SurrogateTraining, kind: type) -> Callable[[Any], dict[str, torch.Tensor]]:
+        return lambda batch: self.checked(module, batch)
+
+    def checked(self, module: SurrogateTraining, batch: Any) -> dict[str, torch.Tensor]:
+        # The edges see normalised positions: at their means all modes are at zero.
+        place = module.surrogate.dynamics.position.mean
+        together = batch._replace(latent=place.expand_as(batch.latent).clone())
+        losses = self.losses(module, together)
+        gradients = torch.autograd.grad(sum(losses.values()), list(module.parameters()), allow_unused=True)
+        self.bad += sum(float((~g.isfinite()).sum()) for g in gradients if g is not None)
+        return self.losses(module, batch)
+
+
+def few_frames(**training: Any) -> tuple[float, str]:
+    """Every run has four frames, one of them two: a few windows each."""
+    with folder() as output:
+        skill = train_synthetic(fresh_data(frames=4), output, max_steps=4, validate_every=4, **training)
+        return 0.0 if np.isfinite(skill) else math.nan, f"skill {skill:.3f}"
+
+
+def horizon_too_long() -> tuple[float, str]:
+    with folder() as output:
+        return unsaid(
+            lambda: train_synthetic(synthetic_data(), output, horizon=200), "200 steps", "201 frames"
+        )
+
+
+class Cast(nn.Module):
+    """A network computed in another precision."""
+
+    def __init__(self, network: nn.Module, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.network = copy.deepcopy(network).to(dtype)
+        self.dtype = dtype
+
+    def forward(self, nodes: torch.Tensor, edges: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+        return self.network(nodes.to(self.dtype), edges.to(self.dtype), index).to(nodes.dtype)
+
+
+def precision(dtype: torch.dtype) -> Callable[[], tuple[float, str]]:
+    """RMS difference of a rollout's modes from that of the network in float64, in share of the soil's movement."""
+
+    def measure() -> tuple[float, str]:
+        run = synthetic_data().runs("test")[0]
+        paths = {}
+        for kind in (torch.float64, dtype):
+            simulator = Simulator.load(synthetic_network())
+            dynamics: LatentDynamics = simulator._dynamics
+            dynamics.network = Cast(dynamics.network, kind)
+            # Through `advance`: the fast stepper multiplies weights out itself.
+            paths[kind] = stepped(simulator, run.pose)
+        exact = paths[torch.float64]
+        moved = float(np.sqrt(np.square(exact - exact[:1]).mean()))
+        return 100 * float(np.sqrt(np.square(paths[dtype] - exact).mean())) / moved, ""
+
+    return measure
+
+
+def stepped(simulator: Simulator, path: np.ndarray) -> np.ndarray:
+    """Modes (T, r, 3) along a path and its copy side by side, which takes the way of batches."""
+    return simulator.rollouts(np.stack([path, path])).latent[0]
+
+
+def unfit_checkpoint() -> tuple[float, str]:
+    """A checkpoint with one weight that is not finite."""
+    with folder() as output:
+        held = content(synthetic_network())
+        name = next(name for name in held["state_dict"] if name.endswith("weight"))
+        held["state_dict"][name].view(-1)[0] = math.inf
+        torch.save(held, output / "bad.ckpt")
+        return unsaid(lambda: Simulator.load(output / "bad.ckpt"), "bad.ckpt", "not finite")
+
+
+def wrong_modes() -> tuple[float, str]:
+    return unsaid(
+        lambda: Simulator.load(synthetic_network(), num_modes=5), "4 modes", "cannot have 5", "1 to 4"
+    )
+
+
+NAMED = "refused in one line that says what and where"
+STOPS = "stops in one line, the checkpoint of before is kept"
+SAME = "to the bit the training that was not interrupted"
+DIFFERENCE = "largest difference of weights, optimiser and schedule"
+
+CASES = [
+    Case("NaN in a mode", "one window spoils all weights", NAMED, "words lacking", 0, "words",
+         poison("train", "latent"), quick=True),
+    Case("NaN in a force", "one window spoils all weights", NAMED, "words lacking", 0, "words",
+         poison("train", "force")),
+    Case("NaN in a pose", "one window spoils all weights", NAMED, "words lacking", 0, "words",
+         poison("train", "pose")),
+    Case("NaN in a validation run", "no checkpoint can be chosen", NAMED, "words lacking", 0, "words",
+         poison("validation", "latent"), quick=True),
+    Case("learning rate 1e3 times too high from step 12", "the loss grows but is finite", STOPS,
+         "words lacking and steps lost", 0, "1", exploding_rate(1e3), quick=True),
+    Case("learning rate 1e8 times too high from step 12", "the loss overflows", STOPS, "words lacking and steps lost",
+         0, "1", exploding_rate(1e8)),
+    Case("learning rate 1e30 from the start", "no step is sound", "stops in one line, no checkpoint is written",
+         "words lacking and checkpoints", 0, "1", far_too_high_rate),
+    Case("a gradient that is not finite", "the loss was finite", STOPS, "words lacking and checkpoints spoilt", 0, "1",
+         spoilt_gradient),
+    Case("interrupted once", "Adam, schedule, noise and order of windows go on", SAME, DIFFERENCE, 0, "1",
+         resumed((15,)), quick=True),
+    Case("interrupted three times, twice before the first save", "nothing is there to go on from", SAME, DIFFERENCE, 0,
+         "1", resumed((3, 5, 19))),
+    Case("interrupted with a horizon and fewer modes", "chance picks the modes of a step", SAME, DIFFERENCE, 0, "1",
+         resumed((8, 13), horizon=3, fewer_modes=0.5)),
+    Case("runs that are all the same", "features without variance", "normalised numbers stay of order one",
+         "largest feature or target", 100, "deviations", no_variance),
+    Case("a tool that feels nothing", "targets without variance", "the force stays nothing", "largest force", 1, "N",
+         no_force),
+    Case("all modes at one place", "edges of no length in the gradient of three steps", "gradients stay finite",
+         "gradients that are not", 0, "1", coinciding_nodes),
+    Case("runs of four frames, batches of 512", "more windows in a batch than there are", "it trains",
+         "0, or no finite skill", 0, "1", lambda: few_frames(batch_size=512)),
+    Case("horizon longer than the runs", "no window is left", NAMED, "words lacking", 0, "words", horizon_too_long,
+         quick=True),
+    Case("network in float32", "1e-7 in every step", "the rollout of float64", "RMS difference / movement", 0.1, "%",
+         precision(torch.float32), quick=True),
+    Case("network in bfloat16", "4e-3 in every step", "errors do not grow", "RMS difference / movement", 10, "%",
+         precision(torch.bfloat16), quick=True),
+    Case("a weight that is not finite", "every answer would be NaN", NAMED, "words lacking", 0, "words",
+         unfit_checkpoint, quick=True),
+    Case("more modes than trained", "nobody taught them", NAMED, "words lacking", 0, "words", wrong_modes, quick=True),
+]  # fmt: skip
