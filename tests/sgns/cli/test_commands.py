@@ -100,7 +100,7 @@ def test_settings_of_a_command(command: str) -> None:
     )
     own = {
         "simulate": {"continue_from", "shard", "shards"},
-        "rollout": {"num_modes"},
+        "rollout": {"num_modes", "hold_at_rest"},
         "evaluate": {"split", "num_modes", "new_rollouts", "timing_repeats", "full_space"},
         "check": {"files"},
     }
