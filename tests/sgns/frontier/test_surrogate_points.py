@@ -73,7 +73,7 @@ def test_the_first_frame_that_is_no_number():
         latent, force = np.zeros((5, 2, 3)), np.zeros((5, 3))
         if bad:
             force[bad:] = np.nan
-        return Rollout(latent, force, force, np.zeros((5, 7)), np.zeros((5, 1, 3)), 1.0)
+        return Rollout(latent, force, force, np.zeros((5, 7)), np.zeros((5, 1, 3)), 1.0, lambda: None)
 
     assert first_not_finite(rollout(0)) == 0
     assert first_not_finite(rollout(3)) == 3
