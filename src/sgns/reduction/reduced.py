@@ -249,17 +249,6 @@ def fitted_basis(
     return basis
 
 
-def require_positions(path: Path, first: int, positions: np.ndarray) -> None:
-    """Refuses positions (t, n, 3) of a run from its frame `first` on that are no numbers; the line says where."""
-    bad = ~np.isfinite(positions)
-    if bad.any():
-        frame, particle, axis = (int(i) for i in np.argwhere(bad)[0])
-        raise UserError(
-            f"{path}: the position of particle {particle} along {'xyz'[axis]} is {positions[frame, particle, axis]} "
-            f"at frame {first + frame}; simulate this run again, or remove it"
-        )
-
-
 def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
     """The cached reduced run, or a new one."""
     if path.exists():
