@@ -398,6 +398,8 @@ def _plain(value: Any, hint: Any, where: str) -> Any:
         count = None if parts[-1] is ... else len(parts)
         if not isinstance(value, (list, tuple)) or count not in (None, len(value)):
             raise SceneError(f"{where} is {value!r}; it must be a list of {count or 'some'} values")
+        if get_origin(parts[0]) is tuple:  # the rows of a path; what reads them says which one is wrong
+            return tuple(tuple(one) if isinstance(one, list) else one for one in value)
         return tuple(_plain(one, parts[0], f"{where}[{i}]") for i, one in enumerate(value))
     return value
 
