@@ -25,6 +25,7 @@ from sgns.campaign import Campaign
 from sgns.claim import claimed
 from sgns.cost import RunCost, duration_words, finishing_time, require_space, run_cost, size_words
 from sgns.errors import UserError
+from sgns.leftovers import remove_leftovers
 from sgns.runs import Run
 from sgns.scene_effects import decision_summary, recorded
 from sgns.scene_run import scene_stages
@@ -76,6 +77,8 @@ def simulate_campaign(
     by_length = sorted(costs, key=lambda name: costs[name].work, reverse=True)
     share = by_length[shard::shards]
     missing = [name for name in share if not _done(campaign.file(name), campaign.scenes[name])]
+    for name in set(share) - set(missing):  # nobody will write these again
+        remove_leftovers(campaign.file(name))
     part = f", {len(share)} of them in shard {shard} of {shards}" if shards > 1 else ""
     total = f"{len(campaign.scenes)} runs{part}"
     log.info("dataset %s in %s: %s, %d to do", campaign.name, campaign.path, total, len(missing))

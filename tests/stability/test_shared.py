@@ -76,7 +76,8 @@ def test_two_processes_one_of_them_killed_and_repeated(tmp_path) -> None:
         time.sleep(0.02)
     one.kill()
     one.communicate()
-    for process in (two, start()):  # the third makes what the killed one had claimed
+    for begin_next in (lambda: two, start):  # the third makes or clears away what the killed one had begun
+        process = begin_next()
         said = process.communicate(timeout=100)[0]
         assert process.returncode == 0, said
     assert broken(tmp_path / "shared") == []

@@ -72,6 +72,9 @@ class NewFile:
             os.fsync(self._file.fileno())
             self._file.close()
             os.replace(self._temp, path or self.path)
+            # Again: when this file was begun, a process just killed may still have been seen.
+            with contextlib.suppress(OSError):
+                remove_leftovers(self.path)
         except OSError as error:
             self.discard()
             raise _cannot_write(self.path, error) from error
