@@ -36,7 +36,7 @@ def test_second_time_nothing_is_computed(tmp_path, monkeypatch) -> None:
     dataset = make_dataset(tmp_path)
     first = reduce_dataset(dataset, REDUCTION)
     before = files(tmp_path / "reduced")
-    monkeypatch.setattr(module, "IncrementalPCA", None)
+    monkeypatch.setattr(module, "fit_runs", None)
     second = reduce_dataset(dataset, REDUCTION)
     assert files(tmp_path / "reduced") == before
     for a, b in zip(first.runs("train"), second.runs("train"), strict=True):
@@ -46,7 +46,7 @@ def test_second_time_nothing_is_computed(tmp_path, monkeypatch) -> None:
 def test_a_sweep_over_modes_fits_one_basis(tmp_path, monkeypatch) -> None:
     dataset = make_dataset(tmp_path)
     reduce_dataset(dataset, REDUCTION)
-    monkeypatch.setattr(module, "IncrementalPCA", None)
+    monkeypatch.setattr(module, "fit_runs", None)
     for r in (1, 2, 6):
         reduced = reduce_dataset(dataset, REDUCTION | {"num_modes": r})
         assert (reduced.basis.num_modes, reduced.num_modes) == (6, r)
