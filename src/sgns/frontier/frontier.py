@@ -29,6 +29,8 @@ def main(cfg: DictConfig) -> None:
     """The command."""
     study = Study.from_settings(OmegaConf.to_container(cfg.study, resolve=True), Path(cfg.output))
     axes = axes_of(cfg.axis)
+    if axes:
+        study.record()
     for axis in axes:
         module, function = MEASURES[axis]
         getattr(importlib.import_module(module), function)(study)

@@ -8,10 +8,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from mpm_warp import Scene
 from sgns.errors import UserError
 from sgns.frontier.store import Store
 from sgns.frontier.timing import composed_scene
+from sgns.wholefile import write_whole
+from sgns.yaml_text import parse_yaml
 
 __all__ = ["AXES", "PointSettings", "Study", "StudyScene"]
 
@@ -127,3 +131,36 @@ class Study:
     def store(self) -> Store:
         """Where points are kept."""
         return Store(self.folder)
+
+    def record(self) -> None:
+        """Write what is asked for into the folder's study.yaml.
+
+        Raises:
+            UserError: the folder has a point of the same label that was asked for otherwise, so its results would be
+                taken for this study's.
+        """
+        file, asked = self.folder / "study.yaml", self._asked()
+        try:
+            known = parse_yaml(file.read_text(encoding="utf-8")) if file.exists() else {}
+        except ValueError:
+            known = None
+        if not isinstance(known, dict):
+            raise UserError(f"{file} does not say what was measured; give another output")
+        for key in known.keys() & asked.keys():
+            if known[key] != asked[key]:
+                raise UserError(
+                    f"{self.folder} holds {key} measured with {known[key]}, and {asked[key]} is asked for now; give "
+                    "another output, or another label"
+                )
+        write_whole(file, yaml.safe_dump(known | asked, sort_keys=False, allow_unicode=True))
+
+    def _asked(self) -> dict[str, Any]:
+        """Everything that results depend on, by scene and label."""
+        found = {}
+        for scene in self.scenes:
+            for key in ("scene", "dataset", "cases", "training", "reference"):
+                found[f"{scene.name}, {key}"] = scene.settings.get(key)
+            for axis in AXES:
+                for entry in scene.settings.get(axis) or ():
+                    found[f"{scene.name}, {axis}: {entry['label']}"] = entry
+        return found

@@ -164,3 +164,20 @@ def test_two_points_of_one_name_are_refused() -> None:
     scene["solver"] = [{"label": "a"}]
     with pytest.raises(UserError, match="needs axis and label"):
         study.scenes[0].points("solver")
+
+
+def test_a_label_stands_for_one_setting(tmp_path: Path) -> None:
+    def study(precision: str) -> Study:
+        changed = yaml.safe_load(yaml.safe_dump(TINY).replace("float64", precision))
+        changed["scenes"]["cut"]["solver"][1]["label"] = "precise"
+        return Study.from_settings(changed, tmp_path)
+
+    study("float64").record()
+    study("float64").record()
+    with pytest.raises(
+        UserError, match=r"cut, solver: precise measured with .*float64.*float32.*asked for now"
+    ):
+        study("float32").record()
+    (tmp_path / "study.yaml").write_text("- a list")
+    with pytest.raises(UserError, match="does not say what was measured"):
+        study("float64").record()
