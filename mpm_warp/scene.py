@@ -389,7 +389,11 @@ def _plain(value: Any, hint: Any, where: str) -> Any:
     parts = get_args(hint)
     if get_origin(hint) is UnionType:
         kinds = [part for part in parts if part is not type(None)]
-        return None if value is None and len(kinds) < len(parts) else _plain(value, kinds[0], where)
+        if value is None and len(kinds) < len(parts):
+            return None
+        if str in kinds and float in kinds:  # words, or the number that one of them stands for
+            return value if isinstance(value, str) else _number(value, where, float)
+        return _plain(value, kinds[0], where)
     if hint is str and not isinstance(value, str):
         raise SceneError(f"{where} is {value!r}; it must be text")
     if hint in (int, float):
