@@ -189,7 +189,7 @@ class Dataset:
         file = path / "dataset.yaml"
         if not file.exists():
             raise UserError(
-                f"no dataset in {path}: dataset.yaml is missing; make one: sgns simulate dataset=quick"
+                f"no dataset in {path}: dataset.yaml is missing; make one: sgns simulate dataset=<name>"
             )
         content = _read(file)
         split = content.get("split") if isinstance(content, dict) else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -107,8 +107,8 @@ def continued(cfg: DictConfig, overrides: Sequence[str]) -> Continuation:
 
 
 def _effects(reasons: Mapping[str, Any], path: Path) -> Effects:
-    try:
-        return Effects(**{name: bool(effect["on"]) for name, effect in reasons.items()})
+    try:  # some of what is recorded follows from the scene and is no choice
+        return Effects(**{effect.name: bool(reasons[effect.name]["on"]) for effect in fields(Effects)})
     except (TypeError, KeyError) as error:
         raise UserError(f"{path}: its effects are damaged ({error}); repeat the run") from None
 

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import h5py
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
 from test_simulate import SMALL, sgns
 
-from mpm_warp import Bed, Effects, Excavation, Plate, Scene, Solver, SolverStopped
+from mpm_warp import Bed, Effects, Excavation, Plate, Scene, Solver, SolverStopped, effects_for
 from mpm_warp.batch import all_together
 from sgns import campaign_runs
 from sgns.continuation import continued
 from sgns.errors import UserError
 from sgns.runs import Run, check_run
 from sgns.runs.stopped import read_state, stopped_path
+from sgns.scene_effects import recorded
 from sgns.scene_run import simulate_scene
 
 LAST = 3  # frame before the one in which the solver stops
@@ -27,6 +30,12 @@ def small(**kw) -> Excavation:
         duration=0.1,
         **kw,
     )
+
+
+def physics() -> dict[str, Any]:
+    """Effects and the record of them as `sgns simulate` decides."""
+    effects, decisions = effects_for(small())
+    return {"effects": effects, "reasons": recorded(decisions)}
 
 
 @pytest.fixture
@@ -47,7 +56,7 @@ def stopped(stops, tmp_path):
     """A stopped run's file, and the file that it was to become."""
     output = tmp_path / "run.h5"
     with pytest.raises(SolverStopped) as caught:
-        simulate_scene(small(), output, effects=Effects())
+        simulate_scene(small(), output, **physics())
     assert f"sgns simulate continue_from={stopped_path(output)} output={output} scene.courant=0.3" in str(
         caught.value
     )
@@ -61,10 +70,10 @@ def test_the_frames_before_are_kept(stopped):
     assert [p.name for p in kept.parent.iterdir()] == [kept.name]
     with Run(kept) as run:
         assert run.frame_count == LAST + 1
-        assert "particle 11 at (" in run.stopped
+        assert "particle 51 at (" in run.stopped  # 11 of the half that is computed
         assert run.positions(0)[0].shape == (len(small().stored), 3)
     (problem,) = check_run(kept)
-    assert problem.startswith("the run stopped after 4 good frames: particle 11 at (")
+    assert problem.startswith("the run stopped after 4 good frames: particle 51 at (")
     assert read_state(kept).frame == LAST
 
 
@@ -94,7 +103,7 @@ def test_a_run_that_goes_on_unchanged_is_the_undisturbed_one(stopped, monkeypatc
     """Bit for bit, as a run file: the same content hash."""
     kept, _ = stopped
     monkeypatch.undo()
-    simulate_scene(small(), tmp_path / "whole.h5", effects=Effects())
+    simulate_scene(small(), tmp_path / "whole.h5", **physics())
     done = sgns(tmp_path, "simulate", f"continue_from={kept}", "output=rest.h5")
     assert done.returncode == 0, done.stderr
     with Run(tmp_path / "whole.h5") as one, Run(tmp_path / "rest.h5") as two:

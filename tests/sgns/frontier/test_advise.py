@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,23 @@ def test_time_is_that_of_a_step() -> None:
     assert answer("time=0.1")[0] == "use: solver, coarse"  # the smallest error within the time
     closest = answer("error.force=0.25", "time=0.001")
     assert closest[0].startswith("nothing meets this; closest: surrogate")
+
+
+def test_a_surrogate_is_not_taken_for_its_luck() -> None:
+    lucky = replace(
+        POINTS[3], label="lucky", force_nrmse=0.2, own_force_nrmse=0.5, wall_s_per_simulated_s=0.01
+    )
+    points = [*POINTS, lucky]
+    assert advice(points, wished(asked("error.force=0.4"), points))[0] == "use: surrogate, r = 8"
+    assert advice(points, wished(asked("time=0.001"), points))[0] == "use: surrogate, r = 8"
+
+
+def test_a_surrogate_that_no_command_makes_is_not_named() -> None:
+    study = replace(
+        POINTS[3], label="9 runs", force_nrmse=0.3, wall_s_per_simulated_s=0.01, note="trained on 9 runs"
+    )
+    points = [*POINTS, study]
+    assert advice(points, wished(asked("error.force=0.4"), points))[0] == "use: surrogate, r = 8"
 
 
 def test_particles_cost_their_decoding() -> None:
