@@ -256,6 +256,13 @@ def log_summary(evaluation: Evaluation, report: Path) -> None:
         timing.decoding,
         total.solver_rate,
     )
+    if full := evaluation.full_space:
+        log.info(
+            "the same network on every particle: %.3g s per simulated second, %.3g s per training step of %d samples",
+            full.rollout,
+            full.training_step,
+            full.batch_size,
+        )
     log.info("report: %s", report)
 
 
