@@ -63,5 +63,6 @@ def _opened(lock: Path) -> int:
             with suppress(FileNotFoundError):  # removed in between
                 return os.open(lock, os.O_RDWR)  # network file systems lock only what may be written
         else:
-            os.fchmod(file, 0o666)
+            with suppress(OSError):  # some file systems have no permissions to set
+                os.fchmod(file, 0o666)
             return file

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -39,13 +40,15 @@ class Continuation:
     scene: Scene
     """What was asked for at first; the run file says this."""
     changes: dict[str, Any]
-    """Keys of `CHANGES` with new values."""
+    """Keys of `CHANGES` with new values, those of earlier continuations included."""
     effects: Effects
     reasons: dict[str, dict[str, Any]]
     """Of the effects, as in the file."""
     precision: str
     seed: int
     state: State
+    wall_time: float
+    """What its frames took [s]."""
     before: list[dict[str, Any]]
     """What the file says of earlier continuations."""
 
@@ -82,27 +85,35 @@ def continued(cfg: DictConfig, overrides: Sequence[str]) -> Continuation:
         UserError: the file is no stopped run, or something else is to be changed than how it is computed.
     """
     path = Path(str(cfg.continue_from))
-    changes = _changes(cfg, overrides)
+    asked_changes = _changes(cfg, overrides)
     with Run(path) as run:
         reason = run.stopped
         if reason is None:
             raise UserError(f"continue_from: {path} is a whole run; there is nothing to go on with")
         scene, reasons, extra = run.scene, run.effects, run.extra
-        seed, count = run.seed, run.frame_count
+        seed, count, wall_time = run.seed, run.frame_count, run.wall_time_s
     state = read_state(path)
     if state.frame != count - 1:
         raise UserError(f"{path} holds {count} frames but the state of frame {state.frame}; repeat the run")
+    effects, before = _effects(reasons, path), _earlier(extra, path)
+    changes = {key: value for earlier in before for key, value in earlier["changed"].items()} | asked_changes
+    if effects.nonlocality and "bed.headroom" in changes:
+        raise UserError(
+            "with effects.nonlocality the grid keeps what flows, so scene.bed.headroom cannot change half-way; "
+            "simulate the scene anew"
+        )
     asked = any(o.startswith("solver.precision=") for o in overrides)
     return Continuation(
         path=path,
         scene=Scene.from_dict(scene),
         changes=changes,
-        effects=_effects(reasons, path),
+        effects=effects,
         reasons=reasons,
         precision=cfg.solver.precision if asked else str(extra.get("precision", cfg.solver.precision)),
         seed=seed,
         state=state,
-        before=_earlier(extra),
+        wall_time=wall_time,
+        before=before,
     )
 
 
@@ -113,16 +124,22 @@ def _effects(reasons: Mapping[str, Any], path: Path) -> Effects:
         raise UserError(f"{path}: its effects are damaged ({error}); repeat the run") from None
 
 
-def _earlier(extra: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _earlier(extra: Mapping[str, Any], path: Path) -> list[dict[str, Any]]:
     found = extra.get("continued", [])
-    return found if isinstance(found, list) else []
+    try:
+        known = all(set(one["changed"]) <= set(CHANGES) for one in found)
+    except (TypeError, KeyError):
+        known = False
+    if not known:
+        raise UserError(f"{path}: what it says of earlier continuations is damaged; repeat the run")
+    return found
 
 
 def _changes(cfg: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
     changes = {}
     for override in overrides:
         key = override.split("=")[0].lstrip("+~")
-        if key.split("@")[0].split(".")[0] == "hydra" or key in _OTHERS:
+        if re.split(r"[@./]", key)[0] == "hydra" or key in _OTHERS:
             continue
         if key.removeprefix("scene.") not in CHANGES or not key.startswith("scene."):
             raise UserError(

@@ -98,7 +98,8 @@ def scene_stages(
         there = writer.frame_count
         # Loading kernels is not part of the cost of a run: the clock starts with the first frame, or with the first
         # work where the first frames are there already.
-        wall_time, seen, shared_by = 0.0, None, 1
+        before = going_on.wall_time if going_on is not None else 0.0
+        wall_time, seen, shared_by = before, None, 1
         try:
             for stage in solver.stages():
                 if isinstance(stage, Work):
@@ -126,13 +127,22 @@ def scene_stages(
             if stopped.state is None or stopped.state.frame != writer.frame_count - 1:
                 raise
             kept = writer.stop(wall_time, str(stopped), stopped.state)
-            raise SolverStopped(
-                f"{stopped}. They are kept: sgns simulate continue_from={kept} output={output} "
-                f"scene.courant={0.5 * computed.courant:g} goes on from there with half the step"
-            ) from stopped
+            raise SolverStopped(f"{stopped}. {_way_on(str(stopped), kept, output, computed)}") from stopped
         wall_time += (time.perf_counter() - seen) / shared_by if seen is not None else 0.0
         writer.finish(wall_time)
     frames = scene.frame_count - max(1, there)
     yield Timing(
-        wall_time, frames / scene.frame_rate, frames * solver.substeps_per_frame * solver.computed_count
+        wall_time - before,
+        frames / scene.frame_rate,
+        frames * solver.substeps_per_frame * solver.computed_count,
     )
+
+
+def _way_on(cause: str, kept: Path, output: Path, computed: Scene) -> str:
+    """Where the frames are, and how to go on if a continuation can do what the cause asks for."""
+    command = f"They are kept: sgns simulate continue_from={kept} output={output}"
+    if "scene.courant" in cause:
+        return f"{command} scene.courant={0.5 * computed.courant:g} goes on from there with half the step"
+    if "scene.bed.headroom" in cause:
+        return f"{command} scene.bed.headroom={2.0 * computed.bed.headroom:g} goes on from there"
+    return f"They are kept in {kept}"

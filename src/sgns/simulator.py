@@ -7,6 +7,7 @@ Letters: B paths, T frames, n particles, M body points, N body nodes, d history 
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -137,7 +138,11 @@ class Simulator:
         self._dynamics, self.basis = surrogate.dynamics, surrogate.basis
         if num_modes is not None:
             self._dynamics, self.basis = self._dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
-        self._dynamics.holds_rest = hold_at_rest
+        if self._dynamics.holds_rest != hold_at_rest:
+            self._dynamics = copy.copy(
+                self._dynamics
+            )  # its weights are shared, the choice is this simulator's
+            self._dynamics.holds_rest = hold_at_rest
         self.start_positions = surrogate.start_positions.cpu().numpy()
         self.body_points = surrogate.body_points.cpu().numpy()
         self._start_latent = self.basis.transform(surrogate.start_positions.cpu())

@@ -18,7 +18,8 @@ def parse_yaml(text: str) -> Any:
 
     Raises:
         ValueError: It is no YAML, has such tags, is nested more than 100 deep (deep nesting would end the process), or
-            stands for more than a million values, since a few lines of aliases can stand for more than fits in memory.
+            stands for more than a million values and for more than it has characters, since a few lines of aliases can
+            stand for more than fits in memory.
     """
     try:
         _require_moderate(text)
@@ -31,10 +32,12 @@ def _require_moderate(text: str) -> None:
     sizes: dict[str, int] = {}  # of what aliases stand for
     unfinished: list[tuple[str | None, int]] = [(None, 0)]  # anchor and values so far, the innermost last
 
+    most = max(_MOST, len(text))  # without aliases there are fewer values than characters
+
     def count(anchor: str | None, size: int) -> None:
         outer, so_far = unfinished[-1]
-        if so_far + size > _MOST:
-            raise ValueError(f"it stands for more than {_MOST} values")
+        if so_far + size > most:
+            raise ValueError(f"it stands for more than {most} values")
         unfinished[-1] = outer, so_far + size
         if anchor is not None:
             sizes[anchor] = size

@@ -45,7 +45,7 @@ def stops(monkeypatch):
 
     def check(self, index):
         if index == LAST + 1 and self.scene.courant > 0.4:
-            raise self._stopped(index, 7, 11, "the test stops it")
+            raise self._stopped(index, 7, 11, "the test stops it: lower scene.courant")
         whole(self, index)
 
     monkeypatch.setattr(Solver, "_check", check)
@@ -114,6 +114,8 @@ def test_a_run_that_goes_on_unchanged_is_the_undisturbed_one(stopped, monkeypatc
 def test_it_may_stop_again(stopped, monkeypatch):
     """Then the frames of both are kept, and the file says so."""
     kept, output = stopped
+    with Run(kept) as run:
+        first = run.wall_time_s
     cfg = OmegaConf.create(
         {"continue_from": str(kept), "scene": {"courant": 0.3}, "solver": {"precision": "float32"}}
     )
@@ -121,16 +123,22 @@ def test_it_may_stop_again(stopped, monkeypatch):
 
     def check(self, index):
         if index == LAST + 2:
-            raise self._stopped(index, 7, 11, "the test stops it again")
+            raise self._stopped(index, 7, 11, "the test stops it again: raise scene.bed.headroom")
 
     monkeypatch.setattr(Solver, "_check", check)
-    with pytest.raises(SolverStopped, match=r"stops it again.*scene.courant=0.15 "):
+    with pytest.raises(SolverStopped, match=r"stops it again.*scene.bed.headroom=0"):
         simulate_scene(going_on.scene, output, effects=going_on.effects, going_on=going_on)
     with Run(kept) as run:
         assert run.frame_count == LAST + 2
         assert "stops it again" in run.stopped
         assert run.extra["continued"] == [{"frame": LAST, "changed": {"courant": 0.3}}]
+        took = run.wall_time_s
+    assert took > first  # the frames before the first stop included
     assert read_state(kept).frame == LAST + 1
+    cfg.scene = {"bed": {"headroom": 0.5}}
+    third = continued(cfg, ["scene.bed.headroom=0.5"])
+    assert third.changes == {"courant": 0.3, "bed.headroom": 0.5}  # those of before as well
+    assert third.changed_scene.courant == 0.3 and third.wall_time == took
 
 
 def test_a_campaign_says_where_its_run_is_kept(stops, tmp_path, monkeypatch):

@@ -195,7 +195,9 @@ def wished(cfg: Mapping[str, Any], points: Sequence[Point]) -> Wish:
     scenes = list(dict.fromkeys(p.scene for p in points))
     if cfg["task"] not in scenes:
         raise UserError(f"task is {cfg['task']!r}; the table has {', '.join(scenes) or 'none'}")
-    if not isinstance(cfg["error"], Mapping) or (wrong := set(cfg["error"]) - set(ERRORS)):
+    if not isinstance(cfg["error"], Mapping):
+        raise UserError(f"error is {cfg['error']!r}; give one of its keys, as error.force=0.3")
+    if wrong := set(cfg["error"]) - set(ERRORS):
         raise UserError(f"error has no key {min(wrong)!r}; allowed: {', '.join(ERRORS)}")
     if cfg["against"] not in ("reference", "training"):
         raise UserError(f"against is {cfg['against']!r}; allowed: reference, training")

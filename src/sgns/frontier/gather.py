@@ -74,9 +74,8 @@ def judged(
         return point
     if not all(run.finite for run in runs.values()):
         return replace(point, note=point.note or TOO_FAR)
-    free = scene.case_scene(next(iter(runs))).axle is not None
     compared = [compare(run, reference[case]) for case, run in runs.items()]
-    return replace(point, **errors(compared, free_body=free))
+    return replace(point, **errors(compared, free_body=scene.free_body))
 
 
 def usable(point: Point) -> bool:

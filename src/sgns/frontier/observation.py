@@ -23,10 +23,9 @@ import numpy as np
 from mpm_warp import Scene
 from sgns.errors import UserError
 from sgns.evaluation.surface import SurfaceGrid, height_map
-from sgns.runs import Run
 from sgns.wholefile import whole_file
 
-__all__ = ["Observation", "Observer", "observe_run", "observed_frames", "read_observation"]
+__all__ = ["Observation", "Observer", "observe_arrays", "observed_frames", "read_observation"]
 
 LATTICE = 0.02  # of displacements, coarse enough for the coarsest beds of a study [m]
 COLUMN = 0.03  # edge of a column of the surface [m]
@@ -150,25 +149,6 @@ class _NearPoints:
         ]
         with np.errstate(invalid="ignore"):
             return np.stack(sums, axis=1) / self._total[:, None]
-
-
-def observe_run(run: Run, scene: Scene | None = None) -> Observation:
-    """The observation of a run file, a simulation's or a rollout's.
-
-    Args:
-        run: the file, open.
-        scene: if it is not the one the file names.
-    """
-    frames = observed_frames(run.frame_count, run.frame_rate)
-    return observe_arrays(
-        scene or Scene.from_dict(run.scene),
-        run.time,
-        run.force,
-        run.torque,
-        run.pose,
-        frames,
-        (run.positions(int(frame))[0] for frame in frames),
-    )
 
 
 def observe_arrays(

@@ -71,4 +71,4 @@ class Store:
 
 def name_of(scene: str, kind: str, label: str) -> str:
     """A file name for a point."""
-    return "_".join(re.sub(r"[^0-9A-Za-z.+-]+", "-", part) for part in (scene, kind, label))
+    return "_".join(re.sub(r"([^\w.+-]|_)+", "-", part) for part in (scene, kind, label))

@@ -83,6 +83,11 @@ class StudyScene:
         return composed_scene(self.cases[case])[0]
 
     @cached_property
+    def free_body(self) -> bool:
+        """Whether the soil carries the body."""
+        return self.case_scene(next(iter(self.cases))).axle is not None
+
+    @cached_property
     def reference(self) -> PointSettings:
         """The most accurate run."""
         return PointSettings.from_dict(
@@ -146,8 +151,10 @@ class Study:
             known = None
         if not isinstance(known, dict):
             raise UserError(f"{file} does not say what was measured; give another output")
+        # Of what was never measured nothing can be taken for something else.
+        measured = any((self.folder / "points").glob("*.json"))
         for key in known.keys() & asked.keys():
-            if known[key] != asked[key]:
+            if measured and known[key] != asked[key]:
                 raise UserError(
                     f"{self.folder} holds {key} measured with {known[key]}, and {asked[key]} is asked for now; give "
                     "another output, or another label"
@@ -161,6 +168,6 @@ class Study:
             for key in ("scene", "dataset", "cases", "training", "reference"):
                 found[f"{scene.name}, {key}"] = scene.settings.get(key)
             for axis in AXES:
-                for entry in scene.settings.get(axis) or ():
-                    found[f"{scene.name}, {axis}: {entry['label']}"] = entry
+                for entry, point in zip(scene.settings.get(axis) or (), scene.points(axis), strict=True):
+                    found[f"{scene.name}, {axis}: {point.label}"] = entry
         return found

@@ -35,7 +35,7 @@ from sgns.claim import claimed
 from sgns.errors import UserError
 from sgns.evaluation.costs import network_costs
 from sgns.evaluation.scores import Scores
-from sgns.frontier.observation import Observation, Observer, observed_frames
+from sgns.frontier.observation import Observation, observe_arrays, observed_frames
 from sgns.frontier.own_errors import own_errors
 from sgns.frontier.point import Point
 from sgns.frontier.study import PointSettings, Study, StudyScene
@@ -43,6 +43,7 @@ from sgns.frontier.timed_training import TimedTraining, train_for
 from sgns.frontier.timing import Workload, composed_scene, cost_fields, made_here, one_core
 from sgns.frontier.training_sets import every_nth_frame, with_training_runs
 from sgns.reduction.reduced import reduce_dataset
+from sgns.rollout import finite_frames
 from sgns.simulator import Rollout, Simulator
 
 __all__ = ["TrainingPlan", "measure_surrogates"]
@@ -145,8 +146,8 @@ def measured(
     point = replace(point, training_runs=float(len(dataset.runs("train"))), **own, **costs)
     observations = {}
     for case, (case_scene, rollout) in rollouts.items():
-        if bad := first_not_finite(rollout):
-            return replace(point, note=f"{case}: not finite from frame {bad} on"), {}
+        if (whole := finite_frames(rollout)) < len(rollout.latent):
+            return replace(point, note=f"{case}: not finite from frame {whole} on"), {}
         observations[case] = observed(simulator, case_scene, rollout)
     return point, observations
 
@@ -250,24 +251,12 @@ def case_scene(scene: StudyScene, case: str, frame_rate: float) -> Scene:
     return composed_scene([*scene.cases[case], f"scene.frame_rate={frame_rate}"])[0]
 
 
-def first_not_finite(rollout: Rollout) -> int:
-    """First frame with a number that is not one; 0 if there is none (frame 0 is given)."""
-    latent = rollout.latent.reshape(len(rollout.latent), -1)
-    finite = np.isfinite(np.hstack([latent, rollout.force, rollout.torque])).all(axis=1)
-    return 0 if finite.all() else int(np.argmin(finite))
-
-
 def observed(simulator: Simulator, scene: Scene, rollout: Rollout) -> Observation:
     """What is kept of a rollout."""
-    observer = Observer(scene, simulator.start_positions)
     times = np.arange(len(rollout.latent)) / simulator.frame_rate
-    for values in zip(times, rollout.force, rollout.torque, rollout.poses, strict=True):
-        observer.add(*values)
-    for frame in observed_frames(len(times), simulator.frame_rate):
-        observer.add_soil(
-            float(times[frame]), simulator.basis.inverse(torch.as_tensor(rollout.latent[frame])).numpy()
-        )
-    return observer.finish()
+    frames = observed_frames(len(times), simulator.frame_rate)
+    soil = (simulator.basis.inverse(torch.as_tensor(rollout.latent[frame])).numpy() for frame in frames)
+    return observe_arrays(scene, times, rollout.force, rollout.torque, rollout.poses, frames, soil)
 
 
 def own_fields(scores: Scores, runs: int) -> dict[str, float]:

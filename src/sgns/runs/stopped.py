@@ -10,6 +10,7 @@ import numpy as np
 
 from mpm_warp import State
 from sgns.errors import UserError
+from sgns.hdf5 import BROKEN, own_dataset, own_object
 from sgns.runs.runlayout import one_line, open_run
 
 __all__ = ["read_state", "stopped_path", "write_state"]
@@ -38,7 +39,7 @@ def read_state(path: str | os.PathLike[str]) -> State:
     """
     with open_run(path) as file:
         try:
-            group = file.get(_GROUP)
+            group = own_object(file, _GROUP)
             if not isinstance(group, h5py.Group):
                 raise UserError(
                     f"{path} holds no state to go on from; give a *.stopped.h5, which `sgns simulate` leaves when the "
@@ -47,12 +48,12 @@ def read_state(path: str | os.PathLike[str]) -> State:
             return State(
                 int(group.attrs["frame"]), {name: _numbers(group, name, path) for name in sorted(group)}
             )
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        except BROKEN as error:
             raise UserError(f"{path}: its state is damaged ({one_line(error)}); repeat the run") from error
 
 
 def _numbers(group: h5py.Group, name: str, path: str | os.PathLike[str]) -> np.ndarray:
-    found = group[name]
-    if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "if":
+    found = own_dataset(group, name)
+    if found.dtype.kind not in "if":
         raise UserError(f"{path}: /{_GROUP}/{name} does not hold numbers; repeat the run")
     return found[...]

@@ -105,6 +105,7 @@ def test_the_answer_says_what_it_rests_on() -> None:
         (["against=me", "time=1"], "against is 'me'; allowed: reference, training"),
         (["particles=3", "time=1"], "particles is 3"),
         (["error.sinkage=0.001"], "has all the numbers asked for"),
+        (["error=0.3"], "error is 0.3; give one of its keys"),
         (["+error.torque=1"], "error has no key 'torque'"),
     ],
 )

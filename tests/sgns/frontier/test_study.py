@@ -172,7 +172,10 @@ def test_a_label_stands_for_one_setting(tmp_path: Path) -> None:
         changed["scenes"]["cut"]["solver"][1]["label"] = "precise"
         return Study.from_settings(changed, tmp_path)
 
-    study("float64").record()
+    study("float32").record()
+    study("float64").record()  # nothing has been measured yet
+    (tmp_path / "points").mkdir()
+    (tmp_path / "points" / "cut_solver_base.json").touch()
     study("float64").record()
     with pytest.raises(
         UserError, match=r"cut, solver: precise measured with .*float64.*float32.*asked for now"

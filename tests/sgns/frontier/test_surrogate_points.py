@@ -14,14 +14,12 @@ from sgns.frontier import surrogate_points, timed_training
 from sgns.frontier.study import Study
 from sgns.frontier.surrogate_points import (
     TrainingPlan,
-    first_not_finite,
     full_space_fields,
     measure_surrogates,
     training_settings,
 )
 from sgns.frontier.timing import composed_scene
 from sgns.runs import RunWriter
-from sgns.simulator import Rollout
 
 BED = [
     "scene.bed.spacing=0.05",
@@ -66,20 +64,6 @@ def test_bad_entries_are_one_line(entry, line):
 def test_overrides_make_settings():
     assert training_settings("quick", ("preset=fast",))["model"]["hidden_width"] == 64
     assert training_settings("quick_wheel", ("model=polynomial",))["training"]["draws"] == 2
-
-
-def test_the_first_frame_that_is_no_number():
-    def rollout(bad):
-        latent, force = np.zeros((5, 2, 3)), np.zeros((5, 3))
-        if bad:
-            force[bad:] = np.nan
-        return Rollout(latent, force, force, np.zeros((5, 7)), np.zeros((5, 1, 3)), 1.0, lambda: None)
-
-    assert first_not_finite(rollout(0)) == 0
-    assert first_not_finite(rollout(3)) == 3
-
-
-# --- full space, measured elsewhere -----------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -215,7 +199,7 @@ def test_points_from_training_to_observation(tmp_path):
 
 @pytest.mark.usefixtures("tiny")
 def test_a_rollout_that_leaves_the_numbers_is_said_and_not_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(surrogate_points, "first_not_finite", lambda _: 7)
+    monkeypatch.setattr(surrogate_points, "finite_frames", lambda _: 7)
     asked = study(tmp_path, {"axis": "preset", "label": "whole"}, training={"seconds": 0.1})
     measure_surrogates(asked)
     [(point, cases)] = asked.store.points()

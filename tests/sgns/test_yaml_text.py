@@ -1,0 +1,15 @@
+import pytest
+
+from sgns import yaml_text
+from sgns.yaml_text import parse_yaml
+
+
+def test_long_plain_text_is_read_whatever_its_length(monkeypatch) -> None:
+    monkeypatch.setattr(yaml_text, "_MOST", 10)
+    assert parse_yaml("[" + "1," * 50 + "1]") == [1] * 51
+
+
+def test_what_aliases_stand_for_is_bounded(monkeypatch) -> None:
+    monkeypatch.setattr(yaml_text, "_MOST", 10)
+    with pytest.raises(ValueError, match="it stands for more than"):
+        parse_yaml("a: &a [1,1,1,1,1,1]\nb: &b [*a,*a,*a,*a]\nc: [*b,*b,*b,*b]")
