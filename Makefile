@@ -30,7 +30,7 @@ demo: setup ## from scenes to a report with pictures: simulate, train, roll out,
 	$(BIN)/python -m sgns.demo
 
 # The solver's points on one core, reductions and surrogates on another; the last command gathers.
-frontier: setup ## what accuracy costs in time: the quick study, about a quarter of an hour on two cores
+frontier: setup ## what accuracy costs in time: the quick study, 9 minutes on two cores
 	$(BIN)/sgns simulate dataset=quick
 	$(BIN)/sgns frontier study=quick axis=solver & solver=$$!; \
 	$(BIN)/sgns frontier study=quick axis=reduction && $(BIN)/sgns frontier study=quick axis=surrogate; \
