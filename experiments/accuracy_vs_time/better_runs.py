@@ -1,6 +1,6 @@
 """Errors of a surrogate trained on other runs than the study's, on the study's cuts, against its reference.
 
-    python experiments/accuracy_vs_time/better_runs.py <best.ckpt> --study outputs/full --set scene.bed.particles_per_cell=8
+    python experiments/accuracy_vs_time/better_runs.py <best.ckpt> --study outputs/full --set <overrides>
 
 The overrides are those with which its training runs were made; the study's folder holds the reference that `sgns
 frontier study=full axis=solver` makes.
