@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from mpm_warp import Scene
-    from sgns.simulator import Rollout, Simulator
+    from sgns.simulator import Simulator
+    from sgns.states import Rollout
 
 __all__ = [
     "RolloutTiming",

@@ -20,7 +20,7 @@ from sgns.runs import Run
 
 @dataclass
 class FakeRollout:
-    """The fields of `sgns.simulator.Rollout`."""
+    """The fields of `sgns.states.Rollout`."""
 
     latent: np.ndarray
     force: np.ndarray

@@ -20,7 +20,8 @@ from sgns.learning.training_range import NOTEWORTHY
 from sgns.reduction.reduced import ReducedDataset, ReducedRun
 from sgns.rollout import write_rollout
 from sgns.runs import Run, check_run
-from sgns.simulator import Rollout, Simulator
+from sgns.simulator import Simulator
+from sgns.states import Rollout
 
 __all__ = ["CASES"]
 

@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from sgns.campaign import Dataset
-    from sgns.simulator import Rollout, Simulator
+    from sgns.simulator import Simulator
+    from sgns.states import Rollout
 
 __all__ = ["evaluate", "main"]
 

@@ -15,7 +15,8 @@ from sgns.evaluation.surface import surface_grid
 from sgns.frontier.training_sets import EveryNthFrame
 from sgns.rollout import single_thread
 from sgns.runs import Run
-from sgns.simulator import Rollout, Simulator
+from sgns.simulator import Simulator
+from sgns.states import Rollout
 
 __all__ = ["Decoded", "own_errors"]
 

@@ -44,7 +44,8 @@ from sgns.frontier.timing import Workload, composed_scene, cost_fields, made_her
 from sgns.frontier.training_sets import every_nth_frame, with_training_runs
 from sgns.reduction.reduced import reduce_dataset
 from sgns.rollout import finite_frames
-from sgns.simulator import Rollout, Simulator
+from sgns.simulator import Simulator
+from sgns.states import Rollout
 
 __all__ = ["TrainingPlan", "measure_surrogates"]
 
@@ -146,8 +147,9 @@ def measured(
     point = replace(point, training_runs=float(len(dataset.runs("train"))), **own, **costs)
     observations = {}
     for case, (case_scene, rollout) in rollouts.items():
-        if (whole := finite_frames(rollout)) < len(rollout.latent):
-            return replace(point, note=f"{case}: not finite from frame {whole} on"), {}
+        if (good := finite_frames(rollout)) < len(rollout.latent):
+            notes = (point.note, f"{case}: not finite from frame {good} on")
+            return replace(point, note="; ".join(filter(None, notes))), {}
         observations[case] = observed(simulator, case_scene, rollout)
     return point, observations
 
