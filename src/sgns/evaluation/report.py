@@ -144,6 +144,34 @@ def headline(evaluation: Evaluation) -> str:
     )
 
 
+def html_page(title: str, style: str, introduction: str, parts: Sequence[tuple[str, str, str]]) -> str:
+    """A whole page.
+
+    Args:
+        title: of the page.
+        style: its style sheet.
+        introduction: HTML between title and contents.
+        parts: anchor, heading and HTML of each section.
+    """
+    contents = "".join(f'<a href="#{anchor}">{escape(heading)}</a> ' for anchor, heading, _ in parts)
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{escape(title)}</title>
+<style>{style}</style>
+</head>
+<body>
+<h1>{escape(title)}</h1>
+{introduction}
+<nav>{contents}</nav>
+{chr(10).join(section(*part) for part in parts)}
+</body>
+</html>
+"""
+
+
 def render_report(evaluation: Evaluation, groups: Sequence[FigureGroup]) -> str:
     """The whole page as HTML.
 
@@ -153,26 +181,13 @@ def render_report(evaluation: Evaluation, groups: Sequence[FigureGroup]) -> str:
     """
     title = f"Predicted against simulated soil: {evaluation.dataset}, {evaluation.split} runs"
     warning = overlap_warning(evaluation)
+    introduction = (
+        f"<p>{escape(summary(evaluation))}</p>\n",
+        f'<p class="warning">{escape(warning)}</p>\n' if warning else "",
+        headline(evaluation),
+    )
     parts = [(f"s{count}", *part) for count, part in enumerate(sections(evaluation, groups), start=1)]
-    contents = "".join(f'<a href="#{anchor}">{escape(heading)}</a> ' for anchor, heading, _ in parts)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
-<style>{CSS}</style>
-</head>
-<body>
-<h1>{escape(title)}</h1>
-<p>{escape(summary(evaluation))}</p>
-{f'<p class="warning">{escape(warning)}</p>' if warning else ""}
-{headline(evaluation)}
-<nav>{contents}</nav>
-{chr(10).join(section(*part) for part in parts)}
-</body>
-</html>
-"""
+    return html_page(title, CSS, "".join(introduction), parts)
 
 
 def write_report(evaluation: Evaluation, output: Path) -> Path:

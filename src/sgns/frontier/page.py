@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 
-from sgns.evaluation.report import CSS, note, picture, section
+from sgns.evaluation.report import CSS, html_page, note, picture
 from sgns.evaluation.report_figures import ReportFigure
 from sgns.frontier.figures import (
     COLUMNS,
@@ -197,28 +197,12 @@ def made(study: Study, points: Sequence[Point]) -> str:
 def rendered(study: Study, parts: Sequence[tuple[str, str, str]]) -> str:
     """The whole page."""
     title = f"What accuracy costs in time: study {study.name}"
-    contents = "".join(f'<a href="#{anchor}">{escape(heading)}</a> ' for anchor, heading, _ in parts)
     words = (
         "Settings of the solver and surrogates on one scale: the wall time of a simulated second on one core against "
         "the error beside the most accurate run that was affordable. Read off which point is fast enough and good "
         "enough; sgns advise answers the same question on the command line."
     )
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
-<style>{CSS}{WIDE}</style>
-</head>
-<body>
-<h1>{escape(title)}</h1>
-<p>{escape(words)}</p>
-<nav>{contents}</nav>
-{chr(10).join(section(*part) for part in parts)}
-</body>
-</html>
-"""
+    return html_page(title, CSS + WIDE, f"<p>{escape(words)}</p>", parts)
 
 
 def digits(value: float) -> str:
