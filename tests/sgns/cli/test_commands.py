@@ -316,7 +316,9 @@ def test_log_lines(empty_folder: Path) -> None:
 def test_an_interruption_says_how_to_go_on(written: bool, empty_folder: Path) -> None:
     write = "open(cfg.output + '/last.ckpt', 'w').close(); " if written else ""
     body = write + "import time; print('ready', flush=True); time.sleep(60)"
-    command = [sys.executable, "-c", FAKE, body, "train", "output=here"]
+    # A shell's background job, such as a CI's, ignores the signal, and so would what it starts.
+    heeding = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n" + FAKE
+    command = [sys.executable, "-c", heeding, body, "train", "output=here"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None and process.stdout.readline() == "ready\n"
     process.send_signal(signal.SIGINT)
