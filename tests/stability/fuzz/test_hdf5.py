@@ -21,19 +21,7 @@ from sgns.runs import Run, check_run
 def spoiled(draw: Any, names: list[str], attributes: list[str]) -> list[tuple[Any, ...]]:
     """What is done to an HDF5 file."""
     actions = []
-    kinds = [
-        "missing",
-        "shape",
-        "huge",
-        "type",
-        "values",
-        "group",
-        "link",
-        "attribute",
-        "text",
-        "more",
-        "more",
-    ]
+    kinds = ["more", "missing", "shape", "huge", "type", "values", "group", "link", "attribute", "text"]
     for _ in range(draw(st.integers(1, 3))):
         kind = draw(st.sampled_from(kinds))
         shape = draw(st.lists(st.sampled_from([0, 1, 2, 3, 4, 6, 7]), max_size=4))
