@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 from kills import broken, same
 from small import REDUCED, SMALL, TRAIN, call, small_dataset
-from test_disk import CAMPAIGN, files
+from test_disk import CAMPAIGN, TRAINING_STEPS, files
 
-NETWORK = [*TRAIN, "training.max_steps=20", "training.validate_every=10"]
+NETWORK = [*TRAIN, *TRAINING_STEPS]
 POLYNOMIAL = [*REDUCED, "model=polynomial", "training.noises=[0.1]", "training.penalties=[0.01]"]
 MOUNTED = 16 << 20
 """Size of the file system [bytes]."""
