@@ -40,9 +40,20 @@ def changed(draw: Any, tree: Any) -> Any:
     return draw(VALUES)
 
 
-@st.composite
-def damaged(draw: Any, content: bytes) -> bytes:
+class File(bytes):
+    """Bytes that are not shown in full when a case fails."""
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} bytes>"
+
+
+def damaged(content: bytes) -> st.SearchStrategy[bytes]:
     """A file that was cut short, or in which bytes were changed, doubled or inserted."""
+    return _damaged(File(content))
+
+
+@st.composite
+def _damaged(draw: Any, content: bytes) -> bytes:
     for _ in range(draw(st.integers(1, 4))):
         at = draw(st.integers(0, max(0, len(content) - 1)))
         action = draw(st.integers(0, 4))

@@ -7,6 +7,7 @@ import string
 from typing import Any
 
 import hypothesis.strategies as st
+import pytest
 from fuzz_values import NUMBERS, VALUES, YAML, changed
 from fuzzing import OUTCOMES, cases
 from hydra import compose, initialize_config_module
@@ -125,3 +126,20 @@ def test_yaml_of_settings(empty_folder, good, nothing_long) -> None:
         OUTCOMES["accepted" if status == 0 or said.endswith(": begun\n") else "refused"] += 1
 
     check()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["simulate", "dataset={}"], "dataset.name is missing"),
+        (["simulate", "scene.kind=[]"], "scene.kind is []; allowed"),
+        (
+            ["simulate", "scene=body", "scene.path=path.csv", "scene.tool.shape={}"],
+            "tool.shape is {}; allowed",
+        ),
+    ],
+)
+def test_what_once_ended_in_a_traceback(arguments, words, empty_folder) -> None:
+    (empty_folder / "path.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0.1,0.1,0.1,0,0,0,1\n")
+    status, said = call(*arguments)
+    assert status == 2 and said.count("\n") == 1 and words in said, said
