@@ -56,12 +56,16 @@ DEFAULTS = {
 }
 
 
+CHANGEABLE = {
+    name: [key for key, value in values.items() if value not in (None, [], "???")]
+    for name, values in DEFAULTS.items()
+}
+
+
 @st.composite
 def plausible(draw: Any, command: str) -> str:
     """A setting as somebody would change it: a number that is somewhat larger or smaller, or what it was."""
-    key = draw(
-        st.sampled_from([key for key, value in DEFAULTS[command].items() if value not in (None, "???")])
-    )
+    key = draw(st.sampled_from(CHANGEABLE[command]))
     value = DEFAULTS[command][key]
     if type(value) in (int, float):
         value = type(value)(value * draw(st.sampled_from([0.5, 1, 1, 1.1, 2])))
@@ -80,7 +84,7 @@ def overrides(draw: Any) -> list[str]:
     """A command with some of its settings changed at random."""
     names = ["simulate", "simulate", "train", "train", "rollout", "reduce", "evaluate", "check"]
     command = draw(st.sampled_from(names))
-    good = draw(st.lists(plausible(command), max_size=3))
+    good = draw(st.lists(plausible(command), max_size=3)) if CHANGEABLE[command] else []
     return [command, *good, *draw(st.lists(anything(command), min_size=not good, max_size=1))]
 
 
