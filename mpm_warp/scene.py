@@ -308,7 +308,7 @@ class Scene:
     def from_dict(data: dict[str, Any]) -> Scene:
         """The scene described by plain nested data, checked."""
         kind = data.get("kind", "bed")
-        if kind not in Scene.kinds:
+        if not isinstance(kind, str) or kind not in Scene.kinds:
             raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(Scene.kinds)}")
         return _build(Scene.kinds[kind], data, "scene")
 
@@ -379,7 +379,7 @@ def _build(cls: type, data: dict[str, Any], where: str) -> Any:
 def _chosen(shapes: dict[str, type], value: Any, where: str) -> type:
     """The class of a body given as nested data with the key `shape`."""
     shape = value.get("shape") if isinstance(value, dict) else None
-    if shape not in shapes:
+    if not isinstance(shape, str) or shape not in shapes:
         raise SceneError(f"{where}.shape is {shape!r}; allowed: {', '.join(shapes)}")
     return shapes[shape]
 

@@ -1,12 +1,18 @@
 """Kill commands at random moments, repeat them, and compare what comes out with what an undisturbed command makes.
 
-    python experiments/stability/kills.py [--kills 20] [--seed 0] [--table kills.csv] [simulate reduce train rollout]
+    python experiments/stability/kills.py [--kills 20] [--seed 0] [--table kills.csv] [simulate reduce train ...]
 
-Each command runs in a process of its own, which is killed (SIGKILL) after a random share of the time that the
-undisturbed command takes. What is then on disk under its final name is read through; then the same command runs again.
-When it completes, its result is compared bit for bit and it begins anew in an empty folder, until it has been killed
-often enough.
-A campaign's worker processes are killed, too. A command with a row in the table is not repeated.
+Each command runs in a process of its own, which is killed (SIGKILL), once to three times in a row; then it runs to its
+end, the result is compared bit for bit with that of the undisturbed command, and it begins anew in an empty folder,
+until it has been killed often enough. After each kill, what is on disk under its final name is read through.
+
+Half of the kills come after a random share of the undisturbed command's time, all shares alike. The clock is the
+processor time of the command and its worker processes, so that a busy machine does not move them all into the start;
+of a campaign, half of them hit a worker process.
+The other half come at a random one of the calls that make a file whole, `os.fsync` and `os.replace`, just before or
+just after it: a network's checkpoint is written in milliseconds, which no random time would meet. (A campaign's files
+are written by its workers, for minutes: there all kills come by the clock.)
+A command with a row in the table is not repeated.
 """
 
 from __future__ import annotations
@@ -16,6 +22,7 @@ import csv
 import importlib.util
 import json
 import logging
+import mmap
 import os
 import shutil
 import signal
@@ -80,6 +87,15 @@ TRAIN = [
     "training.threads=1",
     "output={folder}",
 ]
+TRAIN_POLYNOMIAL = [
+    "train",
+    "dataset.path={data}",
+    "model=polynomial",
+    "reduction.max_modes=24",
+    "reduction.num_modes=8",
+    "training.threads=1",
+    "output={folder}",
+]
 ROLLOUT = [
     "rollout",
     *BED,
@@ -89,7 +105,16 @@ ROLLOUT = [
     "checkpoint={checkpoint}",
     "output={folder}/rollout.h5",
 ]
-COMMANDS = {"simulate": SIMULATE, "reduce": REDUCE, "train": TRAIN, "rollout": ROLLOUT}
+COMMANDS = {
+    "simulate": SIMULATE,
+    "reduce": REDUCE,
+    "train": TRAIN,
+    "train polynomial": TRAIN_POLYNOMIAL,
+    "rollout": ROLLOUT,
+    "rollout polynomial": ROLLOUT,
+}
+TRAINED = {"rollout": "train", "rollout polynomial": "train polynomial"}
+"""Which training makes the checkpoint that a rollout needs."""
 
 
 @dataclass
@@ -98,13 +123,21 @@ class Row:
 
     command: str
     kills: int = 0
-    """SIGKILLs that hit a running process."""
-    kills_of_workers: int = 0
-    """Those of them that hit a campaign's worker process instead of the command itself."""
-    kills_with_results: int = 0
-    """Those after which some files of the result were complete."""
-    kills_while_writing: int = 0
-    """Those that left a hidden half of a file."""
+    """SIGKILLs that hit a running process; the next four add up to them."""
+    before_work: int = 0
+    """Kills before the command had read its settings."""
+    at_work: int = 0
+    """Kills between that and the command's end without a half-written file."""
+    while_writing: int = 0
+    """Kills that left a hidden half of a file."""
+    after_work: int = 0
+    """Kills between the command's last word and the end of the process."""
+    at_a_write: int = 0
+    """Kills of all these that came at a call of `os.fsync` or `os.replace` and not by the clock."""
+    of_workers: int = 0
+    """Kills of all these that hit a campaign's worker process instead of the command itself."""
+    with_results: int = 0
+    """Kills of all these after which some files of the result were complete."""
     corrupt: int = 0
     """Files under their final name that were not whole."""
     completed: int = 0
@@ -116,7 +149,7 @@ class Row:
     leftovers: int = 0
     """Hidden files beside a complete result."""
     undisturbed_s: float = 0.0
-    """Time of the undisturbed command, the imports of its first process left out [s]."""
+    """Processor time of the undisturbed command, the imports of its first process left out [s]."""
 
 
 def main() -> int:
@@ -129,7 +162,7 @@ def main() -> int:
     asked = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     torch.set_num_threads(1)
-    for command in COMMANDS:  # here, so that no time of the commands goes into imports
+    for command, *_ in COMMANDS.values():  # here, so that no time of the commands goes into imports
         importlib.import_module(cli.COMMANDS[command].module)
     done = {row.command: row for row in read_rows(asked.table)}
     with tempfile.TemporaryDirectory(prefix="sgns_kills_") as name:
@@ -156,88 +189,125 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.seconds: dict[str, float] = {}
+        """Processor time of each undisturbed command [s]."""
+        self.writes: dict[str, int] = {}
+        """Moments at its calls of `os.fsync` and `os.replace`: before and after each."""
 
     def killed_often(self, command: str, kills: int, chance: np.random.Generator) -> Row:
         """Kill the command again and again."""
-        reference, seconds = self.undisturbed(command), self.seconds[command]
-        row, folder = Row(command, undisturbed_s=round(seconds, 2)), self.folder / f"{command}_killed"
-        while row.kills < kills or row.completed == 0:
-            given = self.given(command, folder)
-            begun = self.begin(command, folder)
-            # A command with nothing left to do would be over before the signal.
-            delay = chance.uniform(0.0, seconds) if row.kills < kills else np.inf
-            of_worker = command == "simulate" and bool(chance.integers(2))
-            hit = kill_after(begun, delay, of_worker)
-            row.kills += hit is not None
-            row.kills_of_workers += hit == "worker"
-            row.orphans += outlived(begun.family)
-            wrong = broken(folder)
-            row.corrupt += len(wrong)
-            for line in wrong:
-                log.info("%s: %s", command, line)
-            if hit is not None:
-                files = [path for path in folder.rglob("*") if path.is_file() and path not in given]
-                row.kills_while_writing += any(path.suffix == ".partial" for path in files)
-                row.kills_with_results += any(
-                    path.suffix in READERS and path.name[0] != "." for path in files
-                )
-                continue
-            if begun.status != 0:
-                raise RuntimeError(f"{command} ended with {begun.status}: {begun.log.read_text()}")
+        reference = self.undisturbed(command)
+        row, folder = Row(command, undisturbed_s=round(self.seconds[command], 2)), self.folder / "killed"
+        while row.kills < kills:
+            for _ in range(chance.integers(1, 4)):
+                if not self.killed(row, folder, chance):
+                    break
+            else:
+                begun = self.begin(command, folder)
+                begun.wait()
+                row.orphans += outlived(begun.family)
             row.completed += 1
             row.equal += same(reference, folder)
             row.leftovers += sum(path.name.startswith(".") for path in folder.rglob("*") if path.is_file())
             shutil.rmtree(folder)
-        shutil.rmtree(folder, ignore_errors=True)
         return row
+
+    def killed(self, row: Row, folder: Path, chance: np.random.Generator) -> bool:
+        """Begin the command and kill it; says whether it was hit, or complete before."""
+        given = self.given(row.command, folder)
+        moments = self.writes[row.command] if row.command != "simulate" else 0
+        if moments and chance.integers(2):
+            begun = self.begin(row.command, folder, fatal=int(chance.integers(moments)))
+            hit = begun.killed_itself()
+            row.at_a_write += hit
+        else:
+            begun = self.begin(row.command, folder)
+            of_worker = row.command == "simulate" and bool(chance.integers(2))
+            target = begun.kill_after(chance.uniform(0.0, self.seconds[row.command]), of_worker)
+            hit = target is not None
+            row.of_workers += target == "worker"
+        row.orphans += outlived(begun.family)
+        wrong = broken(folder)
+        row.corrupt += len(wrong)
+        for line in wrong:
+            log.info("%s: %s", row.command, line)
+        if hit:
+            files = [path for path in folder.rglob("*") if path.is_file() and path not in given]
+            writing = any(path.suffix == ".partial" for path in files)
+            row.kills += 1
+            row.while_writing += writing
+            row.before_work += not writing and begun.stage == BEFORE
+            row.at_work += not writing and begun.stage == WORK
+            row.after_work += not writing and begun.stage == AFTER
+            row.with_results += any(path.suffix in READERS and path.name[0] != "." for path in files)
+        return hit
 
     def undisturbed(self, command: str) -> Path:
         """Folder of the result of the undisturbed command."""
-        folder = self.folder / command
+        folder = self.folder / command.replace(" ", "_")
         if command not in self.seconds:
             self.given(command, folder)
-            began = time.perf_counter()
-            process = self.begin(command, folder)
-            kill_after(process, np.inf, False)
-            self.seconds[command] = time.perf_counter() - began
-            if process.status != 0:
-                raise RuntimeError(f"{command}: {process.log.read_text()}")
+            begun = self.begin(command, folder)
+            begun.wait()
+            self.seconds[command], self.writes[command] = begun.spent, begun.writes
         return folder
 
     def given(self, command: str, folder: Path) -> set[Path]:
         """Files that a command finds in its folder: the dataset, beside which the reduced runs go."""
         folder.mkdir(parents=True, exist_ok=True)
-        if command not in ("reduce", "train"):
+        if "dataset.path={data}" not in COMMANDS[command] or command == "simulate":
             return set()
         source, data = self.undisturbed("simulate") / "data", folder / "data"
         if not data.exists():
             shutil.copytree(source, data)
         return {data / path.relative_to(source) for path in source.rglob("*")}
 
-    def begin(self, command: str, folder: Path) -> Begun:
+    def begin(self, command: str, folder: Path, fatal: int | None = None) -> Begun:
         """Begin a command with its result in `folder`; a checkpoint is that of the undisturbed training."""
         places = {"folder": folder, "data": folder / "data", "checkpoint": ""}
-        if command == "rollout":
-            places["checkpoint"] = self.undisturbed("train") / "best.ckpt"
+        if command in TRAINED:
+            places["checkpoint"] = self.undisturbed(TRAINED[command]) / "best.ckpt"
         arguments = COMMANDS[command]
         for name, place in places.items():
             arguments = [argument.replace(f"{{{name}}}", str(place)) for argument in arguments]
-        return Begun(arguments, self.folder / "log.txt")
+        return Begun(arguments, self.folder / "log.txt", fatal)
+
+
+BEFORE, WORK, AFTER = range(3)
+"""Stages of a command: settings are read; the command itself; its process ends."""
 
 
 class Begun:
-    """A command in a process of its own, made by a fork so that no time goes into imports."""
+    """A command in a process of its own, made by a fork so that no time goes into imports.
 
-    def __init__(self, arguments: list[str], log: Path) -> None:
+    Args:
+        arguments: Of `sgns`.
+        log: Where its words go.
+        fatal: Which moment at a write ends it; None: none.
+    """
+
+    def __init__(self, arguments: list[str], log: Path, fatal: int | None = None) -> None:
         self.log = log
         self.family: set[int] = set()
         """The process and all its descendants that were seen."""
+        self.spent = 0.0
+        """Processor time of them all [s]."""
         self.status: int | None = None
+        self._shared = np.frombuffer(mmap.mmap(-1, 16), np.int64)
         self.pid = os.fork()
         if self.pid == 0:
-            self._be(arguments)
+            self._be(arguments, fatal)
 
-    def _be(self, arguments: list[str]) -> None:
+    @property
+    def stage(self) -> int:
+        """The stage in which the command is, or ended."""
+        return int(self._shared[0])
+
+    @property
+    def writes(self) -> int:
+        """Moments at writes that have passed."""
+        return int(self._shared[1])
+
+    def _be(self, arguments: list[str], fatal: int | None) -> None:
         status = 1
         try:
             with self.log.open("w") as file:
@@ -247,6 +317,10 @@ class Begun:
             # So that worker processes begin as those of `python -m sgns` do, without this file and its imports.
             sys.modules["__main__"] = types.ModuleType("__main__")
             sys.modules["__main__"].__spec__ = importlib.util.find_spec("sgns.__main__")
+            module = importlib.import_module(cli.COMMANDS[arguments[0]].module)
+            module.main = self._staged(module.main)
+            for name in ("fsync", "replace"):
+                setattr(os, name, self._counted(getattr(os, name), fatal))
             status = cli.main()
         except BaseException:
             traceback.print_exc()
@@ -255,32 +329,73 @@ class Begun:
             sys.stderr.flush()
             os._exit(status)
 
+    def _staged(self, main: Callable[..., Any]) -> Callable[..., Any]:
+        def staged(*args: Any) -> Any:
+            self._shared[0] = WORK
+            result = main(*args)
+            self._shared[0] = AFTER
+            return result
+
+        return staged
+
+    def _counted(self, write: Callable[..., Any], fatal: int | None) -> Callable[..., Any]:
+        def moment() -> None:
+            if self.writes == fatal:
+                os.kill(os.getpid(), signal.SIGKILL)
+            self._shared[1] += 1
+
+        def counted(*args: Any, **settings: Any) -> Any:
+            moment()
+            result = write(*args, **settings)
+            moment()
+            return result
+
+        return counted
+
     def running(self) -> bool:
         """Whether the process is still there."""
-        self.family |= {self.pid, *descendants(self.pid)}
+        alive = {self.pid, *descendants(self.pid)}
+        self.family |= alive
+        self.spent = max(self.spent, sum(map(processor_time, alive)))
         if self.status is None:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
             if pid:
                 self.status = os.waitstatus_to_exitcode(status)
         return self.status is None
 
+    def wait(self) -> None:
+        """Until the command is complete."""
+        self._ended(0)
 
-def kill_after(begun: Begun, seconds: float, worker: bool) -> str | None:
-    """Kill a command or one of its worker processes; says which was hit, None if it ended by itself before."""
-    end = time.perf_counter() + seconds
-    while begun.running() and time.perf_counter() < end:
-        time.sleep(0.005)
-    if begun.status is not None:
+    def killed_itself(self) -> bool:
+        """Wait for the fatal moment; says whether it came."""
+        return self._ended(-signal.SIGKILL, 0) != 0
+
+    def kill_after(self, seconds: float, worker: bool) -> str | None:
+        """Kill the command or one of its worker processes; says which was hit, None if it ended by itself before.
+
+        Args:
+            seconds: Of processor time.
+            worker: Whether to kill a worker process if there is one.
+        """
+        while self.running() and self.spent < seconds:
+            time.sleep(0.005)
+        if self.status is None:
+            workers = [pid for pid in descendants(self.pid) if "spawn_main" in command_line(pid)]
+            hit = "worker" if worker and workers else "command"
+            os.kill(workers[0] if hit == "worker" else self.pid, signal.SIGKILL)
+            # A command whose worker was killed ends by itself.
+            if self._ended(-signal.SIGKILL, 2, 0) != 0:
+                return hit
+        self._ended(0)  # there was nothing left to do
         return None
-    workers = [pid for pid in descendants(begun.pid) if "spawn_main" in command_line(pid)]
-    hit = "worker" if worker and workers else "command"
-    os.kill(workers[0] if hit == "worker" else begun.pid, signal.SIGKILL)
-    while begun.running():  # a command whose worker was killed ends by itself
-        time.sleep(0.005)
-    if begun.status == 0:
-        return None  # there was nothing left to do
-    assert begun.status in (-signal.SIGKILL, 2), (begun.status, begun.log.read_text())
-    return hit
+
+    def _ended(self, *allowed: int) -> int:
+        while self.running():
+            time.sleep(0.005)
+        if self.status not in allowed:
+            raise RuntimeError(f"ended with {self.status}: {self.log.read_text()}")
+        return self.status
 
 
 def outlived(family: set[int], most: float = 30.0) -> int:
@@ -308,6 +423,15 @@ def command_line(pid: int) -> str:
         return Path(f"/proc/{pid}/cmdline").read_text()
     except OSError:
         return ""
+
+
+def processor_time(pid: int) -> float:
+    """Of a process and its children that have ended [s]; 0 if it is gone."""
+    try:
+        times = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:15]
+    except OSError:
+        return 0.0
+    return sum(map(int, times)) / os.sysconf("SC_CLK_TCK")
 
 
 def is_running(pid: int) -> bool:
@@ -365,11 +489,11 @@ def read_hdf5(path: Path) -> Any:
 
 
 def read_tensors(path: Path) -> Any:
-    """Everything in a checkpoint that a training goes on from."""
+    """Everything in a checkpoint that a training goes on from; polynomials have the first two."""
     load_surrogate(path)
     content = read_checkpoint(path)
     kept = ("state_dict", "hyper_parameters", "optimizer_states", "lr_schedulers", "global_step", "callbacks")
-    return {key: as_bytes(content[key]) for key in kept}
+    return {key: as_bytes(content[key]) for key in kept if key in content}
 
 
 def read_json(path: Path) -> Any:

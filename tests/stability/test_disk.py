@@ -1,6 +1,7 @@
 """A full disk, a folder that cannot be written, a clock that goes back: one clear line, and what was there stays.
 
-The limit on file sizes stands for the full disk: a write stops in the middle as it does there, with another error.
+The limit on file sizes stands for the full disk: a write stops in the middle as it does there, with another error. A
+disk that is really full is in `test_full_disk.py`: it must be mounted, which not every machine permits.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from kills import broken, same
+from small import SMALL, TRAIN
 from tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
 
 from sgns.evaluation.training_curves import read_log
@@ -31,19 +33,7 @@ sys.argv[0] = "sgns"
 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 sys.exit(sgns.cli.main())
 """
-SMALL = [
-    *("scene.bed.size=[0.4,0.2,0.16]", "scene.bed.spacing=0.04", "scene.duration=0.2", "scene.speed=0.05"),
-    *("scene.blade.length=0.1", "scene.blade.width=0.1", "scene.blade.thickness=0.08"),
-]
-TRAIN = [
-    *(
-        "reduction.max_modes=6",
-        "reduction.num_modes=4",
-        "model.hidden_width=8",
-        "model.message_passing_steps=1",
-    ),
-    *("training.max_steps=20", "training.validate_every=10", "training.warmup_steps=0", "training.threads=1"),
-]
+TRAINING_STEPS = ["training.max_steps=20", "training.validate_every=10"]
 CAMPAIGN = ["dataset=quick", "dataset.draw=[{rake:[0.0,10.0,20.0]}]", "dataset.runs=3", *SMALL]
 
 
@@ -85,7 +75,7 @@ def test_a_campaign(tmp_path) -> None:
 def test_reduce_and_train(tmp_path, limit) -> None:
     make_dataset(tmp_path / "data")
     before = files(tmp_path)
-    arguments = [f"dataset.path={tmp_path / 'data'}", *TRAIN, f"output={tmp_path / 'out'}"]
+    arguments = [f"dataset.path={tmp_path / 'data'}", *TRAIN, *TRAINING_STEPS, f"output={tmp_path / 'out'}"]
     limited(limit, "train", *arguments)
     assert broken(tmp_path) == []
     assert {name: before[name] for name in before} == {
@@ -141,7 +131,10 @@ sys.exit(main())
     [
         (["simulate", *SMALL, "output={}/run.h5"], "cannot write"),
         (["simulate", *CAMPAIGN, "dataset.path={}/new"], "cannot write"),
-        (["train", "dataset.path={}/data", *TRAIN, "output={}/out"], "choose another output"),
+        (
+            ["train", "dataset.path={}/data", *TRAIN, *TRAINING_STEPS, "output={}/out"],
+            "choose another output",
+        ),
     ],
 )
 def test_folders_that_may_not_be_written(arguments, words, tmp_path) -> None:
@@ -163,7 +156,9 @@ def with_path() -> dict[str, str]:
 # --- the clock --------------------------------------------------------------------------------------------
 
 
-def test_a_clock_that_goes_back(tmp_path, monkeypatch) -> None:
+@pytest.mark.parametrize("days", [-1.0, 1000.0])
+def test_a_clock_that_is_set(days, tmp_path, monkeypatch) -> None:
+    """Between two parts of a training; the files it finds are then of tomorrow, or years old."""
     data = make_dataset(tmp_path / "data")
 
     def run(output: Path, **changes) -> None:
@@ -182,22 +177,28 @@ def test_a_clock_that_goes_back(tmp_path, monkeypatch) -> None:
         patch.setattr("sgns.learning.training.StepProgress.on_train_batch_end", stop)
         run(tmp_path / "parts")
     now = time.time
-    monkeypatch.setattr(time, "time", lambda: now() - 86400.0)
-    for file in (tmp_path / "data").rglob("*"):
-        os.utime(file, (now() + 86400.0,) * 2)
+    monkeypatch.setattr(time, "time", lambda: now() + 86400.0 * days)
+    for file in tmp_path.glob("data/**/*"):
+        os.utime(file, (now() - 86400.0 * days,) * 2)
     run(tmp_path / "parts")
     assert same(tmp_path / "whole", tmp_path / "parts")
     for name, points in read_log(tmp_path / "parts" / "tensorboard").items():
         assert (points[1:, 0] > points[:-1, 0]).all(), name
 
 
-def test_leftovers_of_a_killed_process_do_not_stay(tmp_path) -> None:
+@pytest.mark.parametrize("collected", [True, False])
+def test_leftovers_of_a_killed_process_do_not_stay(collected, tmp_path) -> None:
+    """Also not while its number is still taken because nobody has asked for its status."""
+    if not collected and not Path("/proc/self/stat").exists():
+        pytest.skip("this system does not show the states of processes as files")
     code = "import os, sys; from pathlib import Path; from sgns.wholefile import whole_file\n"
     code += "with whole_file(Path(sys.argv[1])) as hidden: hidden.write_text('half'); os.kill(os.getpid(), 9)"
-    subprocess.run([sys.executable, "-c", code, str(tmp_path / "a")], timeout=100)
+    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "a")])
+    os.waitid(os.P_PID, process.pid, os.WEXITED | (0 if collected else os.WNOWAIT))
     assert len(list(tmp_path.iterdir())) == 1
     write_whole(tmp_path / "a", "whole")
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    process.wait()
 
 
 def test_a_disk_that_is_full_for_the_basis_leaves_the_earlier_one(tmp_path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -187,6 +188,108 @@ def test_files_of_settings(empty_folder, canary, text, capsys, monkeypatch) -> N
     (folder / "x.yaml").write_text("# @package _global_\n" + text.replace("CANARY", str(canary)))
     said = refused(capsys, monkeypatch, "simulate", "--config-dir", "conf", "experiment=x")
     assert "cannot name Python objects" in said or "could not determine a constructor" in said
+    assert not canary.exists()
+
+
+# --- sweeps -----------------------------------------------------------------------------------------------
+
+TOUCH = "_target_: pathlib.Path.touch, _args_: [CANARY]"
+LAUNCHER = """
+import pathlib
+from hydra.core.config_store import ConfigStore
+from hydra.plugins.launcher import Launcher
+
+
+class Elsewhere(Launcher):
+    def setup(self, **settings):
+        pass
+
+    def launch(self, job_overrides, initial_job_idx):
+        pathlib.Path("launched").touch()
+        return []
+
+
+target = {"_target_": "hydra_plugins.elsewhere.Elsewhere"}
+ConfigStore.instance().store(group="hydra/launcher", name="elsewhere", node=target, provider="elsewhere")
+"""
+
+
+@pytest.fixture
+def experiments(empty_folder, canary) -> Path:
+    """Folder of a good and three hostile files of settings."""
+    hostile = f"{{{TOUCH.replace('CANARY', str(canary))}}}"
+    folder = empty_folder / "conf" / "experiment"
+    folder.mkdir(parents=True)
+    for name, text in {
+        "good": "seed: 3",
+        "bad": f"scene: {{x: {hostile}}}",
+        "callback": f"hydra: {{callbacks: {{x: {hostile}}}}}",
+        "sweep": f"hydra: {{sweeper: {{params: {{+x: '1,{hostile}'}}}}}}",
+    }.items():
+        (folder / f"{name}.yaml").write_text(f"# @package _global_\n{text}\n")
+    return empty_folder / "conf"
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["seed=1,2", "+x._target_=os.system"],
+        [f"+x={{a: 1}},[{{{TOUCH}}}]"],
+        ["seed=1,2", f"+hydra.callbacks.x={{{TOUCH}}}"],
+        ["seed=1,2", "hydra.launcher._target_=pathlib.Path.touch"],
+        ["experiment=sweep"],
+        ["experiment=good,callback"],
+        ["experiment=good,bad", "hydra.sweeper.max_batch_size=2"],
+    ],
+)
+def test_targets_in_sweeps_before_the_first_job(experiments, canary, overrides, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("sgns.simulate.main", lambda cfg: canary.touch())
+    arguments = [override.replace("CANARY", str(canary)) for override in overrides]
+    said = refused(capsys, monkeypatch, "simulate", "-m", "--config-dir", str(experiments), *arguments)
+    assert "cannot name Python objects" in said
+    assert not canary.exists()
+
+
+def test_targets_in_a_later_batch_of_a_sweep(experiments, canary, capsys, monkeypatch) -> None:
+    seeds = []
+    monkeypatch.setattr("sgns.simulate.main", lambda cfg: seeds.append(cfg.seed))
+    batches = "hydra.sweeper.max_batch_size=1"  # each is put together when its turn comes
+    sweep = ["-m", "--config-dir", str(experiments), "experiment=good,bad", batches]
+    assert "cannot name Python objects" in refused(capsys, monkeypatch, "simulate", *sweep).splitlines()[-1]
+    assert seeds == [3] and not canary.exists()
+
+
+@pytest.mark.parametrize(
+    "override",
+    [f"+hydra.callbacks.x={{a: 1}},{{{TOUCH}}}", "hydra.launcher._target_=os.system,pathlib.Path.touch"],
+)
+def test_hydras_own_settings_cannot_be_swept_over(
+    empty_folder, canary, override, capsys, monkeypatch
+) -> None:
+    said = refused(capsys, monkeypatch, "simulate", "-m", override.replace("CANARY", str(canary)))
+    assert "Sweeping over Hydra's configuration is not supported" in said
+    assert not canary.exists()
+
+
+@pytest.mark.parametrize(("swept", "launched"), [("good,good", True), ("good,bad", False)])
+def test_launchers_that_put_settings_together_in_other_processes(
+    experiments, canary, swept, launched, tmp_path
+) -> None:
+    """The first process has put the settings of all jobs together before it gives them away."""
+    plugin = tmp_path / "path" / "hydra_plugins" / "elsewhere"
+    plugin.mkdir(parents=True)
+    (plugin / "__init__.py").write_text(LAUNCHER)
+    command = [sys.executable, "-m", "sgns", "simulate", "-m", "hydra/launcher=elsewhere"]
+    done = subprocess.run(
+        [*command, "--config-dir", str(experiments), f"experiment={swept}"],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "path")},
+    )
+    assert done.returncode == (0 if launched else 2), done.stderr
+    assert (experiments.parent / "launched").exists() == launched
+    assert launched or "cannot name Python objects" in done.stderr
     assert not canary.exists()
 
 

@@ -22,7 +22,9 @@ def test_killed_commands_go_on_and_end_as_if_nothing_had_happened(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     with table.open(newline="") as file:
         rows = {row["command"]: row for row in csv.DictReader(file)}
-    assert set(rows) == {"simulate", "reduce", "train", "rollout"}
+    assert set(rows) == {
+        *("simulate", "reduce", "train", "train polynomial", "rollout", "rollout polynomial")
+    }
     for row in rows.values():
         assert int(row["kills"]) >= 2 and int(row["completed"]) == int(row["equal"]) >= 1, row
         assert row["corrupt"] == row["orphans"] == row["leftovers"] == "0", row

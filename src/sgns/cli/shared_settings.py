@@ -45,6 +45,10 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
     modes = cfg.get("num_modes")
     if modes is not None and (not isinstance(modes, int) or isinstance(modes, bool) or modes < 1):
         raise UserError(f"num_modes is {_shown(modes)}; it must be a whole number, 1 or more, or null")
+    if isinstance(cfg.get("dataset"), DictConfig) and cfg.dataset.get("name") is None:
+        raise UserError(
+            "dataset.name is missing; choose a dataset, as in dataset=quick, or give this one a name"
+        )
     where = OmegaConf.select(cfg, "dataset.where")
     if where is not None and not isinstance(where, DictConfig):
         raise UserError(

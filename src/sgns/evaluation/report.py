@@ -24,7 +24,7 @@ from sgns.evaluation.report_words import (
     soil_note,
     summary,
 )
-from sgns.wholefile import write_whole
+from sgns.wholefile import whole_file, write_whole
 
 if TYPE_CHECKING:
     from sgns.evaluation.results import Evaluation
@@ -191,7 +191,7 @@ def render_report(evaluation: Evaluation, groups: Sequence[FigureGroup]) -> str:
 
 
 def write_report(evaluation: Evaluation, output: Path) -> Path:
-    """Draws the figures into `figures/` and writes `report.html`, complete or not at all.
+    """Draws the figures into `figures/` and writes `report.html`; every file is complete or not there at all.
 
     Returns:
         Path of the page.
@@ -201,7 +201,8 @@ def write_report(evaluation: Evaluation, output: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for group in groups:
         for figure in group.figures:
-            (folder / f"{figure.name}.png").write_bytes(figure.png)
+            with whole_file(folder / f"{figure.name}.png") as temporary:
+                temporary.write_bytes(figure.png)
     path = output / "report.html"
     write_whole(path, render_report(evaluation, groups))
     return path

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import logging
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,7 @@ from tqdm import tqdm
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.validation import RolloutScore, ValidationRollouts
 
-__all__ = ["RolloutValidation", "StepProgress", "force_figure"]
+__all__ = ["RolloutValidation", "StepProgress", "force_figure", "quiet_writer"]
 
 log = logging.getLogger(__name__)
 
@@ -173,3 +176,19 @@ def force_figure(rollouts: ValidationRollouts, score: RolloutScore, most: int = 
         axes[1, column].set_xlabel("frame")
     axes[0, 0].legend(frameon=False, fontsize=8)
     return figure
+
+
+@contextmanager
+def quiet_writer() -> Iterator[None]:
+    """Full disks without a traceback of TensorBoard's thread: it passes the error on to the training, which says it."""
+    before = threading.excepthook
+
+    def hook(failed: threading.ExceptHookArgs) -> None:
+        if not isinstance(failed.exc_value, OSError):
+            before(failed)
+
+    threading.excepthook = hook
+    try:
+        yield
+    finally:
+        threading.excepthook = before

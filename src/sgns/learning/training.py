@@ -32,7 +32,7 @@ from sgns.learning.data import TrainingWindows, WindowDataModule
 from sgns.learning.dynamics import LatentDynamics
 from sgns.learning.kinds import model_settings
 from sgns.learning.model_settings import ModelSettings
-from sgns.learning.monitoring import RolloutValidation, StepProgress
+from sgns.learning.monitoring import RolloutValidation, StepProgress, quiet_writer
 from sgns.learning.polynomial_settings import FitSettings, PolynomialSettings
 from sgns.learning.polynomial_training import check_start, fit_polynomial
 from sgns.learning.statistics import fit_normalisation
@@ -84,6 +84,7 @@ def main(cfg: DictConfig) -> float:
     )
 
 
+@quiet_writer()
 def train(
     reduced: ReducedDataset,
     *,
