@@ -214,7 +214,7 @@ def test_soil_is_held_while_the_tool_rests(trained, kind) -> None:
         state = simulator.step(pause[t])
         np.testing.assert_array_equal(state.latent, rollout.latent[t])
     surrogate = load_surrogate(folder / kind / "best.ckpt")
-    holding, free = Simulator(surrogate), Simulator(surrogate, hold_at_rest=False)
+    holding, free = Simulator(surrogate), Simulator(surrogate, rate_independent=False)
     np.testing.assert_array_equal(
         holding.rollout(pause).latent, rollout.latent
     )  # the choice is each one's own

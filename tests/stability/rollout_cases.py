@@ -96,7 +96,7 @@ def rest(start: str, seconds: float = 60.0) -> Callable[[], tuple[float, str]]:
         run = a_run("quick")
         drifts = []
         for hold in (True, False):
-            simulator = Simulator.load(quick_network(), hold_at_rest=hold)
+            simulator = Simulator.load(quick_network(), rate_independent=hold)
             d, r = simulator.history, simulator.num_modes
             frames = round(seconds * simulator.frame_rate) + 1
             if start == "untouched":
@@ -105,7 +105,7 @@ def rest(start: str, seconds: float = 60.0) -> Callable[[], tuple[float, str]]:
                 path = run.pose[-1:].repeat(frames, axis=0)
                 found = simulator.rollout(path, latent_history=run.latent[-d:, :r], values=run.scene)
             drifts.append(float(moved(simulator, found.latent).max()))
-        return drifts[0], f"without hold_at_rest {drifts[1]:.3g} mm"
+        return drifts[0], f"without rate_independent {drifts[1]:.3g} mm"
 
     return measure
 

@@ -19,10 +19,8 @@ from sgns.learning.normalisation import Standardiser
 from sgns.learning.polynomial_settings import PolynomialSettings
 from sgns.learning.prediction import Path, Step
 
-__all__ = ["Dynamics", "Stepper", "resting", "unrolled"]
+__all__ = ["Dynamics", "Stepper", "unrolled"]
 
-# A body that moves less than this in a frame [m, rad] rests: round-off of poses, not motion.
-_STILL = 1e-9
 # No latent position goes further than this from its mean, in deviations; training runs stay within about half of it. It
 # keeps a rollout finite that has left everything the dynamics know.
 _REACH = 10.0
@@ -43,15 +41,10 @@ class Dynamics(nn.Module):
         num_modes: r.
         context: Keys of the scene whose numbers are told, K of them.
         predicts_body: Whether the body moves as the soil lets it (see `free_axes`).
-
-    Attributes:
-        holds_rest: Whether the soil stays where it is while a prescribed body has rested for d frames. Slow dry soil
-            flows only while something drives it, but small errors of a step add up over minutes of rest.
     """
 
     settings: ModelSettings | PolynomialSettings
     force: Standardiser
-    holds_rest: bool = True
 
     def __init__(
         self,
@@ -130,16 +123,7 @@ class Dynamics(nn.Module):
             latent,
             body,
             self.predicts_body,
-            self.held(body),
         )
-
-    def held(self, body: BodyTrack) -> Tensor | None:
-        """In which windows of d frames of a track (B, T, N, ...) the soil is held, shape (B, T - d + 1); None: in
-        none."""
-        if not self.holds_rest or self.predicts_body:
-            return None
-        still = resting(body, self.history)
-        return still if bool(still.any()) else None
 
     def check_modes(self, num_modes: int) -> None:
         """For `with_modes`."""
@@ -176,17 +160,11 @@ class OwnStepper:
             return self.dynamics.advance(latent, body, self.context)
 
 
-def resting(body: BodyTrack, history: int) -> Tensor:
-    """Whether no node of a body (B, T, N, ...) moved in each window of d frames, shape (B, T - d + 1)."""
-    return (body.motion.abs() <= _STILL).flatten(2).all(2).unfold(1, history, 1).all(2)
-
-
 def unrolled(
     advance: Callable[[Tensor, BodyTrack], Step],
     latent: Tensor,
     body: BodyTrack,
     predicts_body: bool,
-    held: Tensor | None = None,
 ) -> Path:
     """Whole paths by steps that see what the steps before said.
 
@@ -195,7 +173,6 @@ def unrolled(
         latent: As for `Dynamics.unroll`.
         body: As for `Dynamics.unroll`.
         predicts_body: Whether the body goes where the steps say.
-        held: As `Dynamics.held`.
     """
     d, frames = latent.shape[1], body.position.shape[1]
     states = latent.new_empty((latent.shape[0], frames, *latent.shape[2:]), dtype=torch.float64)
@@ -207,8 +184,6 @@ def unrolled(
     for t in range(d, frames):
         step = advance(states[:, t - d : t], body.frames(slice(t - d + 1, t + 1)))
         states[:, t], force[:, t], torque[:, t] = step.latent, step.force, step.torque
-        if held is not None:
-            states[:, t] = torch.where(held[:, t - d + 1, None, None], states[:, t - 1], states[:, t])
         if predicts_body:
             body.motion[:, t, :, :3] = step.displacement
             body.position[:, t] = body.position[:, t - 1] + step.displacement

@@ -40,6 +40,7 @@ from sgns.learning.stepping import Dynamics
 from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint, write_checkpoint
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.training_range import TrainingRange
+from sgns.learning.travel import slowest_travel
 from sgns.learning.validation import ValidationRollouts
 from sgns.poses import in_body_frame
 from sgns.reduction.reduced import ReducedDataset, ReducedRun, reduce_dataset
@@ -235,8 +236,12 @@ def surrogate_of(dynamics: Dynamics, reduced: ReducedDataset, card: dict[str, An
     basis = reduced.basis.sliced(dynamics.num_modes)
     sees_points = dynamics.settings.body_nodes == "points"
     known = TrainingRange.of(reduced.runs("train"), dynamics.num_modes, dynamics.context_keys, sees_points)
+    covered = {
+        "training_range": known.plain(),
+        "slowest_travel": slowest_travel(reduced.runs("train")),
+    }
     start = torch.as_tensor(reduced.start_positions)
-    return Surrogate(dynamics, basis, start, points, card | {"training_range": known.plain()})
+    return Surrogate(dynamics, basis, start, points, card | covered)
 
 
 def prepared(
