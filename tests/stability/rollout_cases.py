@@ -1,7 +1,7 @@
 """Hard cases of rollouts: paths that nobody trained the network for.
 
-Names of networks as `simulator_of` takes them; "quick" and "slower" are of the solver's own runs, the others of
-synthetic ones. Letters: T frames, r modes.
+Names of networks as `simulator_of` takes them; "quick" is of the solver's own runs, the others of synthetic ones.
+Letters: T frames, r modes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Change = Callable[[np.ndarray], np.ndarray]
 
 def data_of(kind: str) -> ReducedDataset:
     """The runs that a network was trained on."""
-    return quick_data() if kind in ("quick", "slower") else synthetic_data()
+    return quick_data() if kind == "quick" else synthetic_data()
 
 
 def a_run(kind: str) -> ReducedRun:
@@ -377,13 +377,6 @@ CASES = [
          "soil moves no further than the tool", "RMS movement", 3.6, "mm", creeping("quick")),
     Case("tool shakes by 0.1 mm for 60 s before it cuts", "motion that no training run has", STAYS, "RMS movement", 1,
          "mm", vibrating("quick")),
-    Case("slowly, trained with slower windows", "errors add up over 2401 steps",
-         "slow soil ends where it would have ended faster", "RMS difference of the end / movement", 1, "",
-         slowly("slower", 10)),
-    Case("tool creeps, trained with slower windows", "slower than anything recorded, but not at rest",
-         "soil moves no further than the tool", "RMS movement", 3.6, "mm", creeping("slower")),
-    Case("tool shakes, trained with slower windows", "motion that no training run has", STAYS, "RMS movement", 1,
-         "mm", vibrating("slower")),
     Case("held-out runs", "a false alarm would teach people to ignore it", "not flagged", "largest excess", NOTEWORTHY,
          "", held_out),
     Case("five times as deep", "deeper than the training runs", FLAGGED, UNFLAGGED, 0, "runs",

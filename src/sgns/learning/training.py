@@ -257,7 +257,7 @@ def prepared(
     runs = reduced.runs("train")
     context = tuple(varying_context(runs, model.context))
     windows = TrainingWindows(
-        runs, num_modes, model.history, model.body_nodes, seed, settings.horizon, context, settings.slower
+        runs, num_modes, model.history, model.body_nodes, seed, settings.horizon, context
     )
     dynamics = LatentDynamics(model, num_modes, context, moves_freely(runs))
     noise = fit_normalisation(
@@ -309,8 +309,8 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
     if not found:
         return ""
     there = read_checkpoint(found[0])["hyper_parameters"].get("settings", {})
-    if isinstance(there.get("training"), dict) and "max_steps" in there["training"]:
-        there["training"].setdefault("slower", 0.0)  # a key of later
+    if isinstance(there.get("training"), dict) and not there["training"].get("slower"):
+        there["training"].pop("slower", None)  # a key of before that did nothing at 0
     if different := differences(there, asked):
         key, (old, new) = next(iter(different.items()))
         more = f" (and {len(different) - 1} more)" if len(different) > 1 else ""
