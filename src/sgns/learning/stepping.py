@@ -5,6 +5,7 @@ Shapes: B batch, d history positions, r modes, N body nodes, K context numbers, 
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -41,10 +42,17 @@ class Dynamics(nn.Module):
         num_modes: r.
         context: Keys of the scene whose numbers are told, K of them.
         predicts_body: Whether the body moves as the soil lets it (see `free_axes`).
+
+    Attributes:
+        lowest: Latent positions that no step goes below [m], shape (r, 3) or those of more modes; without bound until
+            the surrogate that it is a part of tells it.
+        highest: Likewise.
     """
 
     settings: ModelSettings | PolynomialSettings
     force: Standardiser
+    lowest: Tensor
+    highest: Tensor
 
     def __init__(
         self,
@@ -58,6 +66,9 @@ class Dynamics(nn.Module):
         self.num_modes = num_modes
         self.context_keys = tuple(context)
         self.predicts_body = predicts_body
+        unbounded = torch.full((num_modes, 3), math.inf, dtype=torch.float64)
+        self.register_buffer("lowest", -unbounded, persistent=False)
+        self.register_buffer("highest", unbounded, persistent=False)
 
     @property
     def history(self) -> int:
@@ -88,7 +99,10 @@ class Dynamics(nn.Module):
     def reach(self) -> tuple[Tensor, Tensor]:
         """Smallest and largest latent positions that a step leads to [m], shape (r, 3) each."""
         mean, scale = self.latent_statistics()
-        return mean - _REACH * scale, mean + _REACH * scale
+        return (
+            torch.maximum(mean - _REACH * scale, self.lowest[: self.num_modes]),
+            torch.minimum(mean + _REACH * scale, self.highest[: self.num_modes]),
+        )
 
     @abstractmethod
     def advance(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Step:
