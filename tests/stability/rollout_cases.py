@@ -355,7 +355,7 @@ FLAGGED = "flagged as unlike the training runs, and finite"
 UNFLAGGED = "test runs not flagged or not finite"
 BOUNDED = "the soil moves no further than twice the largest training run"
 SHARE = "largest RMS movement / largest in training"
-BOUND = "finite, and modes within ten deviations of their mean"
+BOUND = "finite, and modes within their bounds"
 STAYS = "soil at rest stays at rest"
 NAMED = "refused in one line that says what and where"
 
