@@ -68,6 +68,14 @@ def long_path(kind: str, times: int) -> Callable[[], tuple[float, str]]:
     return measure
 
 
+def slowed(path: np.ndarray, times: int) -> np.ndarray:
+    """The path so many times as slow."""
+    frames = np.arange(times * (len(path) - 1) + 1) / times
+    path = np.stack([np.interp(frames, np.arange(len(path)), part) for part in path.T], axis=1)
+    path[:, 3:] /= np.linalg.norm(path[:, 3:], axis=1, keepdims=True)
+    return path
+
+
 def slowly(kind: str, times: int) -> Callable[[], tuple[float, str]]:
     """The cut so many times as slow, which takes as many more steps and leaves the same soil behind, as slow soil does
     not know how fast it is driven: difference of the end from the run's own [share of its movement]."""
@@ -75,12 +83,7 @@ def slowly(kind: str, times: int) -> Callable[[], tuple[float, str]]:
     def measure() -> tuple[float, str]:
         simulator, worst = simulator_of(kind), 0.0
         for run in quick_data().runs("test"):
-            frames = np.arange(times * (len(run.pose) - 1) + 1) / times
-            path = np.stack(
-                [np.interp(frames, np.arange(len(run.pose)), part) for part in run.pose.T], axis=1
-            )
-            path[:, 3:] /= np.linalg.norm(path[:, 3:], axis=1, keepdims=True)
-            found = simulator.rollout(path, values=run.scene)
+            found = simulator.rollout(slowed(run.pose, times), values=run.scene)
             truth = run.latent[:, : simulator.num_modes]
             error = moved(simulator, np.stack([truth[-1], found.latent[-1]]))[1]
             worst = max(worst, float(error / moved(simulator, truth)[-1]))
