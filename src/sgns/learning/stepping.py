@@ -5,6 +5,7 @@ Shapes: B batch, d history positions, r modes, N body nodes, K context numbers, 
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -21,8 +22,8 @@ from sgns.learning.prediction import Path, Step
 
 __all__ = ["Dynamics", "Stepper", "unrolled"]
 
-# Where no bounds are known no latent position goes further than this from its mean, in deviations; training runs stay
-# within about half of it. It keeps a rollout finite that has left everything the dynamics know.
+# No latent position goes further than this from its mean, in deviations; training runs stay within about half of it. It
+# keeps a rollout finite that has left everything the dynamics know.
 _REACH = 10.0
 
 
@@ -43,15 +44,15 @@ class Dynamics(nn.Module):
         predicts_body: Whether the body moves as the soil lets it (see `free_axes`).
 
     Attributes:
-        lowest: Latent positions that no step goes below [m], shape (r, 3) or those of more modes; None until the
-            surrogate that it is a part of tells it.
+        lowest: Latent positions that no step goes below [m], shape (r, 3) or those of more modes; without bound until
+            the surrogate that it is a part of tells it.
         highest: Likewise.
     """
 
     settings: ModelSettings | PolynomialSettings
     force: Standardiser
-    lowest: Tensor | None
-    highest: Tensor | None
+    lowest: Tensor
+    highest: Tensor
 
     def __init__(
         self,
@@ -65,8 +66,9 @@ class Dynamics(nn.Module):
         self.num_modes = num_modes
         self.context_keys = tuple(context)
         self.predicts_body = predicts_body
-        self.register_buffer("lowest", None, persistent=False)
-        self.register_buffer("highest", None, persistent=False)
+        unbounded = torch.full((num_modes, 3), math.inf, dtype=torch.float64)
+        self.register_buffer("lowest", -unbounded, persistent=False)
+        self.register_buffer("highest", unbounded, persistent=False)
 
     @property
     def history(self) -> int:
@@ -96,10 +98,11 @@ class Dynamics(nn.Module):
 
     def reach(self) -> tuple[Tensor, Tensor]:
         """Smallest and largest latent positions that a step leads to [m], shape (r, 3) each."""
-        if self.lowest is not None and self.highest is not None:
-            return self.lowest[: self.num_modes], self.highest[: self.num_modes]
         mean, scale = self.latent_statistics()
-        return mean - _REACH * scale, mean + _REACH * scale
+        return (
+            torch.maximum(mean - _REACH * scale, self.lowest[: self.num_modes]),
+            torch.minimum(mean + _REACH * scale, self.highest[: self.num_modes]),
+        )
 
     @abstractmethod
     def advance(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Step:

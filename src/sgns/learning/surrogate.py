@@ -99,7 +99,8 @@ class Surrogate(nn.Module):
         if self.training_range is not None:
             low, high = self.training_range.soil(_MARGIN)
             dynamics.lowest, dynamics.highest = (
-                torch.as_tensor(bound.reshape(dynamics.num_modes, 3)) for bound in (low, high)
+                torch.as_tensor(bound.reshape(dynamics.num_modes, 3)).to(dynamics.lowest)
+                for bound in (low, high)
             )
         self.slowest_travel = float(card.get("slowest_travel", 0.0))
         if not 0.0 <= self.slowest_travel < math.inf:
