@@ -273,7 +273,7 @@ def main(cfg: DictConfig) -> float:
 
     scene = scene_from_config(cfg)
     simulator = Simulator.load(
-        cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes, hold_at_rest=cfg.hold_at_rest
+        cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes, rate_independent=cfg.rate_independent
     )
     require_same_freedom(simulator, scene, cfg.checkpoint)
     require_known_bed(simulator, scene, cfg.checkpoint)

@@ -7,9 +7,9 @@ Letters: B paths, T frames, n particles, M body points, N body nodes, d history 
 
 from __future__ import annotations
 
-import copy
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,14 @@ from sgns.learning.context import context_of
 from sgns.learning.prediction import Step
 from sgns.learning.surrogate import Surrogate, load_surrogate
 from sgns.learning.training_range import Excess
+from sgns.learning.travel import Travel, markers, stepped_frames
 from sgns.poses import check_poses, fitted_poses, in_world_frame
 from sgns.states import Rollout, Rollouts, State
 
 __all__ = ["Simulator"]
+
+# Soil follows the clock for so long after the tool has moved at the pace of the training runs, then its travel [s].
+_SETTLING = 0.5
 
 
 class Simulator:
@@ -37,7 +41,8 @@ class Simulator:
         surrogate: Network, basis and start.
         device: "cpu" or "cuda".
         num_modes: Of the soil, the first of those it was trained with; None: all.
-        hold_at_rest: Whether the soil stays as it is while a prescribed tool has rested for d frames.
+        rate_independent: Whether the soil follows the travel of a prescribed tool, not the clock, where the tool is
+            slower than in all training runs (see `sgns.learning.travel`).
     """
 
     def __init__(
@@ -45,7 +50,7 @@ class Simulator:
         surrogate: Surrogate,
         device: str = "cpu",
         num_modes: int | None = None,
-        hold_at_rest: bool = True,
+        rate_independent: bool = True,
     ) -> None:
         try:
             self.device = torch.device(device)
@@ -57,11 +62,8 @@ class Simulator:
         self._dynamics, self.basis = surrogate.dynamics, surrogate.basis
         if num_modes is not None:
             self._dynamics, self.basis = self._dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
-        if self._dynamics.holds_rest != hold_at_rest:
-            self._dynamics = copy.copy(
-                self._dynamics
-            )  # its weights are shared, the choice is this simulator's
-            self._dynamics.holds_rest = hold_at_rest
+        self._follows_travel = rate_independent and not self._dynamics.predicts_body
+        self._pace = surrogate.slowest_travel, math.ceil(_SETTLING * surrogate.frame_rate)
         self.start_positions = surrogate.start_positions.cpu().numpy()
         self.body_points = surrogate.body_points.cpu().numpy()
         self._start_latent = self.basis.transform(surrogate.start_positions.cpu())
@@ -69,14 +71,18 @@ class Simulator:
 
     @classmethod
     def load(
-        cls, path: str | Path, device: str = "cpu", num_modes: int | None = None, hold_at_rest: bool = True
+        cls,
+        path: str | Path,
+        device: str = "cpu",
+        num_modes: int | None = None,
+        rate_independent: bool = True,
     ) -> Simulator:
         """From a checkpoint written by `sgns train`; arguments as of the class.
 
         Raises:
             UserError: The file is missing, truncated or not such a checkpoint.
         """
-        return cls(load_surrogate(path), device, num_modes, hold_at_rest)
+        return cls(load_surrogate(path), device, num_modes, rate_independent)
 
     @property
     def frame_rate(self) -> float:
@@ -177,8 +183,12 @@ class Simulator:
                     f"the history has {len(self._poses)} poses; this network looks back on {self.history}"
                 )
         self._latent = latent.clone()[None].to(self.device)
-        nothing = np.zeros(3)
-        return self._state(nothing, nothing.copy(), self._pose_now())
+        self._load = np.zeros(3), np.zeros(3)
+        self._travel: Travel | None = None
+        # The last two frames; what the network sees may be further apart.
+        poses = self._poses[-2:] or [np.full(7, np.nan)]
+        self._shown = list(zip(poses, latent[-len(poses) :].numpy().copy(), strict=True))
+        return self._state()
 
     def step(self, tool_pose: np.ndarray) -> State:
         """Move the tool to its next pose and the soil with it.
@@ -194,23 +204,31 @@ class Simulator:
         """
         pose = check_poses(tool_pose, f"tool pose of frame {self._frame + 1}")[0]
         if not self._poses:
-            self._poses = [pose] * self.history
+            self._poses, self._shown = [pose] * self.history, [(pose, self._shown[-1][1])]
+        before = self._travel or Travel.along(self._markers(self._poses), *self._pace)
+        travel = before.moved(self._markers([pose])[0])
+        if travel.steps or not self._follows_travel:
+            pose = self._step_soil(pose)
+        self._travel = travel
+        self._shown = [self._shown[-1], (pose, self._latent[0, -1].cpu().numpy())]
+        self._frame += 1
+        return self._state()
+
+    def _step_soil(self, pose: np.ndarray) -> np.ndarray:
+        """Let the network take a step; returns where the tool is then."""
         # One frame more than the network sees, because the first motion needs a frame before it.
         window = np.stack([*self._poses, pose])
         body = self._track(window, in_world_frame(window, self._points)).frames(slice(1, None))
         with torch.inference_mode():
             step = self._stepper.advance(self._latent, body)
-            held = self._dynamics.held(body) is not None
-            following = self._latent[:, -1:] if held else step.latent[:, None]
-            self._require_finite(following, step)
-            self._latent = torch.cat([self._latent[:, 1:], following], dim=1)
+            self._require_finite(step)
+            self._latent = torch.cat([self._latent[:, 1:], step.latent[:, None]], dim=1)
         if self.predicts_body:
             there = body.position[0, -2] + step.displacement[0]
             pose = self._predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
         self._poses = [*self._poses[1:], pose]
-        self._frame += 1
-        force, torque = (part[0].cpu().numpy() for part in (step.force, step.torque))
-        return self._state(force, torque, pose)
+        self._load = step.force[0].cpu().numpy(), step.torque[0].cpu().numpy()
+        return pose
 
     def rollout(
         self,
@@ -242,17 +260,18 @@ class Simulator:
         points = self.body_points if body_points is None else np.asarray(body_points, dtype=np.float64)
         d = self.history
         if latent_history is None:
-            padding, latent = d - 1, self._start_latent.expand(d, -1, -1)
+            padding, given, latent = d - 1, 1, self._start_latent.expand(d, -1, -1)
         else:
-            padding, latent = 0, self._checked_history(latent_history)
+            padding, given, latent = 0, d, self._checked_history(latent_history)
             if len(poses) < d:
                 raise UserError(
                     f"the path has {len(poses)} frames; with a given history it needs at least {d}"
                 )
         world = in_world_frame(poses, points)
-        track = self._track(pad_start(poses, padding), pad_start(world, padding))
         context = self._context_of(values)
         began = time.perf_counter()
+        frames, newest = self._steps_of(poses, world, given)
+        track = self._track(pad_start(poses[frames], padding), pad_start(world[frames], padding))
         with torch.inference_mode():
             path = self._dynamics.unroll(latent[None].to(self.device), track, context)
             states, force, torque = (
@@ -260,9 +279,10 @@ class Simulator:
             )
         wall_time = time.perf_counter() - began
         if latent_history is not None:
-            for part, given in ((force, force_history), (torque, torque_history)):
-                if given is not None:
-                    part[:d] = np.asarray(given)[:d]
+            for part, known in ((force, force_history), (torque, torque_history)):
+                if known is not None:
+                    part[:d] = np.asarray(known)[:d]
+        states, force, torque = states[newest], force[newest], torque[newest]
         if self.predicts_body:
             nodes = path.body.position[0, padding:].cpu().numpy()
             poses = self._predicted_poses(poses, nodes, points)
@@ -312,14 +332,22 @@ class Simulator:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Latent positions, force, torque and poses of some paths (B, T, 7) that begin with the bed at rest."""
         padding = self.history - 1
+        worlds = [in_world_frame(path, points) for path in poses]
+        steps = [self._steps_of(*path, 1) for path in zip(poses, worlds, strict=True)]
+        # Side by side all take as many steps: those that are done rest.
+        longest = max(len(frames) for frames, _ in steps)
         tracks = [
-            self._track(pad_start(path, padding), pad_start(in_world_frame(path, points), padding))
-            for path in poses
+            self._track(pad_start(path[shown], padding), pad_start(world[shown], padding))
+            for path, world, (frames, _) in zip(poses, worlds, steps, strict=True)
+            for shown in [np.pad(frames, (0, longest - len(frames)), mode="edge")]
         ]
         track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
         latent = self._start_latent.to(self.device).expand(len(poses), self.history, -1, -1)
         path = self._dynamics.unroll(latent, track, context.expand(len(poses), -1))
-        found = (part[:, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque))
+        found = (
+            np.stack([part[newest] for part, (_, newest) in zip(parts.cpu().numpy(), steps, strict=True)])
+            for parts in (path.latent[:, padding:], path.force[:, padding:], path.torque[:, padding:])
+        )
         if self.predicts_body:
             nodes = path.body.position[:, padding:].cpu().numpy()
             poses = np.stack(
@@ -327,15 +355,23 @@ class Simulator:
             )
         return (*found, poses)  # type: ignore[return-value]
 
+    def _steps_of(self, poses: np.ndarray, world: np.ndarray, given: int) -> tuple[np.ndarray, np.ndarray]:
+        """Frames that the soil takes a step into, the given ones first, and for each frame of the path which of them
+        is the newest; poses (T, 7) and body points (T, M, 3)."""
+        if not self._follows_travel:
+            return np.arange(len(poses)), np.arange(len(poses))
+        frames = stepped_frames(markers(poses, world), given, *self._pace)
+        return frames, np.searchsorted(frames, np.arange(len(poses)), side="right") - 1
+
     def _predicted_poses(self, poses: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Poses (T, 7) of body nodes (T, N, 3) [m]; the prescribed orientation of a pose node is kept."""
         if self._dynamics.settings.body_nodes == "points":
             return fitted_poses(points, nodes)
         return np.concatenate([nodes[:, 0], poses[:, 3:]], axis=1)
 
-    def _require_finite(self, following: Tensor, step: Step) -> None:
+    def _require_finite(self, step: Step) -> None:
         """Refuses a step that says nothing; the simulator stays where it was."""
-        found = {"the soil's state": following, "the force": step.force, "the torque": step.torque}
+        found = {"the soil's state": step.latent, "the force": step.force, "the torque": step.torque}
         bad = [name for name, part in found.items() if not bool(torch.isfinite(part).all())]
         if bad:
             raise UserError(
@@ -343,13 +379,13 @@ class Simulator:
                 f"far from everything the network knows; frame {self._frame} is kept: step to another pose, or reset"
             )
 
-    def _state(self, force: np.ndarray, torque: np.ndarray, pose: np.ndarray) -> State:
+    def _state(self) -> State:
         """The newest state."""
-        # How far it is outside takes the frame before as well, for velocities; before any pose nobody can tell.
-        poses = np.stack(self._poses[-2:]) if self._poses else pose[None]
-        latent = self._latent[0, -len(poses) :].cpu().numpy()
+        # How far it is outside takes the frame before as well, for velocities.
+        poses, latent = (np.stack(part) for part in zip(*self._shown, strict=True))
         excess = partial(self._excess_of, poses, self._points, latent, self._values)
-        return State(self._frame, latent[-1].copy(), force, torque, pose, self.basis, excess)
+        force, torque = (part.copy() for part in self._load)
+        return State(self._frame, latent[-1].copy(), force, torque, poses[-1], self.basis, excess)
 
     def _excess_of(
         self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, values: Mapping[str, Any] | None
@@ -382,8 +418,9 @@ class Simulator:
             raise UserError("the latent history holds values that are not finite; every value must be")
         return latent
 
-    def _pose_now(self) -> np.ndarray:
-        return self._poses[-1] if self._poses else np.full(7, np.nan)
+    def _markers(self, poses: Sequence[np.ndarray]) -> np.ndarray:
+        path = np.stack(poses)
+        return markers(path, in_world_frame(path, self._points))
 
 
 def pad_start(values: np.ndarray, count: int) -> np.ndarray:

@@ -197,30 +197,135 @@ def test_fewer_modes_than_it_was_trained_with(trained) -> None:
         Simulator.load(folder / "pose" / "best.ckpt", num_modes=5)
 
 
+def along_x(simulator: Simulator, pose: np.ndarray, steps: list[float]) -> np.ndarray:
+    """Poses from a first one on along x; steps are in travels of the slowest training run in a frame."""
+    path = pose[None].repeat(len(steps) + 1, axis=0)
+    path[1:, 0] += simulator._surrogate.slowest_travel * np.cumsum(steps)
+    return path
+
+
+# At the pace of the training, at rest, slowly, at pace, back, shaking.
+CHANGING = [1.5] * 5 + [0.0] * 35 + [0.3] * 12 + [1.2] * 3 + [-0.4] * 40 + [0.2, -0.2] * 5
+
+
 @pytest.mark.parametrize("kind", ["pose", "points", "polynomial"])
-def test_soil_is_held_while_the_tool_rests(trained, kind) -> None:
+def test_at_the_pace_of_the_training_every_frame_is_a_step(trained, kind) -> None:
+    data, folder = trained
+    surrogate = load_surrogate(folder / kind / "best.ckpt")
+    following, plain = Simulator(surrogate), Simulator(surrogate, rate_independent=False)
+    for run in data.runs("train") + data.runs("test"):
+        for history in (None, run.latent[:3, :4]):
+            found, expected = (s.rollout(run.pose, latent_history=history) for s in (following, plain))
+            np.testing.assert_array_equal(found.latent, expected.latent)
+            np.testing.assert_array_equal(found.force, expected.force)
+            assert (np.diff(found.latent[2:], axis=0) != 0).any(axis=(1, 2)).all()
+
+
+@pytest.mark.parametrize("kind", ["pose", "points", "polynomial"])
+def test_a_path_driven_slowly_leaves_the_same_soil(trained, kind) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    start = data.runs("test")[0].pose[0]
+    known = simulator.rollout(along_x(simulator, start, [1.1] * 12))
+    slow = along_x(simulator, start, [1.1 / 4] * 48)
+    slow[::4] = along_x(simulator, start, [1.1] * 12)
+    found = simulator.rollout(slow)
+    for name in ("latent", "force", "torque"):
+        # In between nothing happens.
+        np.testing.assert_array_equal(getattr(found, name)[:-1], getattr(known, name)[:-1].repeat(4, axis=0))
+        np.testing.assert_array_equal(getattr(found, name)[-1], getattr(known, name)[-1])
+    own = Simulator.load(folder / kind / "best.ckpt", rate_independent=False).rollout(slow)
+    assert (own.latent[-1] != found.latent[-1]).any()
+
+
+@pytest.mark.parametrize("kind", ["pose", "points", "polynomial"])
+def test_soil_settles_and_is_held_while_the_tool_rests(trained, kind) -> None:
     data, folder = trained
     path = data.runs("test")[0].pose
-    pause = np.concatenate([path[:7], path[6:7].repeat(20, axis=0), path[7:]])
-    simulator = Simulator.load(folder / kind / "best.ckpt")
-    rollout = simulator.rollout(pause)
-    d = simulator.history
-    held = rollout.latent[5 + d : 27]
-    # The tool has to rest for d frames before the soil does.
-    np.testing.assert_array_equal(held, held[:1].repeat(len(held), axis=0))
-    assert (rollout.latent[4 + d] != held[0]).any() and (rollout.latent[27] != held[0]).any()
-    simulator.reset(pause)
-    for t in range(1, len(pause)):
-        state = simulator.step(pause[t])
-        np.testing.assert_array_equal(state.latent, rollout.latent[t])
+    pause = np.concatenate([path[:7], path[6:7].repeat(60, axis=0), path[7:]])
     surrogate = load_surrogate(folder / kind / "best.ckpt")
-    holding, free = Simulator(surrogate), Simulator(surrogate, hold_at_rest=False)
-    np.testing.assert_array_equal(
-        holding.rollout(pause).latent, rollout.latent
-    )  # the choice is each one's own
-    drifting = free.rollout(pause)
-    np.testing.assert_array_equal(drifting.latent[: 6 + d], rollout.latent[: 6 + d])
-    assert (np.diff(drifting.latent[6 + d : 27], axis=0) != 0).any()
+    found, own = (Simulator(surrogate, rate_independent=follows).rollout(pause) for follows in (True, False))
+    # It follows the clock for half a second more.
+    np.testing.assert_array_equal(found.latent[:36], own.latent[:36])
+    held = found.latent[35:67]
+    np.testing.assert_array_equal(held, held[:1].repeat(len(held), axis=0))
+    assert (found.latent[34] != held[0]).any() and (found.latent[67] != held[0]).any()
+    assert (np.diff(own.latent[35:67], axis=0) != 0).any()
+
+
+@pytest.mark.parametrize("kind", ["pose", "points", "polynomial"])
+@pytest.mark.parametrize("given", [False, True])
+def test_stepping_is_the_rollout_at_any_pace(trained, kind, given) -> None:
+    data, folder = trained
+    run = data.runs("test")[0]
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    path = along_x(simulator, run.pose[0], CHANGING)
+    history = run.latent[:3, :4] if given else None
+    rollout = simulator.rollout(path, latent_history=history)
+    moved = (np.diff(rollout.latent, axis=0) != 0).any(axis=(1, 2))
+    assert moved[5:34].all() and not moved[34:40].any() and moved[40:52].sum() == 3 and not moved[-10:].any()
+    first = 3 if given else 1
+    state = simulator.reset(None if given else path, history=(history, path[:3]) if given else None)
+    for t in range(first, len(path)):
+        state = simulator.step(path[t])
+        np.testing.assert_array_equal(state.latent, rollout.latent[t])
+        np.testing.assert_array_equal(state.force, rollout.force[t])
+        np.testing.assert_array_equal(state.pose, path[t])
+        assert state.outside == pytest.approx(rollout.excess.amount[t], rel=1e-12)
+
+
+def test_paths_of_different_paces_side_by_side(trained) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / "pose" / "best.ckpt")
+    pose, count = data.runs("test")[0].pose[0], len(CHANGING)
+    steps = (CHANGING, [0.0] * count, [0.1] * count, [1.3] * count)
+    paths = np.stack([along_x(simulator, pose, list(each)) for each in steps])
+    many = simulator.rollouts(paths)
+    for i, path in enumerate(paths):
+        one = simulator.rollout(path)
+        for name in ("latent", "force", "torque"):
+            found, expected = getattr(many, name)[i], getattr(one, name)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * max(np.abs(expected).max(), 1.0))
+    assert not np.diff(many.latent[1], axis=0).any() and not many.force[1].any()
+
+
+def test_the_given_force_stays_until_a_step_is_taken(trained) -> None:
+    data, folder = trained
+    run = data.runs("test")[0]
+    simulator = Simulator.load(folder / "pose" / "best.ckpt")
+    path = along_x(simulator, run.pose[0], [0.0] * 9)
+    rollout = simulator.rollout(path, latent_history=run.latent[:3, :4], force_history=run.force[:3])
+    np.testing.assert_array_equal(rollout.force[2:], run.force[2:3].repeat(8, axis=0))
+
+
+def test_a_checkpoint_from_before_holds_soil_at_rest_only(trained, tmp_path) -> None:
+    data, folder = trained
+    content = torch.load(folder / "pose" / "best.ckpt", weights_only=True)
+    known = Simulator.load(folder / "pose" / "best.ckpt")
+    path = along_x(known, data.runs("test")[0].pose[0], [0.01] * 5 + [0.0] * 40)
+    assert not np.diff(known.rollout(path).latent, axis=0).any()
+    del content["hyper_parameters"]["slowest_travel"]
+    torch.save(content, tmp_path / "old.ckpt")
+    moved = np.diff(Simulator.load(tmp_path / "old.ckpt").rollout(path).latent, axis=0).any(axis=(1, 2))
+    assert moved[:34].all() and not moved[34:].any()
+    content["hyper_parameters"]["slowest_travel"] = float("nan")
+    torch.save(content, tmp_path / "bad.ckpt")
+    with pytest.raises(UserError, match="slowest travel"):
+        Simulator.load(tmp_path / "bad.ckpt")
+
+
+@pytest.mark.parametrize("kind", ["pose", "polynomial"])
+def test_modes_stay_near_their_training_range(trained, kind) -> None:
+    data, folder = trained
+    for num_modes in (4, 2):
+        simulator = Simulator.load(folder / kind / "best.ckpt", num_modes=num_modes)
+        runs = np.concatenate([run.latent[:, :num_modes] for run in data.runs("train")])
+        low, high = (bound.numpy() for bound in simulator._dynamics.reach())
+        width = runs.max(axis=0) - runs.min(axis=0)
+        beyond = np.maximum(runs.min(axis=0) - low, high - runs.max(axis=0))
+        # A mode that varies little is given a tenth of the widest one's range.
+        assert (beyond <= 0.75 * np.maximum(width, 0.1 * width.max()) + 1e-12).all()
+        assert (low <= runs.min(axis=0)).all() and (high >= runs.max(axis=0)).all()
 
 
 @pytest.mark.parametrize("kind", ["pose", "polynomial"])

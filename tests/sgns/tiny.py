@@ -57,7 +57,6 @@ TRAINING: dict[str, Any] = {
     "normalisation_floor": 0.01,
     "horizon": 1,
     "fewer_modes": 0.0,
-    "slower": 0.0,
     "change_of": "free",
     "loss": {"change": 1.0, "force": 1.0, "torque": 0.1},
     "validate_every": 10,

@@ -87,13 +87,9 @@ def quick_data() -> ReducedDataset:
     return reduce_dataset(Dataset.open(path), settings, progress=False)
 
 
-def quick_network(name: str = "quick") -> Path:
-    """Checkpoint of a network trained on the dataset quick; trained once, then kept in outputs/.
-
-    "quick" is the default network and training, "slower" the same with `training.slower=0.3`.
-    """
-    changes = {"quick": {}, "slower": {"slower": 0.3}}[name]
-    output = ROOT / "outputs" / "stability" / {"quick": "network"}.get(name, f"network_{name}")
+def quick_network() -> Path:
+    """Checkpoint of the default network, trained on the dataset quick once and then kept in outputs/."""
+    output = ROOT / "outputs" / "stability" / "network"
     output.mkdir(parents=True, exist_ok=True)
     model, training = (
         OmegaConf.to_container(OmegaConf.load(ROOT / "conf" / group / "default.yaml"))
@@ -107,7 +103,7 @@ def quick_network(name: str = "quick") -> Path:
             data,
             num_modes=data.num_modes,
             model=model,
-            training=training | {"threads": 1} | changes,
+            training=training | {"threads": 1},
             output=output,
             provenance={"preset": "default", "dataset": "quick"},
         )
@@ -115,5 +111,5 @@ def quick_network(name: str = "quick") -> Path:
 
 
 def simulator_of(kind: str) -> Simulator:
-    """By the name of its network: pose, points, polynomial, quick or slower."""
-    return Simulator.load(quick_network(kind) if kind in ("quick", "slower") else synthetic_network(kind))
+    """By the name of its network: pose, points, polynomial or quick."""
+    return Simulator.load(quick_network() if kind == "quick" else synthetic_network(kind))

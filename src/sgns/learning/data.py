@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["Batch", "NoiseScales", "TrainingWindows", "WindowDataModule", "random_walk", "require_finite"]
 
 # Streams of random numbers that must not be the same.
-_CHOICE, _NOISE, _BODY_NOISE, _PACE = 0, 1, 2, 3
+_CHOICE, _NOISE, _BODY_NOISE = 0, 1, 2
 
 
 class NoiseScales(NamedTuple):
@@ -100,7 +100,6 @@ class TrainingWindows:
         seed: Of choice and noise.
         horizon: h, targets of a window.
         context: Keys of the scene whose numbers go with every window.
-        slower: Share of the windows that are shown at a slower pace, see `slowed`.
     """
 
     def __init__(
@@ -112,7 +111,6 @@ class TrainingWindows:
         seed: int = 0,
         horizon: int = 1,
         context: Sequence[str] = (),
-        slower: float = 0.0,
     ) -> None:
         if not runs:
             raise UserError(
@@ -121,7 +119,6 @@ class TrainingWindows:
         self.history = history
         self.horizon = horizon
         self.seed = seed
-        self.slower = slower
         latent, tracks, force, torque, targets, of_run = [], [], [], [], [], []
         offset, pad = 0, history - 1
         for number, run in enumerate(runs):
@@ -195,11 +192,7 @@ class TrainingWindows:
         body_offsets = random_walk(
             noise.body.expand(nodes, 3), shape, generator(self.seed, step, _BODY_NOISE)
         )
-        batch = self.windows(rows, (offsets, body_offsets))
-        if self.slower == 0:
-            return batch
-        draw = torch.rand((2, size), generator=generator(self.seed, step, _PACE), dtype=torch.float64)
-        return slowed(batch, torch.where(draw[0] < self.slower, draw[1], 1.0))
+        return self.windows(rows, (offsets, body_offsets))
 
     def batches(self, size: int, noise: NoiseScales, first: int = 0) -> Iterator[Batch]:
         """Batches without end, from step `first`."""
@@ -207,37 +200,6 @@ class TrainingWindows:
         while True:
             yield self.batch(step, size, noise)
             step += 1
-
-
-def slowed(batch: Batch, pace: Tensor) -> Batch:
-    """Windows as if everything had happened more slowly around the newest frame that is shown.
-
-    Slow dry soil does not know how fast it is driven: the same way of the tool moves it by the same amount in any time,
-    down to a tool and soil at rest. Frames between the frames are interpolated; force and torque are those of the
-    target.
-
-    Args:
-        batch: Clean windows with their noise, which stays as it is.
-        pace: Of every window [1], 1: as it was, 0: everything rests; shape (B,).
-    """
-    frames, now = batch.latent.shape[1], batch.history.shape[1] - 1
-    place = now + (torch.arange(frames) - now) * pace[:, None]
-    # Motions are summed up and divided anew; before frame 1 there is none.
-    way = torch.nn.functional.pad(batch.body.motion.cumsum(1), (0, 0, 0, 0, 1, 0))
-    body = BodyTrack(
-        between(batch.body.position, place[:, 1:] - 1),
-        between(batch.body.orientation, place[:, 1:] - 1),
-        between(way, place).diff(dim=1),
-    )
-    return batch._replace(latent=between(batch.latent, place), body=body)
-
-
-def between(values: Tensor, place: Tensor) -> Tensor:
-    """Values (B, F, ...) at places between 0 and F - 1, shape (B, S); (B, S, ...)."""
-    low = place.floor().clamp(0, max(values.shape[1] - 2, 0)).long()
-    share = (place - low).reshape(*place.shape, *[1] * (values.dim() - 2))
-    windows = torch.arange(len(values))[:, None]
-    return torch.lerp(values[windows, low], values[windows, (low + 1).clamp(max=values.shape[1] - 1)], share)
 
 
 def require_finite(run: ReducedRun) -> None:

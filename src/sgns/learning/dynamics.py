@@ -228,7 +228,7 @@ class LatentDynamics(Dynamics):
             return super().unroll(latent, body, context)
         stepper = self.stepper(body.position.shape[-2], context)
         if self.predicts_body:
-            return unrolled(stepper.advance, latent, body, self.predicts_body)  # a free body: nothing is held
+            return unrolled(stepper.advance, latent, body, self.predicts_body)
         d, frames = self.history, body.position.shape[1]
         states = torch.empty((1, frames, *latent.shape[2:]), dtype=torch.float64, device=latent.device)
         states[:, :d] = latent

@@ -181,11 +181,7 @@ class PathStepper:
         with torch.inference_mode():
             known = self.known(body)
             loads = self.load_mean.new_empty(len(states) - d, len(self.load_mean))
-            held = self.dynamics.held(body)
-            rests = None if held is None else held[0].tolist()
             for k, (features, places) in enumerate(zip(known.features[1:], known.places[1:], strict=True)):
                 latent = states[k : k + d]
                 states[k + d], loads[k] = self.outcome(self.decoded(latent, features, places), latent)
-                if rests is not None and rests[k + 1]:
-                    states[k + d] = latent[-1]
             return loads

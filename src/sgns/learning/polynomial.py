@@ -116,6 +116,7 @@ class PolynomialDynamics(Dynamics):
         )
         fewer.body_displacement, fewer.force, fewer.torque = self.body_displacement, self.force, self.torque
         fewer.bounds = self.bounds[:, held]
+        fewer.lowest, fewer.highest = self.lowest, self.highest
         rows = torch.nn.functional.pad(held, (1, 0), value=True)[self.terms].all(1)
         columns = torch.cat([self.weights[:, : 3 * num_modes], self.weights[:, 3 * r :]], dim=1)
         fewer.weights.copy_(columns[rows])

@@ -5,6 +5,7 @@ Shapes: B batch, d history positions, r modes, N body nodes, K context numbers, 
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -19,10 +20,8 @@ from sgns.learning.normalisation import Standardiser
 from sgns.learning.polynomial_settings import PolynomialSettings
 from sgns.learning.prediction import Path, Step
 
-__all__ = ["Dynamics", "Stepper", "resting", "unrolled"]
+__all__ = ["Dynamics", "Stepper", "unrolled"]
 
-# A body that moves less than this in a frame [m, rad] rests: round-off of poses, not motion.
-_STILL = 1e-9
 # No latent position goes further than this from its mean, in deviations; training runs stay within about half of it. It
 # keeps a rollout finite that has left everything the dynamics know.
 _REACH = 10.0
@@ -45,13 +44,15 @@ class Dynamics(nn.Module):
         predicts_body: Whether the body moves as the soil lets it (see `free_axes`).
 
     Attributes:
-        holds_rest: Whether the soil stays where it is while a prescribed body has rested for d frames. Slow dry soil
-            flows only while something drives it, but small errors of a step add up over minutes of rest.
+        lowest: Latent positions that no step goes below [m], shape (r, 3) or those of more modes; without bound until
+            the surrogate that it is a part of tells it.
+        highest: Likewise.
     """
 
     settings: ModelSettings | PolynomialSettings
     force: Standardiser
-    holds_rest: bool = True
+    lowest: Tensor
+    highest: Tensor
 
     def __init__(
         self,
@@ -65,6 +66,9 @@ class Dynamics(nn.Module):
         self.num_modes = num_modes
         self.context_keys = tuple(context)
         self.predicts_body = predicts_body
+        unbounded = torch.full((num_modes, 3), math.inf, dtype=torch.float64)
+        self.register_buffer("lowest", -unbounded, persistent=False)
+        self.register_buffer("highest", unbounded, persistent=False)
 
     @property
     def history(self) -> int:
@@ -95,7 +99,10 @@ class Dynamics(nn.Module):
     def reach(self) -> tuple[Tensor, Tensor]:
         """Smallest and largest latent positions that a step leads to [m], shape (r, 3) each."""
         mean, scale = self.latent_statistics()
-        return mean - _REACH * scale, mean + _REACH * scale
+        return (
+            torch.maximum(mean - _REACH * scale, self.lowest[: self.num_modes]),
+            torch.minimum(mean + _REACH * scale, self.highest[: self.num_modes]),
+        )
 
     @abstractmethod
     def advance(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Step:
@@ -130,16 +137,7 @@ class Dynamics(nn.Module):
             latent,
             body,
             self.predicts_body,
-            self.held(body),
         )
-
-    def held(self, body: BodyTrack) -> Tensor | None:
-        """In which windows of d frames of a track (B, T, N, ...) the soil is held, shape (B, T - d + 1); None: in
-        none."""
-        if not self.holds_rest or self.predicts_body:
-            return None
-        still = resting(body, self.history)
-        return still if bool(still.any()) else None
 
     def check_modes(self, num_modes: int) -> None:
         """For `with_modes`."""
@@ -176,17 +174,11 @@ class OwnStepper:
             return self.dynamics.advance(latent, body, self.context)
 
 
-def resting(body: BodyTrack, history: int) -> Tensor:
-    """Whether no node of a body (B, T, N, ...) moved in each window of d frames, shape (B, T - d + 1)."""
-    return (body.motion.abs() <= _STILL).flatten(2).all(2).unfold(1, history, 1).all(2)
-
-
 def unrolled(
     advance: Callable[[Tensor, BodyTrack], Step],
     latent: Tensor,
     body: BodyTrack,
     predicts_body: bool,
-    held: Tensor | None = None,
 ) -> Path:
     """Whole paths by steps that see what the steps before said.
 
@@ -195,7 +187,6 @@ def unrolled(
         latent: As for `Dynamics.unroll`.
         body: As for `Dynamics.unroll`.
         predicts_body: Whether the body goes where the steps say.
-        held: As `Dynamics.held`.
     """
     d, frames = latent.shape[1], body.position.shape[1]
     states = latent.new_empty((latent.shape[0], frames, *latent.shape[2:]), dtype=torch.float64)
@@ -207,8 +198,6 @@ def unrolled(
     for t in range(d, frames):
         step = advance(states[:, t - d : t], body.frames(slice(t - d + 1, t + 1)))
         states[:, t], force[:, t], torque[:, t] = step.latent, step.force, step.torque
-        if held is not None:
-            states[:, t] = torch.where(held[:, t - d + 1, None, None], states[:, t - 1], states[:, t])
         if predicts_body:
             body.motion[:, t, :, :3] = step.displacement
             body.position[:, t] = body.position[:, t - 1] + step.displacement

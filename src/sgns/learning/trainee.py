@@ -51,7 +51,6 @@ class TrainingSettings:
     normalisation_floor: float
     horizon: int
     fewer_modes: float
-    slower: float
     change_of: str
     loss: dict[str, float]
     validate_every: int
@@ -80,7 +79,6 @@ class TrainingSettings:
             ("decades", 0),
             ("horizon", 1),
             ("fewer_modes", 0),
-            ("slower", 0),
             ("validate_every", 1),
             ("log_every", 1),
             ("threads", 1),
@@ -95,11 +93,10 @@ class TrainingSettings:
         for key, weight in settings.loss.items():
             if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not 0 <= weight < math.inf:
                 raise UserError(f"training.loss.{key} is {weight!r}; it must be a number, 0 or more")
-        for key, of in (("fewer_modes", "steps"), ("slower", "windows")):
-            if getattr(settings, key) > 1:
-                raise UserError(
-                    f"training.{key} is {getattr(settings, key)}; allowed: 0 to 1, a share of the {of}"
-                )
+        if settings.fewer_modes > 1:
+            raise UserError(
+                f"training.fewer_modes is {settings.fewer_modes}; allowed: 0 to 1, a share of the steps"
+            )
         for key, allowed in (
             ("schedule", SCHEDULES),
             ("noise_unit", NOISE_UNITS),

@@ -40,6 +40,7 @@ from sgns.learning.stepping import Dynamics
 from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint, write_checkpoint
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.training_range import TrainingRange
+from sgns.learning.travel import slowest_travel
 from sgns.learning.validation import ValidationRollouts
 from sgns.poses import in_body_frame
 from sgns.reduction.reduced import ReducedDataset, ReducedRun, reduce_dataset
@@ -236,8 +237,12 @@ def surrogate_of(dynamics: Dynamics, reduced: ReducedDataset, card: dict[str, An
     basis = reduced.basis.sliced(dynamics.num_modes)
     sees_points = dynamics.settings.body_nodes == "points"
     known = TrainingRange.of(reduced.runs("train"), dynamics.num_modes, dynamics.context_keys, sees_points)
+    covered = {
+        "training_range": known.plain(),
+        "slowest_travel": slowest_travel(reduced.runs("train")),
+    }
     start = torch.as_tensor(reduced.start_positions)
-    return Surrogate(dynamics, basis, start, points, card | {"training_range": known.plain()})
+    return Surrogate(dynamics, basis, start, points, card | covered)
 
 
 def prepared(
@@ -253,7 +258,7 @@ def prepared(
     runs = reduced.runs("train")
     context = tuple(varying_context(runs, model.context))
     windows = TrainingWindows(
-        runs, num_modes, model.history, model.body_nodes, seed, settings.horizon, context, settings.slower
+        runs, num_modes, model.history, model.body_nodes, seed, settings.horizon, context
     )
     dynamics = LatentDynamics(model, num_modes, context, moves_freely(runs))
     noise = fit_normalisation(
@@ -305,8 +310,8 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
     if not found:
         return ""
     there = read_checkpoint(found[0])["hyper_parameters"].get("settings", {})
-    if isinstance(there.get("training"), dict) and "max_steps" in there["training"]:
-        there["training"].setdefault("slower", 0.0)  # a key of later
+    if isinstance(there.get("training"), dict) and not there["training"].get("slower"):
+        there["training"].pop("slower", None)  # a key of before that did nothing at 0
     if different := differences(there, asked):
         key, (old, new) = next(iter(different.items()))
         more = f" (and {len(different) - 1} more)" if len(different) > 1 else ""

@@ -27,6 +27,7 @@ NOTEWORTHY = 0.05
 _FLOOR = 0.1
 _AXES = ("x", "y", "z")
 _POINTS = "the number of the tool's points"
+_SOIL = "the soil's state"
 
 
 class Excess(NamedTuple):
@@ -117,6 +118,11 @@ class TrainingRange:
             for side in ("low", "high")
         }
 
+    def soil(self, margin: float) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest modes, one after another [m], so many widths of their range outside of it."""
+        low, high = (side[_SOIL] for side in (self.low, self.high))
+        return low - margin * widths(low, high), high + margin * widths(low, high)
+
     def excess(
         self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, context: Mapping[str, float]
     ) -> Excess:
@@ -157,7 +163,7 @@ def quantities(
         "the tool's orientation": track.orientation[:, 0].numpy(),
         "the tool's displacement per frame": moved[:, :3],
         "the tool's rotation per frame": moved[:, 3:],
-        "the soil's state": latent,
+        _SOIL: latent,
         "the soil's velocity": velocity,
         **{key: np.full((len(place), 1), value) for key, value in context.items()},
     }

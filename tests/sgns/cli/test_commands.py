@@ -100,7 +100,7 @@ def test_settings_of_a_command(command: str) -> None:
     )
     own = {
         "simulate": {"continue_from", "shard", "shards"},
-        "rollout": {"num_modes", "hold_at_rest"},
+        "rollout": {"num_modes", "rate_independent"},
         "evaluate": {"split", "num_modes", "new_rollouts", "timing_repeats", "full_space"},
         "frontier": {"study", "axis"},
         "advise": {"task", "error", "time", "particles", "against", "table"},

@@ -10,7 +10,7 @@ import torch
 from tiny import MODEL, reduced
 
 from sgns.errors import UserError
-from sgns.learning.data import NoiseScales, TrainingWindows, generator, random_walk, slowed
+from sgns.learning.data import NoiseScales, TrainingWindows, generator, random_walk
 from sgns.learning.dynamics import LatentDynamics
 from sgns.learning.model_settings import ModelSettings
 from sgns.learning.statistics import fit_normalisation
@@ -172,33 +172,3 @@ def test_normalised_training_quantities_are_of_order_one(data) -> None:
     assert float(dynamics.force.normalise(batch.force).abs().max()) < 10
     assert torch.isfinite(dynamics.body_motion.normalise(batch.body.motion)).all()
     assert torch.isfinite(dynamics.body_orientation.normalise(batch.body.orientation)).all()
-
-
-def test_a_slower_window_is_interpolated(data) -> None:
-    """Half as fast: the frames half-way between; as fast: the window itself; at rest: its newest frame."""
-    windows = TrainingWindows(data.runs("train"), 4, 3, "pose", horizon=2)
-    batch = windows.windows(windows.targets[8:11])
-    half = slowed(batch, torch.full((3,), 0.5, dtype=torch.float64))
-    torch.testing.assert_close(half.latent[:, 2], batch.latent[:, 2])
-    torch.testing.assert_close(half.latent[:, 0], batch.latent[:, 1])
-    torch.testing.assert_close(half.latent[:, 3], batch.latent[:, 2:4].mean(1))
-    torch.testing.assert_close(half.body.position[:, 1], batch.body.position[:, 1])
-    torch.testing.assert_close(half.body.motion[:, 2:], 0.5 * batch.body.motion[:, 2:3].expand(-1, 2, -1, -1))
-    # Position and motion still belong together.
-    torch.testing.assert_close(half.body.position.diff(dim=1), half.body.motion[:, 1:, :, :3])
-    same = slowed(batch, torch.ones(3, dtype=torch.float64))
-    for a, b in zip((same.latent, *same.body), (batch.latent, *batch.body), strict=True):
-        torch.testing.assert_close(a, b)
-    rest = slowed(batch, torch.zeros(3, dtype=torch.float64))
-    torch.testing.assert_close(rest.latent, batch.latent[:, 2:3].expand_as(rest.latent))
-    assert not rest.body.motion.any()
-    torch.testing.assert_close(rest.following, batch.latent[:, 2:3].expand(-1, 2, -1, -1))
-
-
-def test_as_many_windows_are_slower_as_asked_for(data) -> None:
-    runs = data.runs("train")
-    plain, some, all_ = (TrainingWindows(runs, 4, 3, "pose", slower=share) for share in (0.0, 0.3, 1.0))
-    clean, third, whole = (windows.batch(5, 2000, still()).latent for windows in (plain, some, all_))
-    differ = [(other != clean).flatten(1).any(1).double().mean() for other in (third, whole)]
-    assert differ[0] == pytest.approx(0.3, abs=0.05) and differ[1] > 0.95
-    assert torch.equal(third, some.batch(5, 2000, still()).latent)

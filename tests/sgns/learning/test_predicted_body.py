@@ -52,6 +52,18 @@ def test_rollout_is_stepping_and_needs_no_height(trained, kind) -> None:
         np.testing.assert_allclose(state.pose, rollout.poses[t], rtol=0, atol=1e-6)
 
 
+def test_soil_under_a_wheel_follows_the_clock(trained) -> None:
+    """A wheel that rests may still sink."""
+    data, folder = trained
+    path = data.runs("test")[0].pose[:1].repeat(20, axis=0)
+    found, own = (
+        Simulator.load(folder / "pose" / "best.ckpt", rate_independent=follows).rollout(path)
+        for follows in (True, False)
+    )
+    np.testing.assert_array_equal(found.latent, own.latent)
+    assert (np.diff(found.latent, axis=0) != 0).any(axis=(1, 2)).all()
+
+
 def test_the_prescribed_part_is_kept(trained) -> None:
     data, folder = trained
     run = data.runs("test")[0]

@@ -1,0 +1,91 @@
+"""When soil takes a step: with the tool's travel, with the clock, not at all."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from tiny import reduced
+
+from sgns.learning.travel import Travel, markers, slowest_travel, stepped_frames
+
+
+def line(*steps: float) -> np.ndarray:
+    """One marker along x by these steps [m], shape (T, 1, 3)."""
+    path = np.zeros((len(steps) + 1, 1, 3))
+    path[1:, 0, 0] = np.cumsum(steps)
+    return path
+
+
+def test_a_slow_tool_steps_by_its_travel() -> None:
+    frames = stepped_frames(line(*[0.3] * 10), 1, 1.0, 5)
+    np.testing.assert_array_equal(frames, [0, 4, 8])
+
+
+def test_a_fast_tool_steps_in_every_frame() -> None:
+    np.testing.assert_array_equal(stepped_frames(line(*[1.0] * 10), 1, 1.0, 5), np.arange(11))
+
+
+def test_soil_settles_after_a_fast_tool() -> None:
+    frames = stepped_frames(line(0.0, 0.0, 2.0, *[0.0] * 9, 0.5, 0.5), 1, 1.0, 4)
+    np.testing.assert_array_equal(frames, [0, 3, 4, 5, 6, 14])
+
+
+def test_shaking_is_no_travel_unless_it_is_far() -> None:
+    assert len(stepped_frames(line(*[0.9, -0.9] * 10), 1, 1.0, 5)) == 1
+    assert len(stepped_frames(line(*[0.5, 0.5, -0.5, -0.5] * 5), 1, 1.0, 5)) == 11
+
+
+def test_given_frames_are_all_seen_and_say_how_the_tool_moves() -> None:
+    path = line(0.1, 2.0, *[0.0] * 8)
+    np.testing.assert_array_equal(stepped_frames(path, 3, 1.0, 4), [0, 1, 2, 3, 4, 5])
+    np.testing.assert_array_equal(stepped_frames(line(*[0.4] * 8), 3, 1.0, 4), [0, 1, 2, 5, 8])
+
+
+def test_nothing_is_slower_than_rest() -> None:
+    """Without a known pace only a tool at rest is slow."""
+    frames = stepped_frames(line(*[1e-6] * 3, *[0.0] * 6), 1, 0.0, 2)
+    np.testing.assert_array_equal(frames, [0, 1, 2, 3, 4])
+
+
+def test_turning_is_travel_of_the_points() -> None:
+    angle = np.radians(1.0) * np.arange(20)
+    poses = np.zeros((20, 7))
+    poses[:, 5], poses[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
+    points = 0.2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)[:, None]
+    frames = stepped_frames(markers(poses, points), 1, 0.2 * np.radians(2.5), 5)
+    np.testing.assert_array_equal(frames, np.arange(0, 20, 3))
+    # A body without points shows its centre of mass only.
+    assert len(stepped_frames(markers(poses, points[:, :0]), 1, 0.01, 5)) == 1
+
+
+def test_travel_is_not_changed_by_looking_ahead() -> None:
+    here = Travel.along(line(0.5), 1.0, 5)
+    assert here.moved(line(1.5)[1]).steps and not here.moved(line(0.75)[1]).steps
+    np.testing.assert_array_equal(here.stepped, line(0.5)[1])
+
+
+def test_the_slowest_travel_is_a_pace_not_a_stop(tmp_path) -> None:
+    runs = reduced(tmp_path).runs("train")
+    moved = np.concatenate([np.linalg.norm(np.diff(run.pose[:, :3], axis=0), axis=1) for run in runs])
+    known = slowest_travel(runs)
+    assert known == pytest.approx(moved.min(), rel=0.02)
+    # Frames at rest do not count, and the one in which the tool stops is one among many.
+    first = runs[0]
+    fast, end = first.pose.repeat(1, axis=0), first.pose[-1:].copy()
+    end[:, 0] += 1e-5
+    shift = end[:, None, :3] - first.pose[-1:, None, :3]
+    stopping = dataclasses.replace(
+        first,
+        pose=np.concatenate([fast, end.repeat(30, axis=0)]),
+        body_points=np.concatenate([first.body_points, (first.body_points[-1:] + shift).repeat(30, axis=0)]),
+    )
+    many = [first] * 20
+    assert slowest_travel([stopping, *many]) == pytest.approx(slowest_travel(many), rel=0.05)
+    still = dataclasses.replace(
+        first,
+        pose=first.pose[:1].repeat(14, axis=0),
+        body_points=first.body_points[:1].repeat(14, axis=0),
+    )
+    assert slowest_travel([still]) == 0.0
