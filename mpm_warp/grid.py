@@ -36,6 +36,7 @@ def grid_struct(real: type) -> type:
         )
         particle_mass: real  # [kg]
         particle_volume: real  # at the critical density [m^3]
+        density_per_mass: real  # of a node: soil's density there over that of an undisturbed bed [1/kg]
         speed_limit: real  # one cell per step [m/s]
 
     return Grid
@@ -45,8 +46,8 @@ def grid_struct(real: type) -> type:
 def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
     """Kernels on the nodes in precision `real`.
 
-    - `begin`: momentum and mass to velocity, 1 / mass and the density over the critical one after a remap. A node on
-      a wall sees half of what is around it; soil is taken to go on beyond.
+    - `begin`: momentum and mass to velocity, 1 / mass and the density over that of an undisturbed bed after a remap.
+      A node on a wall sees half of what is around it; soil is taken to go on beyond.
     - `step`: velocity from the step's impulse and gravity, walls and floor; counts the step.
 
     Both clear what they have used for the next sum. `walls` are the kinds of x walls, y walls and floor
@@ -116,8 +117,7 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
         momentum[n] = vec4()
         impulse[n] = vec4()
         velocity[n] = result
-        per_cell = grid.particle_volume * grid.inverse_spacing * grid.inverse_spacing * grid.inverse_spacing
-        result[3] = mass * per_cell / grid.particle_mass * walls_seen(n, grid)
+        result[3] = mass * grid.density_per_mass * walls_seen(n, grid)
         before[n] = result
         inverse_mass[n] = inverse
 

@@ -17,8 +17,7 @@ from .splines import splines
 __all__ = ["loose"]
 
 DENSE = 0.98
-"""Density over the critical one from which on a node counts as dense: below that of a bed at rest by more than
-round-off."""
+"""Share of an undisturbed bed's density from which on a node counts as dense: less than 1 by more than round-off."""
 
 
 @cache
@@ -26,8 +25,9 @@ def loose(real: type) -> SimpleNamespace:
     """Warp function `volume(ln_j, first, f, nodes, grid)` in precision `real`: ln J of a particle that bears no stress.
 
     `first` is the lowest of its 27 nodes, `f` its offset from there [cells], and the fourth number of `nodes` is the
-    density over the critical one. With a dense node among them the particle is at a surface, or next to a body, where
-    the mean density says how much soil is missing around it and nothing about the particle: its own ln J holds.
+    density over that of an undisturbed bed. With a dense node among them the particle is at a surface, or next to a
+    body, where the mean density says how much soil is missing around it and nothing about the particle: its own ln J
+    holds.
     """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     Grid, weights = grid_struct(real), splines(real).weights
