@@ -36,6 +36,7 @@ def grid_struct(real: type) -> type:
         )
         particle_mass: real  # [kg]
         particle_volume: real  # at the critical density [m^3]
+        density_per_mass: real  # of a node: soil's density there over that of an undisturbed bed [1/kg]
         speed_limit: real  # one cell per step [m/s]
 
     return Grid
@@ -45,7 +46,8 @@ def grid_struct(real: type) -> type:
 def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
     """Kernels on the nodes in precision `real`.
 
-    - `begin`: momentum and mass to velocity and 1 / mass after a remap.
+    - `begin`: momentum and mass to velocity, 1 / mass and the density over that of an undisturbed bed after a remap.
+      A node on a wall sees half of what is around it; soil is taken to go on beyond.
     - `step`: velocity from the step's impulse and gravity, walls and floor; counts the step.
 
     Both clear what they have used for the next sum. `walls` are the kinds of x walls, y walls and floor
@@ -77,6 +79,23 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
     conditions = {"no_slip": no_slip, "slip": slip, "friction": rub, "periodic": slip}
     at_x, at_y, at_floor = (conditions[kind] for kind in walls)
 
+    @wp.func
+    def place(n: int, grid: Grid):
+        # `/` of whole numbers is one instruction; `//` and `%` follow Python's rule for negative numbers.
+        column = n / grid.nz
+        i = column / grid.ny
+        return wp.vec3i(i, column - i * grid.ny, n - column * grid.nz)
+
+    @wp.func
+    def walls_seen(n: int, grid: Grid):
+        # The whole around a node over the part of it within the walls.
+        at = place(n, grid)
+        share = real(1.0)
+        for axis in range(3):
+            if at[axis] == grid.low[axis] or at[axis] == grid.high[axis]:
+                share *= real(2.0)
+        return share
+
     @scene_kernel()
     def begin(
         n: int,
@@ -98,6 +117,7 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
         momentum[n] = vec4()
         impulse[n] = vec4()
         velocity[n] = result
+        result[3] = mass * grid.density_per_mass * walls_seen(n, grid)
         before[n] = result
         inverse_mass[n] = inverse
 
@@ -118,11 +138,10 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
             now = velocity[n] + inverse * change
             impulse[n] = vec4()
             v = vec3(now[0], now[1], now[2]) + grid.dt * grid.gravity
-            # `/` of whole numbers is one instruction; `//` and `%` follow Python's rule for negative numbers.
-            column = n / grid.nz
-            i = column / grid.ny
-            j = column - i * grid.ny
-            k = n - column * grid.nz
+            at = place(n, grid)
+            i = at[0]
+            j = at[1]
+            k = at[2]
             low = grid.low
             high = grid.high
             rough = grid.wall_friction

@@ -60,5 +60,6 @@ def lay_grid(
     grid.wall_friction = vec3(*bed.walls.friction)
     grid.particle_volume = particle_volume
     grid.particle_mass = particle_volume * scene.material.bulk_density
+    grid.density_per_mass = 1.0 / (scene.material.bulk_density * h**3 * bed.filling)
     grid.speed_limit = h / time_step
     return grid, ghosts

@@ -108,6 +108,14 @@ class Bed:
             self.mirrored,
         )
 
+    @property
+    def filling(self) -> float:
+        """Share of the bin below the surface that its particles fill [-]: 1, but for random points that keep apart."""
+        positions, volume = arrange(
+            self.arrangement, self.size, self.particle_spacing, self.seed, self.mirrored
+        )
+        return len(positions) * volume / float(np.prod(self.size))
+
     @cached_property
     def stored(self) -> np.ndarray:
         """Indices of the particles of a full bed that are recorded; see `stored_of`."""

@@ -289,7 +289,9 @@ class Solver:
                 kernels.material, n, felt, c, e, ln_j, self._stress, self._swelling, self._excess, grid, soil
             ),
         ]
-        self._from_grid = self._record(kernels.from_grid, n, home, felt, v, grid, self._before, self._keep)
+        self._from_grid = self._record(
+            kernels.from_grid, n, home, felt, v, grid, self._before, self._keep, ln_j
+        )
         self._remap = Program(self._to_grid)
         self._until_remap = Program(self._begin, self._step, [self._from_grid])
 

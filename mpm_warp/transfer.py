@@ -21,6 +21,7 @@ from .effects import Effects
 from .fluidity import fluidity
 from .grid import grid_struct
 from .launches import scene_kernel
+from .loose import loose
 from .rows import rows
 from .soil import soil_struct
 from .splines import splines
@@ -48,6 +49,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
     push = contact(real, touch or ContactLaw(), atomic).push
     update, kirchhoff = law.update, law.kirchhoff
     fading = fluidity(real, effects).fading
+    loose_volume = loose(real).volume
     spline = splines(real)
     base_and_offset, weights, moments = spline.base_and_offset, spline.weights, spline.moments
     lanes = rows(real, gpu=atomic)
@@ -230,14 +232,21 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         before = e[p]
         # Volume changes as the mean over the nodes around does: what a particle's own gradient says besides is noise,
         # and is taken back within the time a wave needs for a cell. `swelling` is the sum of its recent changes, and
-        # felt[p][3] the mean of that.
+        # felt[p][3] the mean of that. Soil that bears no stress has no say in it and repeats the mean: its changes are
+        # large, and shared out they would compress the dense soil that it falls on.
         recent = swelling[p]
         volume_before = ln_j[p] + grid.volume_averaging * grid.forgetting * (felt[p][3] - recent)
+        if wp.static(effects.separation):
+            if ln_j[p] >= real(0.0):
+                volume_before = ln_j[p]
         state = update(before, volume_before, grid.dt * c[p], grid.dt, soil, g)
         after = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
         e[p] = after
         ln_j[p] = state[6]
         swelling[p] = (real(1.0) - grid.forgetting) * recent + state[6] - volume_before
+        if wp.static(effects.separation):
+            if volume_before >= real(0.0) or state[6] >= real(0.0):
+                swelling[p] = (real(1.0) - grid.forgetting) * felt[p][3]
         if wp.static(effects.fluidity):
             soil.g[p] = state[7]
         # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone. It
@@ -257,6 +266,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         grid: Grid,
         before: wp.array(dtype=vec4),
         keep: wp.array(dtype=real),
+        ln_j: wp.array(dtype=real),
     ):
         # The particle's own velocity changes by what changed on the grid; of the part that the grid does not resolve
         # the share `keep` is left.
@@ -269,6 +279,9 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
                 total = plus(total, wx[i] * wy[j], gather_row(before, node_index(base, i, j, grid)))
         smooth = fold(weights(f[2]), total)
         u = vec3(felt[p][0], felt[p][1], felt[p][2])
+        if wp.static(effects.separation):
+            if ln_j[p] > real(0.0):
+                ln_j[p] = loose_volume(ln_j[p], node_index(base, 0, 0, grid), f, before, grid)
         v[p] = u + keep[0] * (v[p] - vec3(smooth[0], smooth[1], smooth[2]))
 
     return SimpleNamespace(

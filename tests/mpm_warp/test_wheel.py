@@ -84,12 +84,14 @@ def test_damped_fall_reaches_its_terminal_speed():
 
 @pytest.mark.parametrize("kw", [{}, {"gravity": 1.62, "settle": 1.0}, {"bilateral": True, "friction": 3.0}])
 def test_a_wheel_at_rest_carries_its_load(kw):
-    scene = wheel(**kw)
+    scene = wheel(
+        start=0.5, **kw
+    )  # anywhere else the lattice is not the same on both sides, and friction holds that
     frames = list(Solver(scene).frames())
-    rest = frames[len(frames) // 2 :]
+    rest = frames[len(frames) // 2 : -1]
     force = np.mean([f.force for f in rest], axis=0)
     assert force[2] == pytest.approx(scene.load, rel=0.02)
-    assert np.abs(force[:2]).max() < 0.02 * scene.load
+    assert np.abs(force[:2]).max() < 0.002 * scene.load
     z = np.array([f.body_pose[2] for f in rest])
     assert np.ptp(z) < 0.002
     assert 0.0 < scene.sinkage(frames[-1].body_pose[None])[0] < 0.03
