@@ -365,6 +365,16 @@ def test_a_checkpoint_that_is_not_finite_is_refused(trained, tmp_path) -> None:
         Simulator.load(tmp_path / "bad.ckpt")
 
 
+@pytest.mark.parametrize("rate", [float("inf"), float("nan"), 0.0, -60.0])
+def test_a_checkpoint_without_a_frame_rate_is_refused(trained, tmp_path, rate) -> None:
+    _, folder = trained
+    content = torch.load(folder / "pose" / "best.ckpt", weights_only=True)
+    content["hyper_parameters"]["frame_rate"] = rate
+    torch.save(content, tmp_path / "bad.ckpt")
+    with pytest.raises(UserError, match="frame rate is"):
+        Simulator.load(tmp_path / "bad.ckpt")
+
+
 @pytest.mark.parametrize("kind", ["pose", "points"])
 def test_nothing_runs_away_far_from_everything(trained, kind) -> None:
     data, folder = trained
