@@ -311,8 +311,8 @@ class Solver:
                 share * grid.particle_mass,
                 share * grid.particle_volume,
             )
-            its_body.stiffness, its_body.damping = share * body.stiffness, share * body.damping
             if self._body is not None:
+                its_body.stiffness, its_body.damping = share * body.stiffness, share * body.damping
                 its_body.stick = body.stick[part]
             yield part, its_grid, its_body
 

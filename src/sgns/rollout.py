@@ -271,6 +271,8 @@ def main(cfg: DictConfig) -> float:
     from sgns.scenes import scene_from_config
     from sgns.simulator import Simulator
 
+    if not isinstance(cfg.rate_independent, bool):
+        raise UserError(f"rate_independent is {cfg.rate_independent!r}; it must be true or false")
     scene = scene_from_config(cfg)
     simulator = Simulator.load(
         cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes, rate_independent=cfg.rate_independent

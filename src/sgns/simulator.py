@@ -203,21 +203,24 @@ class Simulator:
             UserError: The pose is not finite or its quaternion not of unit length, or the answer is not finite.
         """
         pose = check_poses(tool_pose, f"tool pose of frame {self._frame + 1}")[0]
-        if not self._poses:
-            self._poses, self._shown = [pose] * self.history, [(pose, self._shown[-1][1])]
-        before = self._travel or Travel.along(self._markers(self._poses), *self._pace)
+        poses, shown = self._poses, self._shown[-1]
+        if not poses:
+            poses, shown = [pose] * self.history, (pose, shown[1])
+        before = self._travel or Travel.along(self._markers(poses), *self._pace)
         travel = before.moved(self._markers([pose])[0])
         if travel.steps or not self._follows_travel:
-            pose = self._step_soil(pose)
-        self._travel = travel
-        self._shown = [self._shown[-1], (pose, self._latent[0, -1].cpu().numpy())]
+            pose = self._step_soil(poses, pose)
+            poses = [*poses[1:], pose]
+        self._poses, self._travel = poses, travel
+        self._shown = [shown, (pose, self._latent[0, -1].cpu().numpy())]
         self._frame += 1
         return self._state()
 
-    def _step_soil(self, pose: np.ndarray) -> np.ndarray:
-        """Let the network take a step; returns where the tool is then."""
+    def _step_soil(self, poses: Sequence[np.ndarray], pose: np.ndarray) -> np.ndarray:
+        """Let the network take a step after d poses; returns where the tool is then. What is not finite changes
+        nothing."""
         # One frame more than the network sees, because the first motion needs a frame before it.
-        window = np.stack([*self._poses, pose])
+        window = np.stack([*poses, pose])
         body = self._track(window, in_world_frame(window, self._points)).frames(slice(1, None))
         with torch.inference_mode():
             step = self._stepper.advance(self._latent, body)
@@ -226,7 +229,6 @@ class Simulator:
         if self.predicts_body:
             there = body.position[0, -2] + step.displacement[0]
             pose = self._predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
-        self._poses = [*self._poses[1:], pose]
         self._load = step.force[0].cpu().numpy(), step.torque[0].cpu().numpy()
         return pose
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mpm_warp import Bed, Effects, Scene, Solver
+from mpm_warp import Bed, Effects, Scene, Solver, Walls
 
 GROWTH = 1e-3  # 1/s, just enough for a sign
 
@@ -56,6 +56,30 @@ def test_loose_soil_is_as_loose_as_the_grid_sees(stretch, precision):
     loose = inner & (ln_j > 0.0)
     assert loose.sum() > 0.9 * inner.sum()
     np.testing.assert_allclose(ln_j[loose], 3.0 * np.log(stretch), atol=0.03)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize(
+    ("walls", "symmetry"), [("slip", False), ("slip", True), ("periodic", False), (0.5, False)]
+)
+def test_an_undisturbed_bed_is_dense_up_to_its_walls(walls, symmetry, precision):
+    """At walls and floor, across a seam and a plane of symmetry: every node below the surface sees a density of 1."""
+    x_walls, y_walls = walls, "slip" if symmetry else walls
+    bed = Bed(size=(0.2, 0.24, 0.1), spacing=0.02, initial_stress="none", walls=Walls(x_walls, y_walls))
+    scene = Scene(bed=bed, gravity=0.0, duration=1.0 / 60.0)
+    solver = Solver(scene, Effects(symmetry=symmetry), precision=precision)
+    list(solver.frames())
+    grid = solver._grid
+    density = solver._before.numpy()[:-1, 3].reshape(grid.nx, grid.ny, grid.nz)
+    heights = float(grid.origin[2]) + bed.spacing * np.arange(grid.nz)
+    below = (heights > -0.1 - 1e-6) & (heights < -1e-6)
+    inside = []
+    for axis, count in enumerate((grid.nx, grid.ny)):
+        places = float(grid.origin[axis]) + bed.spacing * np.arange(count)
+        inside.append((places > -1e-6) & (places < bed.size[axis] + 1e-6))
+    known = density[np.ix_(*inside, below)]
+    assert known.shape == (11, 9 if symmetry else 13, 5)
+    np.testing.assert_allclose(known, 1.0, rtol=1e-5)
 
 
 def test_soil_near_dense_soil_keeps_its_own_volume():

@@ -42,9 +42,10 @@ def test_half_is_whole(bed, on_plane):
     assert size > 10.0
 
 
-def test_a_column_is_symmetric_too():
+@pytest.mark.parametrize("width", [0.30, 0.31])  # without and with particles on the plane
+def test_a_column_is_symmetric_too(width):
     # The time between remaps is bounded so that it does not hang on the last digit of the top speed.
-    bed = Bed(size=(0.3, 0.3, 0.05), spacing=0.01, headroom=0.03)
+    bed = Bed(size=(0.3, width, 0.05), spacing=0.01, headroom=0.03)
     scene = Column(bed=bed, radius=0.05, duration=0.1, remap_time=1e-3)
     one, two = (
         list(Solver(scene, Effects(symmetry=on), precision="float64").frames())[-1] for on in (False, True)

@@ -84,11 +84,10 @@ def test_damped_fall_reaches_its_terminal_speed():
 
 @pytest.mark.parametrize("kw", [{}, {"gravity": 1.62, "settle": 1.0}, {"bilateral": True, "friction": 3.0}])
 def test_a_wheel_at_rest_carries_its_load(kw):
-    scene = wheel(
-        start=0.5, **kw
-    )  # anywhere else the lattice is not the same on both sides, and friction holds that
+    # Anywhere else the lattice is not the same on both sides, and friction holds that.
+    scene = wheel(start=0.5, **kw)
     frames = list(Solver(scene).frames())
-    rest = frames[len(frames) // 2 : -1]
+    rest = frames[len(frames) // 2 : -1]  # in the last one it is driven
     force = np.mean([f.force for f in rest], axis=0)
     assert force[2] == pytest.approx(scene.load, rel=0.02)
     assert np.abs(force[:2]).max() < 0.002 * scene.load

@@ -365,6 +365,16 @@ def test_a_checkpoint_that_is_not_finite_is_refused(trained, tmp_path) -> None:
         Simulator.load(tmp_path / "bad.ckpt")
 
 
+@pytest.mark.parametrize("rate", [float("inf"), float("nan"), 0.0, -60.0])
+def test_a_checkpoint_without_a_frame_rate_is_refused(trained, tmp_path, rate) -> None:
+    _, folder = trained
+    content = torch.load(folder / "pose" / "best.ckpt", weights_only=True)
+    content["hyper_parameters"]["frame_rate"] = rate
+    torch.save(content, tmp_path / "bad.ckpt")
+    with pytest.raises(UserError, match="frame rate is"):
+        Simulator.load(tmp_path / "bad.ckpt")
+
+
 @pytest.mark.parametrize("kind", ["pose", "points"])
 def test_nothing_runs_away_far_from_everything(trained, kind) -> None:
     data, folder = trained
@@ -392,3 +402,18 @@ def test_an_answer_that_is_not_finite_stops_and_keeps_the_frame_before(trained) 
     state = simulator.step(path[3])
     assert state.frame == 3
     np.testing.assert_array_equal(state.latent, expected.latent[3])
+
+
+def test_a_first_pose_that_is_refused_is_forgotten(trained) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / "pose" / "best.ckpt", rate_independent=False)
+    pose = data.runs("test")[0].pose[0]
+    far = pose.copy()
+    far[0] = 1e300
+    with pytest.raises(UserError, match="not finite at frame 1"):
+        simulator.step(far)
+    state = simulator.step(pose)
+    simulator.reset()
+    expected = simulator.step(pose)
+    assert state.frame == 1 and state.outside == expected.outside
+    np.testing.assert_array_equal(state.latent, expected.latent)

@@ -192,7 +192,8 @@ def load_surrogate(path: str | Path) -> Surrogate:
         basis = Basis.from_state(card["basis"] | tensors, where=str(path))
         surrogate = Surrogate(dynamics_of(card), basis, state["start_positions"], state["body_points"], card)
         surrogate.load_state_dict(state)
-        surrogate.frame_rate  # noqa: B018  (present and a number)
+        if not 0.0 < surrogate.frame_rate < math.inf:
+            raise ValueError(f"the frame rate is {surrogate.frame_rate} Hz")
         if not all(bool(value.isfinite().all()) for value in state.values() if value.is_floating_point()):
             raise ValueError("it holds numbers that are not finite")
     except UserError as error:

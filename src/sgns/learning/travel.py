@@ -70,6 +70,8 @@ def stepped_frames(path: np.ndarray, given: int, least: float, settling: int) ->
         settling: See `Travel`.
     """
     travel = Travel.along(path[:given], least, settling)
+    if (distance(path[given:], path[given - 1 : -1]) >= travel.least).all():
+        return np.arange(len(path))  # as most paths; one by one it takes as long as the steps of many paths
     frames = list(range(given))
     for t in range(given, len(path)):
         travel = travel.moved(path[t])

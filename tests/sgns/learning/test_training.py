@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 from dataclasses import replace
@@ -82,6 +83,17 @@ def test_other_settings_do_not_mix(data, tmp_path) -> None:
     with pytest.raises(UserError, match=r"training\.learning_rate is 0\.001 there and 0\.002 here"):
         run(data, tmp_path, learning_rate=2e-3)
     run(data, tmp_path, learning_rate=2e-3, resume=False)
+
+
+def test_a_training_from_before_goes_on_if_it_had_no_slower_windows(data, tmp_path) -> None:
+    run(data, tmp_path)
+    content = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    for slower, words in ((0.0, None), (0.3, r"training\.slower is 0\.3 there")):
+        content["hyper_parameters"]["settings"]["training"]["slower"] = slower
+        torch.save(content, tmp_path / "last.ckpt")
+        (tmp_path / "training.json").unlink()
+        with pytest.raises(UserError, match=words) if words else contextlib.nullcontext():
+            run(data, tmp_path)
 
 
 def test_the_last_step_is_judged_even_if_odd(data, tmp_path) -> None:

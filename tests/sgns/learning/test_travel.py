@@ -23,8 +23,9 @@ def test_a_slow_tool_steps_by_its_travel() -> None:
     np.testing.assert_array_equal(frames, [0, 4, 8])
 
 
-def test_a_fast_tool_steps_in_every_frame() -> None:
-    np.testing.assert_array_equal(stepped_frames(line(*[1.0] * 10), 1, 1.0, 5), np.arange(11))
+@pytest.mark.parametrize("given", [1, 3, 11])
+def test_a_fast_tool_steps_in_every_frame(given) -> None:
+    np.testing.assert_array_equal(stepped_frames(line(*[1.0] * 10), given, 1.0, 5), np.arange(11))
 
 
 def test_soil_settles_after_a_fast_tool() -> None:

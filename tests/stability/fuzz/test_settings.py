@@ -141,9 +141,10 @@ def test_yaml_of_settings(empty_folder, good, nothing_long) -> None:
             ["simulate", "scene=body", "scene.path=path.csv", "scene.tool.shape={}"],
             "tool.shape is {}; allowed",
         ),
+        (["rollout", "checkpoint=a.ckpt", "rate_independent=nope"], "rate_independent is 'nope'; it must be"),
     ],
 )
-def test_what_once_ended_in_a_traceback(arguments, words, empty_folder) -> None:
+def test_what_was_once_a_traceback_or_taken_for_something_else(arguments, words, empty_folder) -> None:
     (empty_folder / "path.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0.1,0.1,0.1,0,0,0,1\n")
     status, said = call(*arguments)
     assert status == 2 and said.count("\n") == 1 and words in said, said
