@@ -16,13 +16,19 @@ from .splines import splines
 
 __all__ = ["loose"]
 
-DENSE = 0.98
-"""Share of an undisturbed bed's density from which on a node counts as dense: less than 1 by more than round-off."""
+LOOSE, DENSE = 0.9, 0.98
+"""Shares of an undisturbed bed's density between which a node comes to count as dense: at rest it does, whatever
+the round-off, and nothing jumps where soil comes apart."""
+APART = 0.005
+"""ln J from which on soil has no say at all in the mean volume change."""
 
 
 @cache
 def loose(real: type) -> SimpleNamespace:
-    """Warp function `volume(ln_j, first, f, nodes, grid)` in precision `real`: ln J of a particle that bears no stress.
+    """Warp functions in precision `real` for particles with ln J > 0, which bear no stress:
+
+    - `apart(ln_j)`: 0 for dense soil to 1 for soil that is loose for good,
+    - `volume(ln_j, first, f, nodes, grid)`: its ln J.
 
     `first` is the lowest of its 27 nodes, `f` its offset from there [cells], and the fourth number of `nodes` is the
     density over that of an undisturbed bed. With a dense node among them the particle is at a surface, or next to a
@@ -33,18 +39,27 @@ def loose(real: type) -> SimpleNamespace:
     Grid, weights = grid_struct(real), splines(real).weights
 
     @wp.func
+    def ramp(x: real, low: real, high: real):
+        return wp.clamp((x - low) / (high - low), real(0.0), real(1.0))
+
+    @wp.func
+    def apart(ln_j: real):
+        return ramp(ln_j, real(0.0), real(APART))
+
+    @wp.func
     def volume(ln_j: real, first: int, f: vec3, nodes: wp.array(dtype=vec4), grid: Grid):
         wx = weights(f[0])
         wy = weights(f[1])
         wz = weights(f[2])
         mean = real(0.0)
+        densest = real(0.0)
         for i in range(3):
             for j in range(3):
                 for k in range(3):
                     density = nodes[first + (i * grid.ny + j) * grid.nz + k][3]
-                    if density > real(DENSE):
-                        return ln_j
+                    densest = wp.max(densest, density)
                     mean += wx[i] * wy[j] * wz[k] * density
-        return -wp.log(wp.max(mean, real(1.0e-6)))
+        own = ramp(densest, real(LOOSE), real(DENSE))
+        return own * ln_j - (real(1.0) - own) * wp.log(wp.max(mean, real(1.0e-6)))
 
-    return SimpleNamespace(volume=volume)
+    return SimpleNamespace(apart=apart, volume=volume)

@@ -49,7 +49,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
     push = contact(real, touch or ContactLaw(), atomic).push
     update, kirchhoff = law.update, law.kirchhoff
     fading = fluidity(real, effects).fading
-    loose_volume = loose(real).volume
+    apart, loose_volume = loose(real).apart, loose(real).volume
     spline = splines(real)
     base_and_offset, weights, moments = spline.base_and_offset, spline.weights, spline.moments
     lanes = rows(real, gpu=atomic)
@@ -235,18 +235,19 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         # felt[p][3] the mean of that. Soil that bears no stress has no say in it and repeats the mean: its changes are
         # large, and shared out they would compress the dense soil that it falls on.
         recent = swelling[p]
-        volume_before = ln_j[p] + grid.volume_averaging * grid.forgetting * (felt[p][3] - recent)
+        averaged = grid.volume_averaging * grid.forgetting * (felt[p][3] - recent)
         if wp.static(effects.separation):
-            if ln_j[p] >= real(0.0):
-                volume_before = ln_j[p]
+            averaged *= real(1.0) - apart(ln_j[p])
+        volume_before = ln_j[p] + averaged
         state = update(before, volume_before, grid.dt * c[p], grid.dt, soil, g)
         after = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
         e[p] = after
         ln_j[p] = state[6]
-        swelling[p] = (real(1.0) - grid.forgetting) * recent + state[6] - volume_before
+        changes = (real(1.0) - grid.forgetting) * recent + state[6] - volume_before
         if wp.static(effects.separation):
-            if volume_before >= real(0.0) or state[6] >= real(0.0):
-                swelling[p] = (real(1.0) - grid.forgetting) * felt[p][3]
+            mean = (real(1.0) - grid.forgetting) * felt[p][3]
+            changes += apart(wp.max(volume_before, state[6])) * (mean - changes)
+        swelling[p] = changes
         if wp.static(effects.fluidity):
             soil.g[p] = state[7]
         # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone. It

@@ -29,7 +29,11 @@ import matplotlib.pyplot as plt
 HERE = Path(__file__).parent
 REPEATS = 3
 SCENES = {
-    "excavation": ["scene=quick_excavation", "scene.duration=1.0", "scene.bed.headroom=0.5"],  # elastic soil flies
+    "excavation": [
+        "scene=quick_excavation",
+        "scene.duration=1.0",
+        "scene.bed.headroom=0.5",
+    ],  # elastic soil flies
     "wheel": ["scene=quick_wheel", "scene.duration=1.0"],
     "column": ["scene=column", "scene.duration=0.4"],
     "incline": ["scene=incline", "scene.duration=0.4"],

@@ -9,7 +9,7 @@ import pytest
 
 from mpm_warp import Bed, Effects, Scene, Solver, Walls
 
-GROWTH = 1e-3  # 1/s, just enough for a sign
+GROWTH = 2e-2  # 1/s, just enough for a sign
 
 
 @dataclass(frozen=True)
