@@ -9,7 +9,7 @@ import pytest
 
 from mpm_warp import Bed, Effects, Scene, Solver, Walls
 
-GROWTH = 2e-2  # 1/s, just enough for a sign
+GROWTH = 1e-3  # 1/s, just enough for a sign
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def test_loose_soil_is_as_loose_as_the_grid_sees(stretch, precision):
     )
     solver = Solver(Expanding(bed=bed, gravity=0.0, duration=1.0 / 60.0), precision=precision)
     *_, last = solver.frames()
-    inner = np.all(np.abs(last.position - [0.16, 0.16, -0.11]) < [0.07, 0.07, 0.04], axis=1)
+    inner = np.all(np.abs(last.position - [0.16, 0.16, -0.09]) < [0.07, 0.07, 0.04], axis=1)
     ln_j = solver._ln_j.numpy()
     loose = inner & (ln_j > 0.0)
     assert loose.sum() > 0.9 * inner.sum()
