@@ -290,7 +290,7 @@ class Solver:
             ),
         ]
         self._from_grid = self._record(
-            kernels.from_grid, n, home, felt, v, grid, self._before, self._keep, ln_j
+            kernels.from_grid, n, x, home, felt, v, grid, self._before, self._keep, ln_j
         )
         self._remap = Program(self._to_grid)
         self._until_remap = Program(self._begin, self._step, [self._from_grid])

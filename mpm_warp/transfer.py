@@ -258,9 +258,19 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         t = kirchhoff(after + grid.damping * (after - before), volume, soil)
         stress[p] = vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])
 
+    @wp.func
+    def within_walls(x: vec3, grid: Grid):
+        # A wall is a condition at nodes; between two remaps a particle on it may follow the node inside and get beyond.
+        # Where there is none, `low` and `high` lie outside of the grid.
+        for axis in range(3):
+            x[axis] = wp.max(x[axis], grid.origin[axis] + real(grid.low[axis]) * grid.spacing)
+            x[axis] = wp.min(x[axis], grid.origin[axis] + real(grid.high[axis]) * grid.spacing)
+        return x
+
     @scene_kernel(fused)
     def from_grid(
         p: int,
+        x: wp.array(dtype=vec3),
         home: wp.array(dtype=vec3),
         felt: wp.array(dtype=vec4),
         v: wp.array(dtype=vec3),
@@ -280,6 +290,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
                 total = plus(total, wx[i] * wy[j], gather_row(before, node_index(base, i, j, grid)))
         smooth = fold(weights(f[2]), total)
         u = vec3(felt[p][0], felt[p][1], felt[p][2])
+        x[p] = within_walls(x[p], grid)
         if wp.static(effects.separation):
             if ln_j[p] > real(0.0):
                 ln_j[p] = loose_volume(ln_j[p], node_index(base, 0, 0, grid), f, before, grid)

@@ -438,6 +438,7 @@ CASES = [
             limit=1.0,
             unit="mm",
             measure=partial(walls_hold, kind),
+            quick=True,
         )
         for kind in ("no_slip", "slip", 0.3)
     ),
