@@ -37,6 +37,9 @@ def grid_struct(real: type) -> type:
         particle_mass: real  # [kg]
         particle_volume: real  # at the critical density [m^3]
         density_per_mass: real  # of a node: soil's density there over that of an undisturbed bed [1/kg]
+        beyond_walls: (
+            vec3  # the whole around a node on an x wall, a y wall, the floor over its part in the bin
+        )
         speed_limit: real  # one cell per step [m/s]
 
     return Grid
@@ -47,7 +50,7 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
     """Kernels on the nodes in precision `real`.
 
     - `begin`: momentum and mass to velocity, 1 / mass and the density over that of an undisturbed bed after a remap.
-      A node on a wall sees half of what is around it; soil is taken to go on beyond.
+      A node on a wall sees but a part of what is around it; soil is taken to go on beyond.
     - `step`: velocity from the step's impulse and gravity, walls and floor; counts the step.
 
     Both clear what they have used for the next sum. `walls` are the kinds of x walls, y walls and floor
@@ -88,12 +91,11 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
 
     @wp.func
     def walls_seen(n: int, grid: Grid):
-        # The whole around a node over the part of it within the walls.
         at = place(n, grid)
         share = real(1.0)
         for axis in range(3):
             if at[axis] == grid.low[axis] or at[axis] == grid.high[axis]:
-                share *= real(2.0)
+                share *= grid.beyond_walls[axis]
         return share
 
     @scene_kernel()

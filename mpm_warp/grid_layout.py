@@ -61,5 +61,12 @@ def lay_grid(
     grid.particle_volume = particle_volume
     grid.particle_mass = particle_volume * scene.material.bulk_density
     grid.density_per_mass = 1.0 / (scene.material.bulk_density * h**3 * bed.filling)
+    behind = [round(0.5 * (c - s / h), 6) for s, c in zip(bed.size[:2], cells, strict=True)]
+    grid.beyond_walls = vec3(*(1.0 / _part_in_bin(distance) for distance in (*behind, 0.0)))
     grid.speed_limit = h / time_step
     return grid, ghosts
+
+
+def _part_in_bin(distance: float) -> float:
+    """How much of a node's spline (splines.py) lies in the bin, for a node 0 to 0.5 cells outside of it [-]."""
+    return 0.5 - 0.75 * distance + distance**3 / 3.0

@@ -82,6 +82,30 @@ def test_an_undisturbed_bed_is_dense_up_to_its_walls(walls, symmetry, precision)
     np.testing.assert_allclose(known, 1.0, rtol=1e-5)
 
 
+@pytest.mark.parametrize("symmetry", [False, True])
+@pytest.mark.parametrize("beyond", [0.1, 0.25, 0.45])
+def test_walls_that_lie_within_a_cell_are_dense_too(beyond, symmetry):
+    """Nodes on walls that stand beyond the bin, as far as a bed of 27 particles per cell tells [cells]."""
+    size = 0.2 - 2.0 * beyond * 0.02
+    bed = Bed(
+        size=(size, size, 0.06),
+        spacing=0.02,
+        particles_per_cell=27,
+        initial_stress="none",
+        walls=Walls("slip", "slip"),
+    )
+    solver = Solver(Scene(bed=bed, gravity=0.0, duration=1.0 / 60.0), Effects(symmetry=symmetry))
+    list(solver.frames())
+    grid = solver._grid
+    density = solver._before.numpy()[:-1, 3].reshape(grid.nx, grid.ny, grid.nz)
+    at_height = grid.low[2] + 1
+    middle_y = (grid.high[1] + (grid.low[1] if not symmetry else 2)) // 2
+    walls = [density[x, middle_y, at_height] for x in (grid.low[0], grid.high[0])]
+    walls.append(density[grid.nx // 2, grid.high[1], at_height])
+    walls.append(density[grid.low[0], grid.high[1], at_height])  # in an edge
+    np.testing.assert_allclose(walls, density[grid.nx // 2, middle_y, at_height], rtol=0.05)
+
+
 def test_soil_near_dense_soil_keeps_its_own_volume():
     """A bed that has just begun to expand is dense, up to its surface: ln J is what it integrates."""
     bed = Bed(size=(0.2, 0.2, 0.1), spacing=0.02, particles_per_cell=4, initial_stress="none")
