@@ -114,6 +114,9 @@ def main() -> None:
         row["over_needed"] = row["vertical_mean"] / smoothed(carried["sgns"]).mean()
         # What the published force would be if it carried the published wheel, against ours.
         row["needed_nrmse"] = compared(here["vertical"], carried["published"])["nrmse"]
+        # What the wheel pulls for what it bears: the same if all forces are off by the same factor.
+        row["traction"] = row["pull_mean"] / row["vertical_mean"]
+        row["traction_published"] = row["pull_published"] / row["vertical_published"]
         rows.append({key: round(value, 3) for key, value in row.items()})
     axes[0, 1].legend(fontsize=8)
     axes[0, 0].legend(fontsize=8)
@@ -130,6 +133,10 @@ def main() -> None:
         logging.info(
             "%s: median NRMSE %.3f, %.3f to %.3f", label, np.median(errors), min(errors), max(errors)
         )
+    off = [abs(row["traction"] - row["traction_published"]) for row in rows]
+    logging.info(
+        "pull over vertical force: median difference %.3f, %.3f to %.3f", np.median(off), min(off), max(off)
+    )
 
 
 if __name__ == "__main__":
