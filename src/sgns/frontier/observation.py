@@ -62,8 +62,9 @@ class Observation:
 
     @property
     def finite(self) -> bool:
-        """Whether soil and force stayed finite all the time."""
-        return bool(np.isfinite(self.force).all() and np.isfinite(self.moved).all())
+        """Whether force and soil, where there is some, stayed finite all the time."""
+        soil = self.moved[:, ~np.isnan(self.moved[0])]
+        return bool(np.isfinite(self.force).all() and np.isfinite(soil).all())
 
 
 def read_observation(file: Path) -> Observation:
@@ -153,6 +154,7 @@ class _NearPoints:
 
 def observe_arrays(
     scene: Scene,
+    start: np.ndarray,
     time: np.ndarray,
     force: np.ndarray,
     torque: np.ndarray,
@@ -164,6 +166,8 @@ def observe_arrays(
 
     Args:
         scene: what was simulated.
+        start: where the particles are in an undisturbed bed [m], shape (n, 3). Not a frame of the run: what a reduction
+            leaves out of the bed at rest would be left out of every error.
         time: of all frames [s], shape (T,).
         force: [N], shape (T, 3).
         torque: [N m], shape (T, 3).
@@ -171,11 +175,9 @@ def observe_arrays(
         frames: numbers of the frames in which the soil is known, `observed_frames`, the first of them 0.
         positions: particles in each of these frames [m], (n, 3) each.
     """
-    observer: Observer | None = None
+    observer = Observer(scene, start)
     for frame, position in zip(frames, positions, strict=True):
-        observer = observer or Observer(scene, position)
         observer.add_soil(float(time[frame]), position)
-    assert observer is not None
     for values in zip(time, force, torque, pose, strict=True):
         observer.add(*values)
     return observer.finish()

@@ -258,7 +258,8 @@ def observed(simulator: Simulator, scene: Scene, rollout: Rollout) -> Observatio
     times = np.arange(len(rollout.latent)) / simulator.frame_rate
     frames = observed_frames(len(times), simulator.frame_rate)
     soil = (simulator.basis.inverse(torch.as_tensor(rollout.latent[frame])).numpy() for frame in frames)
-    return observe_arrays(scene, times, rollout.force, rollout.torque, rollout.poses, frames, soil)
+    bed, forces = simulator.start_positions, (rollout.force, rollout.torque)
+    return observe_arrays(scene, bed, times, *forces, rollout.poses, frames, soil)
 
 
 def own_fields(scores: Scores, runs: int) -> dict[str, float]:

@@ -40,8 +40,9 @@ def observed(spacing: float, per_cell: float, force: float = 100.0) -> Observati
     time = scene.times()
     frames = observed_frames(FRAMES, 60.0)
     forces = np.outer(np.sin(3.0 * time), [-force, 0.0, 0.5 * force])
-    soil = [sheared(scene.initial_positions(), time[frame]) for frame in frames]
-    return observe_arrays(scene, time, forces, 0.1 * forces, scene.body_poses(), frames, soil)
+    bed = scene.initial_positions()
+    soil = [sheared(bed, time[frame]) for frame in frames]
+    return observe_arrays(scene, bed, time, forces, 0.1 * forces, scene.body_poses(), frames, soil)
 
 
 @pytest.mark.parametrize(("spacing", "per_cell"), [(0.02, 1.0), (0.02, 2.37), (0.025, 1.0), (0.01, 4.0)])
@@ -70,6 +71,25 @@ def test_displacements_of_a_uniform_motion_are_exact() -> None:
         observer.add(time, np.zeros(3), np.zeros(3), scene.body_poses()[0])
     moved = observer.finish().moved
     assert moved[1] == pytest.approx(np.tile([0.01, -0.02, 0.03], (moved.shape[1], 1)), abs=1e-6)
+
+
+def test_what_a_run_gets_wrong_at_rest_counts() -> None:
+    """As a reduction does that cannot express the undisturbed bed."""
+    scene, time = scene_on(0.02, 1.0), np.arange(2.0)
+    bed = scene.initial_positions()
+    lifted = [bed + np.array([0.0, 0.0, 0.004])] * 2
+    run = observe_arrays(
+        scene, bed, time, np.zeros((2, 3)), np.zeros((2, 3)), scene.body_poses()[:2], [0, 1], lifted
+    )
+    assert run.moved == pytest.approx(np.broadcast_to([0.0, 0.0, 0.004], run.moved.shape), abs=1e-6)
+
+
+def test_places_without_soil_are_no_sign_of_a_run_that_left_the_numbers() -> None:
+    run = observed(0.02, 1.0)
+    run.moved[:, 3] = np.nan
+    assert run.finite
+    run.moved[1:, 5] = np.nan
+    assert not run.finite
 
 
 def test_the_surface_of_a_full_bed_is_flat_at_zero_whatever_the_spacing() -> None:
