@@ -40,7 +40,16 @@ __all__ = ["Checked", "Report", "Threads", "compiler", "on_stand_in"]
 
 HERE = Path(__file__).resolve().parent
 MANY = 0xFFFFFFFF
-FLAGS = ("-std=c++17", "-w", "-fPIC", "-shared", "-march=native", "-ffp-contract=fast", "-pthread")
+FLAGS = (
+    "-std=c++17",
+    "-w",
+    "-DNDEBUG",
+    "-fPIC",
+    "-shared",
+    "-march=native",
+    "-ffp-contract=fast",
+    "-pthread",
+)
 
 
 def compiler() -> str | None:
@@ -53,6 +62,8 @@ class Report:
     """What the check found in all launches of one kernel."""
 
     kernel: str
+    variants: int = 0
+    """Of the kernel, compiled for other physics, bodies, walls or numbers."""
     launches: int = 0
     items: int = 0
     accesses: int = 0
@@ -128,6 +139,7 @@ class Checked(StandIn):
     def __init__(self, atomic: bool = True, plain: bool = False) -> None:
         super().__init__(atomic, plain)
         self._reports: dict[str, Report] = {}
+        self._met: set[str] = set()
 
     def reports(self) -> list[Report]:
         """One for each kernel, by name."""
@@ -149,7 +161,10 @@ class Checked(StandIn):
         built.run_checked(ctypes.byref(bounds), ctypes.byref(arguments))
         checker.conflicts_end(ctypes.byref(found))
 
-        report = self._reports.setdefault(kernel.key, Report(kernel.key))
+        name = kernel.key.split("__")[-1]
+        report = self._reports.setdefault(name, Report(name))
+        report.variants += built._name not in self._met
+        self._met.add(built._name)
         report.launches += 1
         report.items += int(bounds.size)
         report.accesses += found.accesses
