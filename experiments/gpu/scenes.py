@@ -3,19 +3,21 @@ one scene alone and several in one launch."""
 
 from __future__ import annotations
 
+import csv
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 sys.path.insert(1, str(Path(__file__).resolve().parents[2] / "tests" / "mpm_warp"))
 
-from beds import cut  # noqa: E402
-from meshes import BOX_FACES, box_corners, write_obj  # noqa: E402
+from beds import cut
+from meshes import BOX_FACES, box_corners, write_obj
 
-from mpm_warp import (  # noqa: E402
+from mpm_warp import (
     Bed,
     Column,
     Effects,
@@ -29,9 +31,13 @@ from mpm_warp import (  # noqa: E402
     Wheel,
     frames_together,
 )
-from mpm_warp.bodies import Box, MeshBody  # noqa: E402
+from mpm_warp.bodies import Box, MeshBody
 
-__all__ = ["Case", "Outcome", "cases", "outcome"]
+__all__ = ["FARTHEST", "FORCE", "Case", "Outcome", "cases", "outcome", "write_rows"]
+
+FARTHEST, FORCE = 1e-4, 0.01
+"""Ways to compute a case agree if no particle is farther off [m] and the forces differ by no larger share: what the
+tests allow between CPU and GPU."""
 
 COARSE = Material(grain_diameter=5e-3)  # so that flow spreads over some cells of these grids
 BEADS = Material(
@@ -106,6 +112,15 @@ def _frames(case: Case, device: str, precision: str) -> Iterator[tuple[int, Fram
             yield 0, frame
     else:
         yield from frames_together(case.scenes, case.effects, device, precision)
+
+
+def write_rows(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a table of rows with the same keys."""
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: f"{v:.3g}" if isinstance(v, float) else v for k, v in row.items()})
 
 
 def cases(folder: Path) -> list[Case]:

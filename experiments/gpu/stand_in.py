@@ -34,9 +34,9 @@ from unittest import mock
 import numpy as np
 import warp as wp
 
-from mpm_warp import nonlocal_fluidity, solver
+from mpm_warp import nonlocal_fluidity, solver, work
 
-__all__ = ["Checked", "Report", "Threads", "compiler", "on_stand_in"]
+__all__ = ["Checked", "Report", "Threads", "compiler", "on_stand_in", "with_graphs"]
 
 HERE = Path(__file__).resolve().parent
 MANY = 0xFFFFFFFF
@@ -197,6 +197,11 @@ def on_stand_in(stand_in: Way) -> Iterator[Way]:
         ),
     ):
         yield stand_in
+
+
+def with_graphs() -> Any:
+    """A context in which launches on the CPU are captured and replayed as graphs, as they are on a GPU."""
+    return mock.patch.object(work, "captures", lambda device: True)
 
 
 Way = TypeVar("Way", bound=StandIn)
