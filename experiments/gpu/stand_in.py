@@ -15,11 +15,13 @@ same C++ for two other ways to run it:
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import hashlib
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -53,8 +55,8 @@ FLAGS = (
 
 
 def compiler() -> str | None:
-    """Path of g++, if there is one."""
-    return shutil.which("g++")
+    """Path of g++, if there is one that can do this."""
+    return shutil.which("g++") if sys.platform == "linux" else None
 
 
 @dataclass
@@ -244,8 +246,11 @@ def _source(command: wp.Launch) -> tuple[str, str]:
 
 
 @cache
-def _folder() -> tempfile.TemporaryDirectory:
-    return tempfile.TemporaryDirectory(prefix="sgns-")
+def _folder() -> Path:
+    """Where libraries are made; it goes when the process ends."""
+    folder = Path(tempfile.mkdtemp(prefix="sgns-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 @cache
@@ -264,8 +269,7 @@ def _built(source: tuple[str, str], flags: tuple[str, ...]) -> ctypes.CDLL:
         f"#define KERNEL {name}_cpu_kernel_forward\n#define ARGUMENTS wp_args_{name}\n"
         f'#define DIMENSIONS {dimensions}\n#include "{HERE / "entry.h"}"\n'
     )
-    folder = Path(_folder().name)
-    file = folder / f"{hashlib.blake2b((code + repr(flags)).encode(), digest_size=8).hexdigest()}.cpp"
+    file = _folder() / f"{hashlib.blake2b((code + repr(flags)).encode(), digest_size=8).hexdigest()}.cpp"
     file.write_text(code)
     headers = Path(wp.__file__).parent / "native"
     library, parts = file.with_suffix(".so"), [file]
@@ -282,13 +286,13 @@ def _built(source: tuple[str, str], flags: tuple[str, ...]) -> ctypes.CDLL:
 
 @cache
 def _checker() -> ctypes.CDLL:
-    library = Path(_folder().name) / "conflicts.so"
+    library = _folder() / "conflicts.so"
     _compile(["-O2", HERE / "conflicts.cpp", "-o", library])
     return ctypes.CDLL(str(library))
 
 
 def _compile(arguments: list[Any]) -> None:
     if compiler() is None:
-        raise FileNotFoundError("there is no g++ here")
+        raise FileNotFoundError("g++ on Linux is needed")
     shared = [flag for flag in FLAGS if "-c" not in arguments or flag != "-shared"]
     subprocess.run([compiler(), *shared, *map(str, arguments)], check=True)

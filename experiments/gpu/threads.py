@@ -2,10 +2,10 @@
 
     python experiments/gpu/threads.py
 
-Needs g++ and no GPU. First faults are planted, which must be found. Then every case of scenes.py is computed: its
-first frames with every access of every item looked at, and all of it by four threads in shuffled order, which must
-agree with the ordinary run; replayed as graphs, as on a GPU, the ordinary run must have the same bits. Writes conflicts.csv and threads.csv beside this script; the status is 1 if something was
-found or does not agree.
+Needs Linux and g++, and no GPU. First faults are planted, which must be found. Then every case of scenes.py is
+computed: its first frames with every access of every item looked at; all of it by four threads in shuffled order, which
+must agree with the ordinary run; and captured and replayed as graphs, which must give the ordinary run's bits. Writes
+conflicts.csv and threads.csv beside this script; the status is 1 if something was found or does not agree.
 """
 
 import argparse
@@ -131,7 +131,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="cases with this in their name; no tables are written")
     options = parser.parse_args()
     if compiler() is None:
-        print("nothing was checked: there is no g++ here")
+        print("nothing was checked: g++ on Linux is needed")
         return 2
     with tempfile.TemporaryDirectory() as folder:
         everything = cases(Path(folder))
