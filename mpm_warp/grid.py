@@ -132,6 +132,8 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
         impulse: wp.array(dtype=vec4),
         substep: wp.array(dtype=int),
     ):
+        # `static` around the walls' functions: Warp knows a kernel by its text and its functions, but not under which
+        # names it calls these. Without, walls x slip, y no_slip would get the kernel of x no_slip, y slip.
         if n == 0:
             substep[0] = substep[0] + 1
         inverse = inverse_mass[n]
@@ -149,16 +151,16 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
             rough = grid.wall_friction
             if wp.static(walls[0] != "periodic"):
                 if i <= low[0]:
-                    v = at_x(v, vec3(real(1.0), real(0.0), real(0.0)), rough[0])
+                    v = wp.static(at_x)(v, vec3(real(1.0), real(0.0), real(0.0)), rough[0])
                 if i >= high[0]:
-                    v = at_x(v, vec3(real(-1.0), real(0.0), real(0.0)), rough[0])
+                    v = wp.static(at_x)(v, vec3(real(-1.0), real(0.0), real(0.0)), rough[0])
             if wp.static(walls[1] != "periodic"):
                 if j <= low[1]:
-                    v = at_y(v, vec3(real(0.0), real(1.0), real(0.0)), rough[1])
+                    v = wp.static(at_y)(v, vec3(real(0.0), real(1.0), real(0.0)), rough[1])
                 if j >= high[1]:
-                    v = at_y(v, vec3(real(0.0), real(-1.0), real(0.0)), rough[1])
+                    v = wp.static(at_y)(v, vec3(real(0.0), real(-1.0), real(0.0)), rough[1])
             if k <= low[2]:
-                v = at_floor(v, vec3(real(0.0), real(0.0), real(1.0)), rough[2])
+                v = wp.static(at_floor)(v, vec3(real(0.0), real(0.0), real(1.0)), rough[2])
             velocity[n] = vec4(v[0], v[1], v[2], inverse * change[3])
 
     return SimpleNamespace(begin=begin, step=step)

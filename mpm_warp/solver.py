@@ -304,6 +304,8 @@ class Solver:
             yield slice(0, n), grid, body
             return
         for part, share in ((slice(0, on_plane), 0.5), (slice(on_plane, n), 1.0)):
+            if part.start == part.stop:  # all lie on it
+                continue
             its_grid, its_body = type(grid)(), type(body)()
             its_grid.assign(grid)
             its_body.assign(body)

@@ -38,6 +38,11 @@ class Work:
     """How many scenes had work done at the same time; known afterwards."""
 
 
+def captures(device: wp.Device) -> bool:
+    """Whether launches are captured as a graph. Warp can do that on a CPU, too, which tests make use of."""
+    return device.is_cuda
+
+
 class _Stack:
     """Programs of the same kernels as one; on a GPU the whole of it is one CUDA graph."""
 
@@ -68,7 +73,7 @@ class _Stack:
             return
         if len(steps) > 1:
             self._steps.assign(np.array(steps, dtype=np.int32))
-        if not self._device.is_cuda:
+        if not captures(self._device):
             self._launch(most)
             return
         if most not in self._graphs:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import astuple, replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from mpm_warp import (
     Wheel,
     frames_together,
 )
+from mpm_warp import work as work_module
 from mpm_warp.batch import all_together
 from mpm_warp.launches import Launch, Together
 from mpm_warp.work import Program, Work
@@ -127,6 +129,32 @@ def test_scenes_of_the_same_kernels_share_every_launch(monkeypatch):
     counts["alone"] = 0
     by_scene(frames_together(scenes))
     assert counts == {"alone": 0, "together": alone}
+
+
+@pytest.mark.parametrize("effects", [Effects(), Effects(symmetry=True, fluidity=True, nonlocality=True)])
+def test_captured_graphs_are_the_launches(effects):
+    """What a GPU replays, here captured and replayed by Warp on the CPU: the same bits, alone and together, though the
+    numbers of steps differ from scene to scene and from remap to remap."""
+    scenes = [cut(duration=0.06, speed=speed, depth=0.03, remap_time=4e-3) for speed in (0.1, 0.25)]
+    scenes.append(Wheel(bed=cut().bed, duration=0.06, settle=0.02, load=60.0))
+
+    def computed():
+        alone = [list(Solver(scene, effects).frames()) for scene in scenes]
+        return [*alone, *by_scene(frames_together(scenes, effects))]
+
+    plain = computed()
+    launched = []
+    real = wp.capture_launch
+    with (
+        mock.patch.object(work_module, "captures", lambda device: True),
+        mock.patch.object(wp, "capture_launch", lambda graph: launched.append(graph) or real(graph)),
+    ):
+        captured = computed()
+    assert len(launched) > 2 * len(set(launched)) > 10  # each graph served more than once
+    for one, two in zip(plain, captured, strict=True):
+        assert len(one) == len(two) > 2
+        for a, b in zip(one, two, strict=True):
+            assert_same(a, b)
 
 
 def test_scenes_may_have_effects_of_their_own():

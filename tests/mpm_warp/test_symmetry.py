@@ -54,6 +54,20 @@ def test_a_column_is_symmetric_too(width):
     np.testing.assert_allclose(two.position, one.position, atol=1e-8)
 
 
+@pytest.mark.parametrize("nonlocality", [False, True])
+def test_a_bed_that_lies_on_its_plane_of_symmetry(nonlocality):
+    """One layer of particles: no half is left out, and all of them count half."""
+    bed = Bed(size=(0.2, 0.04, 0.12), spacing=0.02, particles_per_cell=0.125, walls=Walls(y="slip"))
+    scene = Scene(bed=bed, duration=0.05)
+    assert np.unique(scene.initial_positions()[:, 1]) == pytest.approx(0.02)
+    whole, half = (
+        list(Solver(scene, Effects(symmetry=on, nonlocality=nonlocality), precision="float64").frames())[-1]
+        for on in (False, True)
+    )
+    assert np.abs(whole.position - scene.initial_positions()).max() > 1e-6
+    np.testing.assert_allclose(half.position, whole.position, atol=1e-9)
+
+
 def test_symmetry_computes_half():
     assert Solver(cut(), Effects(symmetry=True)).computed_count == Solver(cut()).computed_count // 2
     nodes = [Solver(cut(), Effects(symmetry=on))._velocity.size for on in (False, True)]

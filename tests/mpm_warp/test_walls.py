@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
+import warp as wp
 from beds import BlockBed, block, cut
 
-from mpm_warp import Bed, Effects, Scene, SceneError, Solver, Walls
+from mpm_warp import Bed, Effects, Incline, Scene, SceneError, Solver, Walls
+from mpm_warp.grid import grid_step
 
 ELASTIC = Effects(yielding=False, rate_dependence=False, separation=False)
 
@@ -131,6 +134,28 @@ def test_walls_survive_plain_data():
     scene = cut(bed=Bed(size=(0.48, 0.4, 0.16), spacing=0.02, walls=Walls("slip", 0.3, 0.5)))
     assert Scene.from_dict(scene.to_dict()) == scene
     assert scene.bed.walls.kinds == ("slip", "friction", "friction")
+
+
+def test_no_two_kinds_of_walls_share_a_kernel():
+    """Warp takes kernels for the same, here and in its cache, whose text and functions are the same, whatever the names
+    under which the text calls the functions."""
+    kinds = ("no_slip", "slip", "friction", "periodic")
+    walls = list(product(kinds, kinds, kinds[:3]))
+    for form in ("alone", "together"):
+        kernels = [getattr(grid_step(wp.float32, kinds).step, form) for kinds in walls]
+        assert len({kernel.module.get_module_hash() for kernel in kernels}) == len(walls) == 48
+
+
+def test_slippery_walls_hold_no_flow_whatever_ran_before():
+    """Soil flows down a slope between walls: after one where they stick, one where they do not."""
+    slowest = []
+    for y in ("no_slip", "slip"):
+        bed = Bed(size=(0.06, 0.06, 0.05), spacing=0.01, walls=Walls("periodic", y))
+        *_, frame = Solver(Incline(bed=bed, tilt=40.0, flowing=True, duration=0.05)).frames()
+        at_top = np.isclose(frame.position[:, 2], frame.position[:, 2].max(), atol=0.002)
+        slowest.append(frame.velocity[at_top, 0].min() / frame.velocity[at_top, 0].max())
+    assert slowest[0] < 0.8
+    assert slowest[1] > 0.99
 
 
 def test_plain_walls_cost_nothing():
