@@ -108,8 +108,8 @@ def test_fluidity_decays_to_a_rough_floor_as_a_cosh(law):
 
 @pytest.mark.parametrize("effects", [STEADY, DYNAMIC])
 def test_nodes_that_hardly_hold_soil_do_no_harm(effects):
-    """A particle just beyond the middle of its cell gives the next nodes so little that float32 has no number for it, or
-    hardly one: the answer is that for a particle in the middle."""
+    """A particle just beyond the middle of its cell gives the next nodes so little that float32 has hardly a number for
+    it: the answer is that for a particle in the middle."""
 
     def answer(beyond):
         column = Column(effects, soil(0.04), real="float32", height=0.05)
