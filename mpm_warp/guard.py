@@ -101,3 +101,17 @@ class Guard:
             f"it is strained to {left} and by {shear:.2g} in shear, more than elastic soil can be: raise "
             "material.youngs_modulus or lower the body's speed"
         )
+
+    def lost_fluidity(self, excess: np.ndarray) -> tuple[int, str] | None:
+        """The first particle to which cooperative flow gave a fluidity that is no number, and why; None if there is
+        none. Its stress does not show it: without a fluidity soil is elastic.
+
+        Args:
+            excess: what the grid gave the particles (n,) [1/s].
+        """
+        lost = ~np.isfinite(excess)
+        if not lost.any():
+            return None
+        return int(
+            np.argmax(lost)
+        ), "its fluidity is not finite: lower scene.courant or set effects.nonlocality=false"

@@ -49,6 +49,10 @@ WALL_CONDUCTANCE = 32.0
 spacing behind the wall. A fixed g = 0 at the node would stop the flow of the soil within a spacing of the wall even
 where A d is too small for the grid."""
 
+LEAST_FILLED = 1e-20
+"""Filled volume [cells] below which a node holds no soil. A particle just beyond the middle of its cell gives the next
+nodes so little that in single precision 1 / W overflows, and one such node made the fluidity of all others NaN."""
+
 
 def sweep_count(ratio: float, relaxation: float | None = None) -> int:
     """Jacobi sweeps per step, an even number, for `ratio` = (A d / dx)^2.
@@ -149,6 +153,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         filled = s[0]
         if filled > real(0.0):
             sums[n] = vec4()
+        if filled > real(wp.static(LEAST_FILLED)):
             g = s[1] / filled
             start = g
             if wp.static(not effects.fluidity):

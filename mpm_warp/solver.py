@@ -382,6 +382,7 @@ class Solver:
         if count:
             raise self._stopped(index, substep, particle, self._guard.strayed(bool(near)))
         found = self._guard.too_strained(self._ln_j.numpy(), self._e.numpy())
+        found = found or self._guard.lost_fluidity(self._excess.numpy())
         if found is not None:
             raise self._stopped(index, self.substeps_per_frame, *found)
         if self._body is not None:

@@ -106,6 +106,28 @@ def test_fluidity_decays_to_a_rough_floor_as_a_cosh(law):
     assert np.abs(column.nodes("g") / g_loc - exact).max() < 0.02
 
 
+@pytest.mark.parametrize("effects", [STEADY, DYNAMIC])
+def test_nodes_that_hardly_hold_soil_do_no_harm(effects):
+    """A particle just beyond the middle of its cell gives the next nodes so little that float32 has hardly a number for
+    it: the answer is that for a particle in the middle."""
+
+    def answer(beyond):
+        column = Column(effects, soil(0.04), real="float32", height=0.05)
+        solver = column.solver
+        solver._home.assign(solver._x.numpy() + beyond * solver.scene.bed.spacing)
+        column.impose(0.8)
+        if effects.fluidity:
+            solver._soil.g.assign(10.0 * column.height)
+        column.solve(30 if effects is STEADY else 3)
+        assert np.isfinite(column.term.field.numpy()).all()
+        return column.nodes("g")
+
+    middle = answer(0.0)
+    assert middle.max() > 0.1
+    for beyond in np.geomspace(1e-7, 1e-5, 9):
+        np.testing.assert_allclose(answer(beyond), middle, rtol=1e-3)
+
+
 def test_flow_reaches_into_soil_below_its_friction():
     """A flowing layer under a solid one: cosh profiles on both sides, joined in value and slope."""
     material = replace(soil(0.03, 0.7), fluidity_at_walls="free")

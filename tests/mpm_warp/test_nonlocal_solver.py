@@ -9,7 +9,7 @@ import warp as wp
 from beds import cut
 from test_nonlocal_fluidity import DYNAMIC, PRESSURE, STEADY
 
-from mpm_warp import Bed, Effects, Material, Scene, Solver, Walls
+from mpm_warp import Bed, Effects, Material, Scene, Solver, SolverStopped, Walls
 
 
 @pytest.mark.parametrize("at_walls", ["free", "zero"])
@@ -92,6 +92,18 @@ def test_precisions_agree_in_a_cut(effects):
     assert np.linalg.norm(two.force) > 1.0
     np.testing.assert_allclose(one.force, two.force, atol=0.02 * np.linalg.norm(two.force))
     assert np.abs(one.position - two.position).max() < 1e-4
+
+
+def test_stops_where_the_fluidity_is_no_number():
+    """Its soil would be elastic and look sound."""
+    solver = Solver(cut(duration=0.1, material=Material(grain_diameter=5e-3)), STEADY)
+    frames = solver.frames()
+    next(frames), next(frames)
+    field = solver._nonlocal.field.numpy().copy()
+    field[:, 3] = np.nan  # which the sweeps of the steady form go on from
+    solver._nonlocal.field.assign(field)
+    with pytest.raises(SolverStopped, match="its fluidity is not finite"):
+        list(frames)
 
 
 def test_inert_nonlocality_leaves_a_cut_as_it_is():
