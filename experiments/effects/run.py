@@ -40,7 +40,7 @@ SCENES = {
     "thin_layer": ["scene=thin_layer", "scene.duration=0.5"],
 }
 EFFECTS = ("yielding", "rate_dependence", "fluidity", "nonlocality", "separation", "symmetry", "torque")
-GRAINS = (1e-4, 3e-4, 1e-3, 2e-3, 5e-3)  # diameters for edge.csv [m]
+GRAINS = (1e-4, 3e-4, 5e-4, 7e-4, 1e-3, 2e-3, 5e-3)  # diameters for edge.csv [m]
 STATED = 0.03  # what auto leaves out changes force and displacement by less, says docs/solver.md
 
 
