@@ -23,7 +23,7 @@ EFFECTS = (*(f.name for f in fields(Effects)), "free_body")
 class Tolerances:
     """How little an effect may do before it is left out."""
 
-    friction: float = 0.01
+    friction: float = 0.005
     """Rate dependence: what mu(I) adds to the friction, as a share of mu_s [-]."""
     grid: float = 0.03
     """Nonlocality: A d, as a share of the grid spacing [-]."""

@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 from omegaconf import OmegaConf
 
-from mpm_warp import Decision, Effects, Scene
+from mpm_warp import Decision, Effects, Scene, SceneError
 from mpm_warp.inputs import read_text
 from sgns.claim import claimed
 from sgns.errors import UserError
@@ -83,11 +83,33 @@ class Campaign:
                 time.sleep(0.05)
         except OSError as error:
             raise UserError(f"cannot write {file}: {error.strerror}") from None
-        if _read(file) != self.describe():
-            raise UserError(
-                f"{self.path} holds a dataset made with other settings; give another dataset.path, or remove "
-                "the folder to make this one"
-            )
+        there, here = _read(file), self.describe()
+        if there == here:
+            return
+        advice = "give another dataset.path, or remove the folder to make this one"
+        if isinstance(there, dict) and {**there, "effects": here["effects"]} == here:
+            others = self._decided_otherwise(there.get("effects"))
+            if others == 0:
+                return
+            if others:
+                raise UserError(
+                    f"{self.path} holds a dataset whose effects were asked for otherwise, so that {others} of its "
+                    f"{len(self.scenes)} runs have other physics; {advice}; to go on with it: "
+                    f"{_overrides(there['effects'], here['effects'])}"
+                )
+        raise UserError(f"{self.path} holds a dataset made with other settings; {advice}")
+
+    def _decided_otherwise(self, asked: Any) -> int | None:
+        """How many runs would have other effects if `asked` decided; None where it cannot.
+
+        A dataset is its runs: a tolerance that has changed since, and decides all of them alike, makes no other one.
+        """
+        if not isinstance(asked, Mapping):
+            return None
+        try:
+            return sum(decided(scene, asked)[0] != self.physics[name][0] for name, scene in self.scenes.items())
+        except (UserError, SceneError):
+            return None
 
 
 def plan(
@@ -215,6 +237,13 @@ class Dataset:
         if split not in SPLITS:
             raise UserError(f"split is {split!r}; allowed: {', '.join(SPLITS)}")
         return [self.path / "runs" / f"{name}.h5" for name in self.split[split]]
+
+
+def _overrides(wanted: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """What on the command line turns the effects asked for here into those wanted."""
+    now = flattened(dict(here))
+    changed = {key: value for key, value in flattened(dict(wanted)).items() if now.get(key) != value}
+    return " ".join(f"effects.{key}={str(value).lower()}" for key, value in changed.items())
 
 
 def _are_names(names: Any) -> bool:

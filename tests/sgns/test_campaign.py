@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from mpm_warp import Scene
+from mpm_warp import Scene, effects_for
 from sgns.campaign import SPLITS, Dataset, plan
 from sgns.errors import UserError
 
@@ -98,6 +100,38 @@ def test_record_once_and_open(tmp_path):
     assert all(run.exists() for run in dataset.runs("train"))
     with pytest.raises(UserError, match="allowed: train, validation, test"):
         dataset.runs("valid")
+
+
+def test_a_tolerance_that_decides_alike_makes_no_other_dataset(tmp_path):
+    """The default tolerance was 0.01 once; what such datasets hold stays theirs as long as each run is decided alike."""
+    c = campaign(tmp_path)
+    numbers = [effects_for(scene)[1]["rate_dependence"].number for scene in c.scenes.values()]
+    numbers = [number for number in numbers if number > 0.0]  # the others' blades stay above the soil
+
+    def asking(friction: float):
+        tolerance = {"friction": friction, "grid": 0.03, "reach": 0.02}
+        return replace(c, effects={"rate_dependence": "auto", "tolerance": tolerance})
+
+    asking(10.0 * max(numbers)).record()
+    text = (c.path / "dataset.yaml").read_text()
+    asking(2.0 * max(numbers)).record()
+    assert (c.path / "dataset.yaml").read_text() == text
+    friction = 10.0 * max(numbers)
+    with pytest.raises(
+        UserError, match=rf"{len(numbers)} of its 10 runs have .*go on with it: effects.tolerance.friction={friction}$"
+    ):
+        asking(0.5 * min(numbers)).record()
+    with pytest.raises(UserError, match="made with other settings"):
+        replace(asking(friction), precision="float64").record()
+
+
+@pytest.mark.parametrize("effects", [3, {"colour": True}, {"tolerance": [1]}, None])
+def test_a_dataset_file_with_odd_effects_is_another_dataset(tmp_path, effects):
+    c = campaign(tmp_path)
+    c.path.mkdir()
+    (c.path / "dataset.yaml").write_text(yaml.safe_dump(c.describe() | {"effects": effects}))
+    with pytest.raises(UserError, match="made with other settings"):
+        c.record()
 
 
 def test_scenes_are_recorded_completely(tmp_path):
