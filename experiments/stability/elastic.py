@@ -2,7 +2,7 @@
 
     python experiments/stability/elastic.py
 
-Prints, ten times in its first second, how high soil is and what energy it has, and what the blade has done; ten seconds.
+Prints, ten times in its first second, how high soil is, its energy and what the blade has done.
 """
 
 from __future__ import annotations
@@ -47,8 +47,15 @@ def main() -> None:
         kinetic, potential, elastic = energies(solver, scene, frame)
         start = potential + elastic if start is None else start
         logging.info(
-            "%.2f s: highest %.2f m; kinetic %.2f J, elastic %.1f J, all since the start %.1f J; the blade's work %.1f J",
-            *(frame.time, frame.position[:, 2].max(), kinetic, elastic, kinetic + potential + elastic - start, work),
+            "%.2f s: highest %.2f m; kinetic %.2f J, elastic %.1f J, in all %.1f J more than at the start; work %.1f J",
+            *(
+                frame.time,
+                frame.position[:, 2].max(),
+                kinetic,
+                elastic,
+                kinetic + potential + elastic - start,
+                work,
+            ),
         )
 
 

@@ -16,7 +16,11 @@ from bagnold import layer, profile
 HERE = Path(__file__).parent
 PLAIN = {"elastic_damping": 0.0, "volume_averaging": 0.0, "remap_time": 0.0, "velocity_memory": 1.0e-9}
 """The group numerics=every_step."""
-CASES = ((0.003, 0.6), (0.003, 0.15), (0.0015, 0.6))  # grid spacing [m], share of the largest time step; 8 per cell
+CASES = (
+    (0.003, 0.6),
+    (0.003, 0.15),
+    (0.0015, 0.6),
+)  # grid spacing [m], share of the largest time step; 8 per cell
 
 
 def main() -> None:

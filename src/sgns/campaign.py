@@ -107,7 +107,9 @@ class Campaign:
         if not isinstance(asked, Mapping):
             return None
         try:
-            return sum(decided(scene, asked)[0] != self.physics[name][0] for name, scene in self.scenes.items())
+            return sum(
+                decided(scene, asked)[0] != self.physics[name][0] for name, scene in self.scenes.items()
+            )
         except (UserError, SceneError):
             return None
 

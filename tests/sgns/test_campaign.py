@@ -103,7 +103,7 @@ def test_record_once_and_open(tmp_path):
 
 
 def test_a_tolerance_that_decides_alike_makes_no_other_dataset(tmp_path):
-    """The default tolerance was 0.01 once; what such datasets hold stays theirs as long as each run is decided alike."""
+    """The default tolerance was 0.01 once; such datasets stay what they are while each run is decided alike."""
     c = campaign(tmp_path)
     numbers = [effects_for(scene)[1]["rate_dependence"].number for scene in c.scenes.values()]
     numbers = [number for number in numbers if number > 0.0]  # the others' blades stay above the soil
@@ -118,7 +118,8 @@ def test_a_tolerance_that_decides_alike_makes_no_other_dataset(tmp_path):
     assert (c.path / "dataset.yaml").read_text() == text
     friction = 10.0 * max(numbers)
     with pytest.raises(
-        UserError, match=rf"{len(numbers)} of its 10 runs have .*go on with it: effects.tolerance.friction={friction}$"
+        UserError,
+        match=rf"{len(numbers)} of its 10 runs have .*go on with it: effects.tolerance.friction={friction}$",
     ):
         asking(0.5 * min(numbers)).record()
     with pytest.raises(UserError, match="made with other settings"):
