@@ -28,7 +28,7 @@ import warp as wp
 from hydra import compose, initialize_config_module
 from scenes import FARTHEST, FORCE, Case, cases, outcome, write_rows
 
-from mpm_warp import Effects, Frame, Scene, Solver, frames_together
+from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
 from mpm_warp.start import find_device
 from sgns.evaluation.provenance import cpu_model
 from sgns.scene_effects import asked_effects, decided
@@ -122,7 +122,12 @@ def main() -> int:
         for case in cases(Path(folder)) if options.part != "speed" else ():
             if options.only not in case.name:
                 continue
-            row = compared(case, options.device)
+            try:
+                row = compared(case, options.device)
+            except (SceneError, SolverStopped, RuntimeError) as error:  # the other cases are of use, too
+                apart.append(case.name)
+                print(f"{case.name}: {error}", flush=True)
+                continue
             rows.append(row)
             if not row["agrees"]:
                 apart.append(case.name)
