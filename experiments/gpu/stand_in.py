@@ -54,9 +54,14 @@ FLAGS = (
 )
 
 
+@cache
 def compiler() -> str | None:
     """Path of g++, if there is one that can do this."""
-    return shutil.which("g++") if sys.platform == "linux" else None
+    found = shutil.which("g++") if sys.platform == "linux" else None
+    if found is None:
+        return None
+    trial = [found, *FLAGS, "-fsanitize=thread", "-c", "-x", "c++", "-o", "/dev/null", "/dev/null"]
+    return found if subprocess.run(trial, capture_output=True).returncode == 0 else None
 
 
 @dataclass

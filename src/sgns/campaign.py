@@ -92,10 +92,11 @@ class Campaign:
             if others == 0:
                 return
             if others:
+                changed = _overrides(there["effects"], here["effects"])
                 raise UserError(
                     f"{self.path} holds a dataset whose effects were asked for otherwise, so that {others} of its "
-                    f"{len(self.scenes)} runs have other physics; {advice}; to go on with it: "
-                    f"{_overrides(there['effects'], here['effects'])}"
+                    f"{len(self.scenes)} runs have other physics; {advice}"
+                    + (f"; to go on with it: {changed}" if changed else "")
                 )
         raise UserError(f"{self.path} holds a dataset made with other settings; {advice}")
 

@@ -65,5 +65,6 @@ def test_threads_agree_with_the_loop():
     with on_stand_in(Threads()) as threads:
         *_, two = Solver(small_cut()).frames()
     assert threads.launches > 100
-    assert abs(one.position - two.position).max() < 1e-6
-    assert abs(one.force - two.force).max() < 1e-4 * abs(one.force).max()
+    # Fused products and another order of sums: 4e-6 m in longer runs; sums that are not atomic: 2e-4 m.
+    assert abs(one.position - two.position).max() < 1e-5
+    assert abs(one.force - two.force).max() < 1e-3 * abs(one.force).max()

@@ -64,7 +64,7 @@ class Observation:
     def finite(self) -> bool:
         """Whether force and soil, where there is some, stayed finite all the time."""
         soil = self.moved[:, ~np.isnan(self.moved[0])]
-        return bool(np.isfinite(self.force).all() and np.isfinite(soil).all())
+        return bool(soil.size and np.isfinite(self.force).all() and np.isfinite(soil).all())
 
 
 def read_observation(file: Path) -> Observation:

@@ -90,6 +90,8 @@ def test_places_without_soil_are_no_sign_of_a_run_that_left_the_numbers() -> Non
     assert run.finite
     run.moved[1:, 5] = np.nan
     assert not run.finite
+    run.moved[:] = np.nan
+    assert not run.finite
 
 
 def test_the_surface_of_a_full_bed_is_flat_at_zero_whatever_the_spacing() -> None:
