@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 import sgns
 from sgns.cli import COMMANDS
@@ -93,3 +95,22 @@ def test_public_names_load_when_used() -> None:
     assert sgns.UserError is not None and set(sgns.__all__) <= set(dir(sgns))
     with pytest.raises(AttributeError, match="public names"):
         _ = sgns.no_such_name
+
+
+def test_the_lock_file_pins_every_dependency_within_its_range(project: dict) -> None:
+    entries = re.split(r"\n(?=\S)", (ROOT / "requirements.lock").read_text())
+    locked: dict[str, list[Requirement]] = {}
+    for entry in entries:
+        if not entry.startswith("#"):
+            assert "--hash=sha256:" in entry, entry
+            pin = Requirement(entry.split("\\")[0])
+            locked.setdefault(canonicalize_name(pin.name), []).append(pin)
+    extras = project["project"]["optional-dependencies"]
+    for text in [*project["project"]["dependencies"], *extras["test"], *extras["lint"]]:
+        asked = Requirement(text)
+        if asked.name == "torch":  # installed first, by its own line
+            assert "torch" not in locked
+            continue
+        for pin in locked[canonicalize_name(asked.name)]:
+            (exact,) = pin.specifier
+            assert exact.operator == "==" and asked.specifier.contains(exact.version), pin
