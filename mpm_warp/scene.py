@@ -17,7 +17,7 @@ from .axle import Axle
 from .bodies import Body
 from .errors import SceneError
 from .material import Material
-from .rotation import rotate
+from .rotation import angular_velocity, rotate
 from .walls import Walls
 
 __all__ = ["Bed", "Scene"]
@@ -277,6 +277,31 @@ class Scene:
         """Poses at the frames, shape (T, 7)."""
         return self.poses_at(self.times())
 
+    def path_times(self) -> np.ndarray:
+        """Times at which a prescribed path may turn [s], increasing, shape (k,); none for a smooth motion."""
+        return np.zeros(0)
+
+    def travel(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the body's centre travels [m] and by what angle the body turns [rad] from each of the increasing times
+        (T,) [s] to the next, both of shape (T - 1,).
+
+        A path counts row by row, whatever it comes back to; between rows, and without any, a body turns the shortest
+        way.
+        """
+        rows = self.path_times()
+        every = np.union1d(time, rows[(rows > time[0]) & (rows < time[-1])])
+        poses = self.poses_at(every)
+        way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+        angle = np.linalg.norm(angular_velocity(poses[:-1, 3:], poses[1:, 3:], 1.0), axis=1)
+        first = np.searchsorted(every, time[:-1])
+        return np.add.reduceat(way, first), np.add.reduceat(angle, first)
+
+    def ways(self, time: np.ndarray) -> np.ndarray:
+        """The most that any point of the body travels from each of the increasing times (T,) [s] to the next [m],
+        shape (T - 1,)."""
+        way, angle = self.travel(time)
+        return way + self.body.reach * angle
+
     def body_points(self) -> np.ndarray:
         """Body nodes in the body frame [m], shape (M, 3)."""
         return np.zeros((0, 3))
@@ -333,7 +358,9 @@ class Scene:
         # Nothing is in the way of a body at the sides of a channel, whose walls stand for more of the same soil.
         side = math.inf if self.bed.walls.kinds[1] in ("slip", "periodic") else 0.0
         outline = self.body.outline()
-        for time, pose in zip(self.times(), self.body_poses(), strict=True):
+        rows, times = self.path_times(), self.times()
+        times = np.union1d(times, rows[(rows > 0.0) & (rows < times[-1])])
+        for time, pose in zip(times, self.poses_at(times), strict=True):
             points = rotate(pose[3:], outline) + pose[:3]
             below = points[:, 2] < 0.0
             for axis, low, high, name in (

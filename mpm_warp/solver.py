@@ -113,7 +113,7 @@ class Solver:
     def frames(self) -> Iterator[Frame]:
         """All frames in order, the initial state first, or those after the one that the solver starts from.
 
-        Each call begins anew and gives the same frames. There is one memory, so the frames of an earlier call end there.
+        Each call begins anew and gives the same frames. There is one memory: the frames of an earlier call end there.
 
         Raises:
             SceneError: the frames were asked for again meanwhile.

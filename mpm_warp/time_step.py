@@ -25,12 +25,22 @@ def damped_share(scene: Scene) -> float:
     return math.sqrt(1.0 + scene.elastic_damping**2) - scene.elastic_damping
 
 
-def top_body_speed(scene: Scene) -> float:
-    """Fastest motion of the body between frames [m/s]."""
+def top_body_speed(scene: Scene, step: float | None = None) -> float:
+    """Fastest motion of any point of the body between frames and, with `step` [s], along its path within such a time
+    [m/s]; a free height moves on top of it."""
     if scene.body is None:
         return 0.0
-    step = np.diff(scene.body_poses()[:, :3], axis=0)
-    return float(np.max(np.linalg.norm(step, axis=1), initial=0.0) * scene.frame_rate)
+    times = scene.times()
+    top = float(np.max(scene.ways(times), initial=0.0) * scene.frame_rate)
+    rows = scene.path_times()
+    if step is None or not len(rows):
+        return top
+    # Where a path is fastest, such a time begins or ends at one of its rows.
+    begin = np.clip(np.concatenate([rows, rows - step]), 0.0, times[-1])
+    every = np.unique(np.concatenate([[0.0], begin, begin + step]))
+    travelled = np.concatenate([[0.0], np.cumsum(scene.ways(every))])
+    way = np.interp(begin + step, every, travelled) - np.interp(begin, every, travelled)
+    return max(top, float(way.max()) / step)
 
 
 def steps_to_remap(scene: Scene, time_step: float, speed: float) -> int:

@@ -124,6 +124,11 @@ class Wheel(Scene):
         poses[:, 3:] = np.array([about_y(angle) for angle in self.angular_speed * driven])
         return poses
 
+    def travel(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # From the speeds: poses do not show a whole turn.
+        driven = np.diff(np.maximum(time - self.settle, 0.0))
+        return abs(self.speed) * driven, self.angular_speed * driven
+
     def sinkage(self, poses: np.ndarray) -> np.ndarray:
         """Depth of the wheel's lowest point below the undisturbed surface [m], shape (T,) for poses (T, 7)."""
         return self.body.tip_radius - poses[:, 2]
