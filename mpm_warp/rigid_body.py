@@ -41,7 +41,7 @@ def longest_step(scene: Scene) -> float:
     """
     if scene.axle is None:
         return math.inf
-    volume = scene.bed.filled[1]
+    volume = scene.bed.particle_volume
     hx, hy, hz = scene.body.half_size
     area = 4.0 * hx * hy + 4.0 * hz * (hx + hy)
     return stable_step(scene.axle.mass, area / volume ** (2.0 / 3.0), *contact_spring(scene, volume))

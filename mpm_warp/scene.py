@@ -12,15 +12,27 @@ from typing import Any, ClassVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from .arrangement import ARRANGEMENTS, arrange
+from .arrangement import ARRANGEMENTS, arrange, particle_volume
 from .axle import Axle
 from .bodies import Body
 from .errors import SceneError
+from .limits import (
+    FRAME_RATE,
+    LEAST_COURANT,
+    MOST_DURATION,
+    MOST_FRAMES,
+    MOST_GRAVITY,
+    MOST_NODES,
+    MOST_PARTICLES,
+)
 from .material import Material
 from .rotation import angular_velocity, rotate
 from .walls import Walls
 
 __all__ = ["Bed", "Scene"]
+
+PADDING = 3
+"""Grid cells outside the bin, so that the nodes around a particle at a wall exist."""
 
 INITIAL_STRESSES = ("geostatic", "k0", "none")
 
@@ -67,11 +79,11 @@ class Bed:
             raise SceneError(
                 f"bed.particles_per_cell is {self.particles_per_cell}; allowed: above 0, at most 64"
             )
-        cells = np.prod(self.size) / self.spacing**3
-        if cells * self.particles_per_cell > 2e7:
+        particles = math.prod(s / self.spacing for s in self.size) * self.particles_per_cell
+        if not particles <= MOST_PARTICLES:
             raise SceneError(
-                f"the bed would hold {cells * self.particles_per_cell:.2g} particles; at most 2e7 are allowed: "
-                "use a larger bed.spacing"
+                f"the bed would hold {particles:.2g} particles; at most {MOST_PARTICLES:g} are allowed: use a larger "
+                "bed.spacing, a smaller bed.size or fewer bed.particles_per_cell"
             )
         if self.arrangement not in ARRANGEMENTS:
             raise SceneError(f"bed.arrangement is {self.arrangement!r}; allowed: {', '.join(ARRANGEMENTS)}")
@@ -79,8 +91,18 @@ class Bed:
             raise SceneError(
                 f"bed.initial_stress is {self.initial_stress!r}; allowed: {', '.join(INITIAL_STRESSES)}"
             )
-        if not self.headroom > 0:
+        if not (math.isfinite(self.headroom) and self.headroom > 0):
             raise SceneError(f"bed.headroom is {self.headroom} m; it must be above 0")
+        height, margin = self.size[2] + self.headroom, 2.0 * PADDING + 2.0
+        floor = math.prod(s / self.spacing + margin for s in self.size[:2])
+        nodes = floor * (height / self.spacing + margin)
+        if not nodes <= MOST_NODES:
+            fits = floor * (self.size[2] / self.spacing + margin) <= 0.5 * MOST_NODES
+            key = "lower bed.headroom" if fits else "use a larger bed.spacing"
+            raise SceneError(
+                f"bed.headroom is {self.headroom} m and bed.spacing {self.spacing} m: the grid would have {nodes:.2g} "
+                f"nodes; at most {MOST_NODES:g} are allowed: {key}"
+            )
         if not (self.store_every >= 1 and self.store_every == int(self.store_every)):
             raise SceneError(f"bed.store_every is {self.store_every}; it must be a whole number, 1 or more")
         if not isinstance(self.mirrored, bool):
@@ -96,6 +118,18 @@ class Bed:
     def particle_spacing(self) -> float:
         """Nominal distance between particles [m]."""
         return self.spacing / self.particles_per_cell ** (1.0 / 3.0)
+
+    @property
+    def particle_volume(self) -> float:
+        """Volume of a particle [m^3], as in `filled`."""
+        return particle_volume(self.arrangement, self.size, self.particle_spacing)
+
+    @property
+    def node_counts(self) -> tuple[int, int, int]:
+        """Nodes of the grid along x, y and z, with those outside the bin and up to the headroom."""
+        h = self.spacing
+        x, y = (math.ceil(s / h - 1e-6) + 2 * PADDING + 1 for s in self.size[:2])
+        return x, y, math.ceil((self.size[2] + self.headroom) / h) + 2 * PADDING + 1
 
     @cached_property
     def filled(self) -> tuple[np.ndarray, float]:
@@ -187,19 +221,28 @@ class Scene:
             Scene.kinds[cls.kind] = cls
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.gravity) and self.gravity >= 0):
-            raise SceneError(f"scene.gravity is {self.gravity} m/s^2; it must be 0 or more")
+        if not 0.0 <= self.gravity <= MOST_GRAVITY:
+            raise SceneError(f"scene.gravity is {self.gravity} m/s^2; allowed: 0 to {MOST_GRAVITY:g}")
         if not -90.0 < self.tilt < 90.0:
             raise SceneError(f"scene.tilt is {self.tilt} degrees; allowed: above -90, below 90")
-        if not (math.isfinite(self.frame_rate) and self.frame_rate > 0):
-            raise SceneError(f"scene.frame_rate is {self.frame_rate} Hz; it must be above 0")
-        if not (math.isfinite(self.duration) and self.duration * self.frame_rate >= 1.0):
+        if not FRAME_RATE[0] <= self.frame_rate <= FRAME_RATE[1]:
+            raise SceneError(
+                f"scene.frame_rate is {self.frame_rate} Hz; allowed: {FRAME_RATE[0]:g} to {FRAME_RATE[1]:g}"
+            )
+        if not self.duration * self.frame_rate >= 1.0:
             raise SceneError(f"scene.duration is {self.duration} s; it must last at least one frame")
+        if not self.duration <= MOST_DURATION:
+            raise SceneError(f"scene.duration is {self.duration} s; allowed: at most {MOST_DURATION:g}")
+        if not self.duration * self.frame_rate <= MOST_FRAMES:
+            raise SceneError(
+                f"scene.duration is {self.duration} s at scene.frame_rate {self.frame_rate} Hz: "
+                f"{self.duration * self.frame_rate:.2g} frames; at most {MOST_FRAMES:g} are allowed: lower one of them"
+            )
         if not -1.0 <= self.contact_margin <= 1.0:
             raise SceneError(f"scene.contact_margin is {self.contact_margin} grid spacings; allowed: -1 to 1")
-        if not 0.0 < self.courant <= MOST_COURANT:
+        if not LEAST_COURANT <= self.courant <= MOST_COURANT:
             raise SceneError(
-                f"scene.courant is {self.courant}; allowed: above 0, at most {MOST_COURANT}: with longer steps "
+                f"scene.courant is {self.courant}; allowed: {LEAST_COURANT:g} to {MOST_COURANT}: with longer steps "
                 "elastic waves in the soil grow"
             )
         for name in ("elastic_damping", "volume_averaging"):

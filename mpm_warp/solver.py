@@ -24,6 +24,7 @@ from .nonlocal_fluidity import NonlocalFluidity, wall_sink
 from .rigid_body import RigidBody
 from .rotation import rotate
 from .scene import Scene
+from .size import require_memory
 from .soil import soil_parameters
 from .start import find_device
 from .state import Memory, State
@@ -87,6 +88,7 @@ class Solver:
         self.device = find_device(device)
         self.precision = precision
         self._real = PRECISIONS[precision]
+        require_memory(scene, precision, device, self.effects.symmetry)
         if self.effects.symmetry:
             require_symmetry(scene)
         self._half = half(scene) if self.effects.symmetry else None
