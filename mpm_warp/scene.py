@@ -100,7 +100,7 @@ class Bed:
             fits = floor * (self.size[2] / self.spacing + margin) <= 0.5 * MOST_NODES
             key = "lower bed.headroom" if fits else "use a larger bed.spacing"
             raise SceneError(
-                f"bed.headroom is {self.headroom} m and bed.spacing {self.spacing} m: the grid would have {nodes:.2g} "
+                f"bed.headroom is {self.headroom} m and bed.spacing {self.spacing} m: the grid would have {nodes:.3g} "
                 f"nodes; at most {MOST_NODES:g} are allowed: {key}"
             )
         if not (self.store_every >= 1 and self.store_every == int(self.store_every)):
