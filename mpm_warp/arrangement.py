@@ -8,7 +8,7 @@ import numpy as np
 
 from .errors import SceneError
 
-__all__ = ["ARRANGEMENTS", "arrange", "lattice", "poisson_disk"]
+__all__ = ["ARRANGEMENTS", "arrange", "lattice", "particle_volume", "poisson_disk", "rows_of"]
 
 ARRANGEMENTS = ("lattice", "jittered", "poisson")
 
@@ -47,7 +47,7 @@ def _arranged(
     if kind == "jittered":
         points, volume = lattice(size, spacing)
         rng = np.random.default_rng(seed)
-        counts = np.maximum(1, np.round(np.asarray(size) / spacing)).astype(int)
+        counts = rows_of(size, spacing)
         moved = (np.asarray(size) / counts * rng.uniform(-0.5, 0.5, points.shape)).reshape(*counts, 3)
         if mirrored:
             # The far half of the rows moves as the near one does, mirrored; a row in the middle stays in the plane.
@@ -81,9 +81,21 @@ def _arranged(
     raise SceneError(f"bed.arrangement is {kind!r}; allowed: {', '.join(ARRANGEMENTS)}")
 
 
+def rows_of(size: tuple[float, float, float], spacing: float) -> np.ndarray:
+    """Particles of a lattice along each side, shape (3,)."""
+    return np.maximum(1, np.round(np.asarray(size) / spacing)).astype(int)
+
+
+def particle_volume(kind: str, size: tuple[float, float, float], spacing: float) -> float:
+    """The volume that `arrange` gives with the particles [m^3], without making these."""
+    if kind == "poisson":
+        return spacing**3
+    return float(np.prod(np.asarray(size) / rows_of(size, spacing)))
+
+
 def lattice(size: tuple[float, float, float], spacing: float) -> tuple[np.ndarray, float]:
     """A regular lattice that fills the bed exactly; the spacing is adjusted to fit each side."""
-    counts = np.maximum(1, np.round(np.asarray(size) / spacing)).astype(int)
+    counts = rows_of(size, spacing)
     step = np.asarray(size) / counts
     axes = [(np.arange(c) + 0.5) * s for c, s in zip(counts, step, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

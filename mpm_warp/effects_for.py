@@ -11,6 +11,7 @@ from .effects import Effects
 from .errors import SceneError
 from .expected_flow import Flow, expected_flow
 from .scene import Scene
+from .size import scene_size
 from .symmetry import asymmetry, require_symmetry
 
 __all__ = ["EFFECTS", "Decision", "Tolerances", "effects_for"]
@@ -64,9 +65,10 @@ def effects_for(
         The effects, and the decision about each name in `EFFECTS`.
 
     Raises:
-        SceneError: something unknown was asked for, or what this scene cannot have.
+        SceneError: something unknown was asked for, or what this scene cannot have; or the scene is too large.
     """
     asked = _checked(asked or {})
+    scene_size(scene)  # what follows looks at all particles
     tolerances = tolerances or Tolerances()
     flow = expected_flow(scene)
     found: dict[str, Decision] = {}

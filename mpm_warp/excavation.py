@@ -87,6 +87,9 @@ class Excavation(Scene):
         poses[:, 3:] = rotation
         return poses
 
+    def path_times(self) -> np.ndarray:
+        return np.array([row[0] for row in self.path or ()])
+
     def body_points(self) -> np.ndarray:
         return self.blade.points(*self.body_grid)
 

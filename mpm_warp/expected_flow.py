@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from .column import Column
-from .rotation import angular_velocity
 from .scene import Scene
 
 __all__ = ["Flow", "expected_flow"]
@@ -64,9 +63,8 @@ def _of_body(scene: Scene) -> Flow | None:
         return None
     poses = scene.body_poses()
     depth = -(poses[:, 2] + (_heights(poses[:, 3:]) @ body.outline().T).min(axis=1))
-    spin = angular_velocity(poses[:-1, 3:], poses[1:, 3:], 1.0 / scene.frame_rate)
-    travel = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) * scene.frame_rate
-    speed = np.maximum(travel, np.linalg.norm(spin, axis=1) * body.reach)
+    way, angle = scene.travel(scene.times())
+    speed = np.maximum(way, angle * body.reach) * scene.frame_rate
     if scene.axle is None:
         speed, thickness = speed[depth[:-1] > 0.0], float(depth.max())
     else:

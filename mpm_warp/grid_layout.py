@@ -10,11 +10,9 @@ import warp as wp
 
 from .grid import grid_struct
 from .images import mirror_pairs, seam_pairs
-from .scene import Scene
+from .scene import PADDING, Scene
 
 __all__ = ["lay_grid"]
-
-_PADDING = 3  # cells outside the bin, so that the nodes around a particle at a wall exist
 
 
 def lay_grid(
@@ -29,19 +27,18 @@ def lay_grid(
     bed, vec3 = scene.bed, wp.types.vector(3, real)
     h = bed.spacing
     cells = [math.ceil(s / h - 1e-6) for s in bed.size[:2]]
-    origin = [0.5 * (s - c * h) - _PADDING * h for s, c in zip(bed.size[:2], cells, strict=True)]
-    origin.append(-bed.size[2] - _PADDING * h)
-    count = [c + 2 * _PADDING + 1 for c in cells]
-    count.append(math.ceil((bed.size[2] + bed.headroom) / h) + 2 * _PADDING + 1)
-    low = [_PADDING, _PADDING, _PADDING]
-    high = [_PADDING + cells[0], _PADDING + cells[1], 2**30]
+    origin = [0.5 * (s - c * h) - PADDING * h for s, c in zip(bed.size[:2], cells, strict=True)]
+    origin.append(-bed.size[2] - PADDING * h)
+    count = list(bed.node_counts)
+    low = [PADDING, PADDING, PADDING]
+    high = [PADDING + cells[0], PADDING + cells[1], 2**30]
     ghosts = {}
     for axis in (0, 1):
         if bed.walls.kinds[axis] == "periodic":
-            ghosts[axis] = seam_pairs(_PADDING, cells[axis])
+            ghosts[axis] = seam_pairs(PADDING, cells[axis])
             low[axis], high[axis] = -1, 2**30  # no walls
     if symmetric:
-        ghosts[1] = mirror_pairs(2 * _PADDING + cells[1])
+        ghosts[1] = mirror_pairs(2 * PADDING + cells[1])
         left_out = ghosts[1].min()
         ghosts[1] -= left_out
         origin[1] += left_out * h

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from .rotation import angular_velocity
 from .scene import Scene
 from .time_step import damped_share, top_body_speed
 
@@ -20,8 +19,8 @@ STABLE_COURANT = 0.84
 leaves soil room to become stiffer."""
 
 
-def speed_bound(scene: Scene) -> float:
-    """Speed [m/s] that no soil of a scene can reach.
+def speed_bound(scene: Scene, time_step: float) -> float:
+    """Speed [m/s] that no soil of a scene can reach, computed in steps of `time_step` [s].
 
     Four times the sum of what it has at the start, of the fastest point of the body and of a fall through the whole
     grid (or, down an endless slope, of a fall for as long as the scene lasts), and half the speed of its waves for what
@@ -33,16 +32,7 @@ def speed_bound(scene: Scene) -> float:
     fall = math.sqrt(2.0 * scene.gravity * height)
     if bed.walls.kinds[0] == "periodic" and scene.tilt:
         fall = max(fall, scene.gravity * scene.duration)
-    return 4.0 * (start + _body_speed(scene) + fall) + 0.5 * scene.material.wave_speed
-
-
-def _body_speed(scene: Scene) -> float:
-    """Of its fastest point between frames [m/s]."""
-    if scene.body is None:
-        return 0.0
-    turns = scene.body_poses()[:, 3:]
-    spin = angular_velocity(turns[:-1], turns[1:], 1.0 / scene.frame_rate)
-    return top_body_speed(scene) + scene.body.reach * float(np.linalg.norm(spin, axis=1).max(initial=0.0))
+    return 4.0 * (start + top_body_speed(scene, time_step) + fall) + 0.5 * scene.material.wave_speed
 
 
 class Guard:
@@ -55,7 +45,7 @@ class Guard:
 
     def __init__(self, scene: Scene, time_step: float) -> None:
         self._time_step = time_step
-        self.speed_bound = speed_bound(scene)
+        self.speed_bound = speed_bound(scene, time_step)
         # Compressed soil is stiffer: its waves are faster by sqrt(1 - ln J).
         stable = damped_share(scene) * scene.bed.spacing / scene.material.wave_speed
         self._most_compression = min(LARGEST_STRAIN, (STABLE_COURANT * stable / time_step) ** 2 - 1.0)

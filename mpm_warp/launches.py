@@ -16,6 +16,8 @@ from typing import Any
 
 import warp as wp
 
+from .kernel_cache import load_kernel
+
 __all__ = ["Launch", "SceneKernel", "Together", "scene_kernel"]
 
 
@@ -99,6 +101,7 @@ class Launch:
 
     @cached_property
     def _recorded(self) -> wp.Launch:
+        load_kernel(self.kernel.alone, self.device)
         return wp.launch(self.kernel.alone, self.count, self.arguments, device=self.device, record_cmd=True)
 
 
@@ -120,6 +123,7 @@ class Together:
                 setattr(rows[-1], name, value)
         counts = [launch.count for launch in launches]
         table = wp.array(rows, dtype=row, device=device), wp.array(counts, dtype=int, device=device)
+        load_kernel(kernel.together, device)
         self._recorded = wp.launch(
             kernel.together,
             (len(launches), max(counts)),

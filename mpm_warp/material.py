@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from .errors import SceneError
 from .friction import FRICTION_MAPS, static_friction
+from .limits import LEAST_PACKING, MOST_POISSONS_RATIO, YOUNGS_MODULUS
 
 __all__ = ["FLUIDITY_AT_WALLS", "RATE_LAWS", "Material"]
 
@@ -74,12 +75,18 @@ class Material:
             value = getattr(self, name)
             if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
                 raise SceneError(f"material.{name} is {value}; it must be a number above 0")
-        if not 0.0 <= self.poissons_ratio < 0.5:
+        low, high = YOUNGS_MODULUS
+        if not low <= self.youngs_modulus <= high:
             raise SceneError(
-                f"material.poissons_ratio is {self.poissons_ratio}; allowed: 0 up to, not including, 0.5"
+                f"material.youngs_modulus is {self.youngs_modulus} Pa; allowed: {low:g} to {high:g}"
             )
-        if not 0.0 < self.packing <= 1.0:
-            raise SceneError(f"material.packing is {self.packing}; allowed: above 0, at most 1")
+        if not 0.0 <= self.poissons_ratio <= MOST_POISSONS_RATIO:
+            raise SceneError(
+                f"material.poissons_ratio is {self.poissons_ratio}; allowed: 0 to {MOST_POISSONS_RATIO}: soil that "
+                "keeps its volume has infinitely fast waves"
+            )
+        if not LEAST_PACKING <= self.packing <= 1.0:
+            raise SceneError(f"material.packing is {self.packing}; allowed: {LEAST_PACKING} to 1")
         if not self.static_friction > 0.0:
             raise SceneError(f"material.static_friction is {self.static_friction}; it must be above 0")
         if not self.limit_friction > self.static_friction:

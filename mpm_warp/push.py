@@ -39,6 +39,9 @@ class Push(Scene):
     def poses_at(self, time: np.ndarray) -> np.ndarray:
         return sampled_poses(np.asarray(self.path), np.atleast_1d(np.asarray(time, dtype=float)))
 
+    def path_times(self) -> np.ndarray:
+        return np.array([row[0] for row in self.path])
+
     def body_points(self) -> np.ndarray:
         return self.tool.points()
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["RigidBody", "contact_spring", "longest_step"]
 
 LONGEST_WAY = 0.5
-"""Of a body in one substep [grid spacings]."""
+"""Of any point of a body in one substep [grid spacings]."""
 
 
 def contact_spring(scene: Scene, volume: float) -> tuple[float, float]:
@@ -41,7 +41,7 @@ def longest_step(scene: Scene) -> float:
     """
     if scene.axle is None:
         return math.inf
-    volume = scene.bed.filled[1]
+    volume = scene.bed.particle_volume
     hx, hy, hz = scene.body.half_size
     area = 4.0 * hx * hy + 4.0 * hz * (hx + hy)
     return stable_step(scene.axle.mass, area / volume ** (2.0 / 3.0), *contact_spring(scene, volume))
@@ -115,8 +115,9 @@ class RigidBody:
         self.data.impulse.zero_()
         if self._axle is not None:
             self._axle[2:].zero_()
-        poses = self.scene.poses_at((frame * self.substeps + np.arange(self.substeps + 1)) * self.dt)
-        self._require_steady(frame, poses[:, :3])
+        times = (frame * self.substeps + np.arange(self.substeps + 1)) * self.dt
+        poses = self.scene.poses_at(times)
+        self._require_steady(frame, times, poses[:, :3])
         velocity = np.diff(poses[:, :3], axis=0) / self.dt
         spin = angular_velocity(poses[:-1, 3:], poses[1:, 3:], self.dt)
         for array, values in (
@@ -166,18 +167,20 @@ class RigidBody:
                 f"the body reached the floor of the bin by {time:.3f} s: make scene.bed.size deeper or the load smaller"
             )
 
-    def _require_steady(self, frame: int, position: np.ndarray) -> None:
+    def _require_steady(self, frame: int, times: np.ndarray, position: np.ndarray) -> None:
         """A body that is somewhere else in the next substep does not push soil: it appears in its midst."""
-        way = np.linalg.norm(np.diff(position, axis=0), axis=1)
-        far = ~(way <= LONGEST_WAY * self.scene.bed.spacing)
+        way, angle = self.scene.travel(times)
+        farthest, most = way + self.scene.body.reach * angle, LONGEST_WAY * self.scene.bed.spacing
+        far = ~(farthest <= most)
         if not far.any():
             return
         substep = int(np.argmax(far))
         at = ", ".join(f"{c:.4f}" for c in position[substep])
         raise SolverStopped(
-            f"the body jumps by {way[substep]:.3g} m from ({at}) m within substep {substep} of frame {frame + 1}, at "
-            f"{frame / self.scene.frame_rate + substep * self.dt:.5f} s: make its path smooth there; the frames before "
-            "it are good"
+            f"the body jumps by {way[substep]:.3g} m from ({at}) m and turns by {math.degrees(angle[substep]):.3g} "
+            f"degrees within substep {substep} of frame {frame + 1}, {self.dt:.3g} s long, at {times[substep]:.5f} s: "
+            f"its farthest point moves {farthest[substep]:.3g} m, allowed: {most:.3g} m, half a grid spacing; make its "
+            "path smooth or slower there; the frames before it are good"
         )
 
     def impulse(self) -> np.ndarray:

@@ -12,15 +12,27 @@ from typing import Any, ClassVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from .arrangement import ARRANGEMENTS, arrange
+from .arrangement import ARRANGEMENTS, arrange, particle_volume
 from .axle import Axle
 from .bodies import Body
 from .errors import SceneError
+from .limits import (
+    FRAME_RATE,
+    LEAST_COURANT,
+    MOST_DURATION,
+    MOST_FRAMES,
+    MOST_GRAVITY,
+    MOST_NODES,
+    MOST_PARTICLES,
+)
 from .material import Material
-from .rotation import rotate
+from .rotation import angular_velocity, rotate
 from .walls import Walls
 
 __all__ = ["Bed", "Scene"]
+
+PADDING = 3
+"""Grid cells outside the bin, so that the nodes around a particle at a wall exist."""
 
 INITIAL_STRESSES = ("geostatic", "k0", "none")
 
@@ -67,11 +79,11 @@ class Bed:
             raise SceneError(
                 f"bed.particles_per_cell is {self.particles_per_cell}; allowed: above 0, at most 64"
             )
-        cells = np.prod(self.size) / self.spacing**3
-        if cells * self.particles_per_cell > 2e7:
+        particles = math.prod(s / self.spacing for s in self.size) * self.particles_per_cell
+        if not particles <= MOST_PARTICLES:
             raise SceneError(
-                f"the bed would hold {cells * self.particles_per_cell:.2g} particles; at most 2e7 are allowed: "
-                "use a larger bed.spacing"
+                f"the bed would hold {particles:.2g} particles; at most {MOST_PARTICLES:g} are allowed: use a larger "
+                "bed.spacing, a smaller bed.size or fewer bed.particles_per_cell"
             )
         if self.arrangement not in ARRANGEMENTS:
             raise SceneError(f"bed.arrangement is {self.arrangement!r}; allowed: {', '.join(ARRANGEMENTS)}")
@@ -79,8 +91,18 @@ class Bed:
             raise SceneError(
                 f"bed.initial_stress is {self.initial_stress!r}; allowed: {', '.join(INITIAL_STRESSES)}"
             )
-        if not self.headroom > 0:
+        if not (math.isfinite(self.headroom) and self.headroom > 0):
             raise SceneError(f"bed.headroom is {self.headroom} m; it must be above 0")
+        height, margin = self.size[2] + self.headroom, 2.0 * PADDING + 2.0
+        floor = math.prod(s / self.spacing + margin for s in self.size[:2])
+        nodes = floor * (height / self.spacing + margin)
+        if not nodes <= MOST_NODES:
+            fits = floor * (self.size[2] / self.spacing + margin) <= 0.5 * MOST_NODES
+            key = "lower bed.headroom" if fits else "use a larger bed.spacing"
+            raise SceneError(
+                f"bed.headroom is {self.headroom} m and bed.spacing {self.spacing} m: the grid would have {nodes:.3g} "
+                f"nodes; at most {MOST_NODES:g} are allowed: {key}"
+            )
         if not (self.store_every >= 1 and self.store_every == int(self.store_every)):
             raise SceneError(f"bed.store_every is {self.store_every}; it must be a whole number, 1 or more")
         if not isinstance(self.mirrored, bool):
@@ -96,6 +118,18 @@ class Bed:
     def particle_spacing(self) -> float:
         """Nominal distance between particles [m]."""
         return self.spacing / self.particles_per_cell ** (1.0 / 3.0)
+
+    @property
+    def particle_volume(self) -> float:
+        """Volume of a particle [m^3], as in `filled`."""
+        return particle_volume(self.arrangement, self.size, self.particle_spacing)
+
+    @property
+    def node_counts(self) -> tuple[int, int, int]:
+        """Nodes of the grid along x, y and z, with those outside the bin and up to the headroom."""
+        h = self.spacing
+        x, y = (math.ceil(s / h - 1e-6) + 2 * PADDING + 1 for s in self.size[:2])
+        return x, y, math.ceil((self.size[2] + self.headroom) / h) + 2 * PADDING + 1
 
     @cached_property
     def filled(self) -> tuple[np.ndarray, float]:
@@ -187,19 +221,28 @@ class Scene:
             Scene.kinds[cls.kind] = cls
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.gravity) and self.gravity >= 0):
-            raise SceneError(f"scene.gravity is {self.gravity} m/s^2; it must be 0 or more")
+        if not 0.0 <= self.gravity <= MOST_GRAVITY:
+            raise SceneError(f"scene.gravity is {self.gravity} m/s^2; allowed: 0 to {MOST_GRAVITY:g}")
         if not -90.0 < self.tilt < 90.0:
             raise SceneError(f"scene.tilt is {self.tilt} degrees; allowed: above -90, below 90")
-        if not (math.isfinite(self.frame_rate) and self.frame_rate > 0):
-            raise SceneError(f"scene.frame_rate is {self.frame_rate} Hz; it must be above 0")
-        if not (math.isfinite(self.duration) and self.duration * self.frame_rate >= 1.0):
+        if not FRAME_RATE[0] <= self.frame_rate <= FRAME_RATE[1]:
+            raise SceneError(
+                f"scene.frame_rate is {self.frame_rate} Hz; allowed: {FRAME_RATE[0]:g} to {FRAME_RATE[1]:g}"
+            )
+        if not self.duration * self.frame_rate >= 1.0:
             raise SceneError(f"scene.duration is {self.duration} s; it must last at least one frame")
+        if not self.duration <= MOST_DURATION:
+            raise SceneError(f"scene.duration is {self.duration} s; allowed: at most {MOST_DURATION:g}")
+        if not self.duration * self.frame_rate <= MOST_FRAMES:
+            raise SceneError(
+                f"scene.duration is {self.duration} s at scene.frame_rate {self.frame_rate} Hz: "
+                f"{self.duration * self.frame_rate:.2g} frames; at most {MOST_FRAMES:g} are allowed: lower one of them"
+            )
         if not -1.0 <= self.contact_margin <= 1.0:
             raise SceneError(f"scene.contact_margin is {self.contact_margin} grid spacings; allowed: -1 to 1")
-        if not 0.0 < self.courant <= MOST_COURANT:
+        if not LEAST_COURANT <= self.courant <= MOST_COURANT:
             raise SceneError(
-                f"scene.courant is {self.courant}; allowed: above 0, at most {MOST_COURANT}: with longer steps "
+                f"scene.courant is {self.courant}; allowed: {LEAST_COURANT:g} to {MOST_COURANT}: with longer steps "
                 "elastic waves in the soil grow"
             )
         for name in ("elastic_damping", "volume_averaging"):
@@ -277,6 +320,31 @@ class Scene:
         """Poses at the frames, shape (T, 7)."""
         return self.poses_at(self.times())
 
+    def path_times(self) -> np.ndarray:
+        """Times at which a prescribed path may turn [s], increasing, shape (k,); none for a smooth motion."""
+        return np.zeros(0)
+
+    def travel(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the body's centre travels [m] and by what angle the body turns [rad] from each of the increasing times
+        (T,) [s] to the next, both of shape (T - 1,).
+
+        A path counts row by row, whatever it comes back to; between rows, and without any, a body turns the shortest
+        way.
+        """
+        rows = self.path_times()
+        every = np.union1d(time, rows[(rows > time[0]) & (rows < time[-1])])
+        poses = self.poses_at(every)
+        way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+        angle = np.linalg.norm(angular_velocity(poses[:-1, 3:], poses[1:, 3:], 1.0), axis=1)
+        first = np.searchsorted(every, time[:-1])
+        return np.add.reduceat(way, first), np.add.reduceat(angle, first)
+
+    def ways(self, time: np.ndarray) -> np.ndarray:
+        """The most that any point of the body travels from each of the increasing times (T,) [s] to the next [m],
+        shape (T - 1,)."""
+        way, angle = self.travel(time)
+        return way + self.body.reach * angle
+
     def body_points(self) -> np.ndarray:
         """Body nodes in the body frame [m], shape (M, 3)."""
         return np.zeros((0, 3))
@@ -333,7 +401,9 @@ class Scene:
         # Nothing is in the way of a body at the sides of a channel, whose walls stand for more of the same soil.
         side = math.inf if self.bed.walls.kinds[1] in ("slip", "periodic") else 0.0
         outline = self.body.outline()
-        for time, pose in zip(self.times(), self.body_poses(), strict=True):
+        rows, times = self.path_times(), self.times()
+        times = np.union1d(times, rows[(rows > 0.0) & (rows < times[-1])])
+        for time, pose in zip(times, self.poses_at(times), strict=True):
             points = rotate(pose[3:], outline) + pose[:3]
             below = points[:, 2] < 0.0
             for axis, low, high, name in (

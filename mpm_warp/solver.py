@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from .nonlocal_fluidity import NonlocalFluidity, wall_sink
 from .rigid_body import RigidBody
 from .rotation import rotate
 from .scene import Scene
+from .size import require_memory
 from .soil import soil_parameters
 from .start import find_device
 from .state import Memory, State
@@ -86,6 +88,7 @@ class Solver:
         self.device = find_device(device)
         self.precision = precision
         self._real = PRECISIONS[precision]
+        require_memory(scene, precision, device, self.effects.symmetry)
         if self.effects.symmetry:
             require_symmetry(scene)
         self._half = half(scene) if self.effects.symmetry else None
@@ -95,10 +98,9 @@ class Solver:
         self.time_step = 1.0 / scene.frame_rate / self.substeps_per_frame
         """Substep [s]."""
         self._guard = Guard(scene, self.time_step)
-        self._allocate()
-        self._start = start
-        if start is not None:
-            self._memory.load(start)
+        self._start = copy.deepcopy(start)  # every beginning needs it as it is now
+        self._beginnings = 0
+        self._make_ready()
 
     @property
     def particle_count(self) -> int:
@@ -113,7 +115,10 @@ class Solver:
     def frames(self) -> Iterator[Frame]:
         """All frames in order, the initial state first, or those after the one that the solver starts from.
 
+        Each call begins anew and gives the same frames. There is one memory: the frames of an earlier call end there.
+
         Raises:
+            SceneError: the frames were asked for again meanwhile.
             SolverStopped: in the first frame in which a particle or the body went wrong, with the state before it.
         """
         worker = Worker(self.device)
@@ -126,6 +131,20 @@ class Solver:
     def stages(self) -> Generator[Frame | Work, None, None]:
         """As `frames`, with all work that the device has to do before the solver can go on: the caller has it done,
         that of other scenes with it (batch.py)."""
+        if self._beginnings:
+            self._make_ready()
+        self._beginnings += 1
+        beginning = self._beginnings
+        for stage in self._computed():
+            yield stage
+            if self._beginnings != beginning:
+                raise SceneError(
+                    "the frames of this solver were asked for again, and it began anew: take them from the later call, "
+                    "or make a Solver for each"
+                )
+
+    def _computed(self) -> Iterator[Frame | Work]:
+        """What `stages` gives, from the solver's memory as it is."""
         for program in (self._remap, self._until_remap):
             yield Work(program, 0)
         first = 0 if self._start is None else self._start.frame + 1
@@ -147,6 +166,12 @@ class Solver:
         return self._memory.state()
 
     # --- set-up -------------------------------------------------------------------------------------------
+
+    def _make_ready(self) -> None:
+        """Arrays as they are before the first frame, or at the state to start from."""
+        self._allocate()
+        if self._start is not None:
+            self._memory.load(self._start)
 
     def _allocate(self) -> None:
         scene, real, device = self.scene, self._real, self.device

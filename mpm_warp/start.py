@@ -6,26 +6,33 @@ import ctypes
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 
 import warp as wp
 
 from .errors import SceneError
 
-__all__ = ["find_device", "start_warp"]
+__all__ = ["find_device", "silent_stderr", "start_warp"]
 
 
 @cache
 def start_warp() -> None:
-    """Initialise Warp once, without its banner and, where there is no CUDA driver, without saying so."""
+    """Initialise Warp once, without its banner and, where there is no CUDA driver, without saying so.
+
+    Raises:
+        SceneError: it has no place for compiled kernels.
+    """
     # Warp announces every kernel it loads; here only its warnings are of use.
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    if _has_cuda_driver():
-        wp.init()
-    else:
-        with _silent_stderr():
+    try:
+        with nullcontext() if _has_cuda_driver() else silent_stderr():
             wp.init()
+    except OSError as error:
+        raise SceneError(
+            f"Warp cannot make its folder of compiled kernels ({error}); name another one in the environment variable "
+            "WARP_CACHE_PATH"
+        ) from error
 
 
 def find_device(name: str) -> wp.Device:
@@ -52,7 +59,8 @@ def _has_cuda_driver() -> bool:
 
 
 @contextmanager
-def _silent_stderr() -> Iterator[None]:
+def silent_stderr() -> Iterator[None]:
+    """Nothing reaches the error stream, not from native code either."""
     # The warning comes from native code, past Python's sys.stderr.
     try:
         kept = os.dup(2)

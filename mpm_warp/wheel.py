@@ -11,6 +11,7 @@ import numpy as np
 from .axle import Axle
 from .bodies import Cylinder
 from .errors import SceneError
+from .limits import BODY_MASS
 from .rotation import about_y
 from .scene import Scene
 
@@ -67,6 +68,11 @@ class Wheel(Scene):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise SceneError(f"scene.{name} is {value} {unit}; a wheel needs more than 0")
+        if not BODY_MASS[0] <= self.load / self.gravity <= BODY_MASS[1]:
+            raise SceneError(
+                f"scene.load is {self.load} N at scene.gravity {self.gravity} m/s^2: a wheel of "
+                f"{self.load / self.gravity:.3g} kg; allowed: {BODY_MASS[0]:g} to {BODY_MASS[1]:g} kg"
+            )
         if not -1.0 <= self.slip <= 1.0:
             raise SceneError(
                 f"scene.slip is {self.slip}; allowed: -1 to 1 (0: rolls freely, 1: turns on the spot)"
@@ -124,6 +130,11 @@ class Wheel(Scene):
         poses[:, 3:] = np.array([about_y(angle) for angle in self.angular_speed * driven])
         return poses
 
+    def travel(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # From the speeds: poses do not show a whole turn.
+        driven = np.diff(np.maximum(time - self.settle, 0.0))
+        return abs(self.speed) * driven, self.angular_speed * driven
+
     def sinkage(self, poses: np.ndarray) -> np.ndarray:
         """Depth of the wheel's lowest point below the undisturbed surface [m], shape (T,) for poses (T, 7)."""
         return self.body.tip_radius - poses[:, 2]
@@ -154,7 +165,7 @@ class Wheel(Scene):
         lx, ly, _ = self.bed.size
         if self.width >= ly:
             raise SceneError(f"scene.width is {self.width} m; the bin is only {ly:g} m wide")
-        first, last = self.body_poses()[[0, -1], 0]
+        first, last = self.poses_at(self.times()[[0, -1]])[:, 0]
         if min(first, last) < 0.0 or max(first, last) > lx:
             raise SceneError(
                 f"the axle moves from x = {first:.3f} to {last:.3f} m; allowed: 0 to {lx:g} m; change scene.start, "

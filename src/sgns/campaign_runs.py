@@ -23,6 +23,7 @@ from mpm_warp.batch import all_together
 from mpm_warp.work import Work
 from sgns.campaign import Campaign
 from sgns.claim import claimed
+from sgns.clock import elapsed
 from sgns.cost import RunCost, duration_words, finishing_time, require_space, run_cost, size_words
 from sgns.errors import UserError
 from sgns.leftovers import remove_leftovers
@@ -205,7 +206,7 @@ class _Production:
             while rest := self._rest():
                 time.sleep(0.2)
                 now, work = time.monotonic(), self._work_made()
-                self._see(work - made, now - last, busy=min(self.at_once, len(rest)))
+                self._see(work - made, elapsed(last, now), busy=min(self.at_once, len(rest)))
                 made, last = work, now
                 done = f"{len(self._jobs) - len(rest)} of {len(self._jobs)} runs"
                 bar.set_postfix_str(f"{done}, {self._left()} left", refresh=False)
@@ -282,9 +283,9 @@ def _try(
     start, counts = time.perf_counter(), [0] * len(found)
     for number, frame in frames:
         counts[number] += isinstance(frame, Frame)  # if it is an error, whoever makes the run says so
-        if time.perf_counter() - start > _MEASURED:
+        if elapsed(start, time.perf_counter()) > _MEASURED:
             break
-    return counts, time.perf_counter() - start
+    return counts, elapsed(start, time.perf_counter())
 
 
 def _make_share(

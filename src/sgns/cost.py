@@ -46,14 +46,19 @@ class RunCost:
 
 
 def run_cost(scene: Scene) -> RunCost:
-    """The cost of a scene's run."""
+    """The cost of a scene's run.
+
+    Raises:
+        SceneError: it is too large to be computed.
+    """
+    substeps = substeps_per_frame(scene)  # before its particles are made
     particles, stored = len(scene.filled[0]), len(scene.stored)
     per_frame = (
         stored * _BYTES_PER_PARTICLE + len(scene.body_points()) * _BYTES_PER_BODY_POINT + _BYTES_PER_FRAME
     )
     return RunCost(
         particles=particles,
-        substeps=substeps_per_frame(scene),
+        substeps=substeps,
         frames=scene.frame_count,
         size=scene.frame_count * per_frame + _BYTES_PER_FILE,
     )

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from sgns.clock import elapsed
 from sgns.errors import UserError
 from sgns.runs import RunWriter, frame_chunks
 from sgns.settings import differences
@@ -150,7 +151,7 @@ def write_rollout(
                     rollout.torque[frame],
                 )
                 previous = position
-        wall_time = float(rollout.wall_time_s) + time.perf_counter() - began
+        wall_time = float(rollout.wall_time_s) + elapsed(began, time.perf_counter())
         if reason:
             raise UserError(f"{reason}; the frames before are in {writer.stop(wall_time, reason)}")
         writer.finish(wall_time)
@@ -260,7 +261,7 @@ def rollout_scene(
         log.warning("%s: forces and soil are a guess there", words)
     began = time.perf_counter()
     write_rollout(path, simulator, scene.to_dict(), rollout, seed=seed, checkpoint=checkpoint)
-    writing = time.perf_counter() - began
+    writing = elapsed(began, time.perf_counter())
     steps = len(rollout.latent) - 1
     return RolloutTiming(steps / float(simulator.frame_rate), float(rollout.wall_time_s), writing)
 

@@ -11,6 +11,7 @@ from typing import Any
 from mpm_warp import Effects, Scene, Solver, SolverStopped
 from mpm_warp.batch import all_together
 from mpm_warp.work import Work
+from sgns.clock import elapsed
 from sgns.continuation import Continuation
 from sgns.runs import RunWriter
 
@@ -109,7 +110,7 @@ def scene_stages(
                     shared_by = stage.shared_by
                     if seen is not None:
                         now = time.perf_counter()
-                        wall_time, seen = wall_time + (now - seen) / shared_by, now
+                        wall_time, seen = wall_time + elapsed(seen, now) / shared_by, now
                     continue
                 seen = seen if seen is not None else time.perf_counter()
                 writer.append(
@@ -128,11 +129,11 @@ def scene_stages(
                 raise
             kept = writer.stop(wall_time, str(stopped), stopped.state)
             raise SolverStopped(f"{stopped}. {_way_on(str(stopped), kept, output, computed)}") from stopped
-        wall_time += (time.perf_counter() - seen) / shared_by if seen is not None else 0.0
+        wall_time += elapsed(seen, time.perf_counter()) / shared_by if seen is not None else 0.0
         writer.finish(wall_time)
     frames = scene.frame_count - max(1, there)
     yield Timing(
-        wall_time - before,
+        elapsed(before, wall_time),
         frames / scene.frame_rate,
         frames * solver.substeps_per_frame * solver.computed_count,
     )

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sgns.clock import elapsed
 from sgns.errors import UserError
 from sgns.learning.body import BodyTrack, body_track
 from sgns.learning.context import context_of
@@ -279,7 +280,7 @@ class Simulator:
             states, force, torque = (
                 part[0, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque)
             )
-        wall_time = time.perf_counter() - began
+        wall_time = elapsed(began, time.perf_counter())
         if latent_history is not None:
             for part, known in ((force, force_history), (torque, torque_history)):
                 if known is not None:
@@ -327,7 +328,7 @@ class Simulator:
                 for first in range(0, len(poses), paths_at_once)
             ]
         latent, force, torque, poses = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return Rollouts(latent, force, torque, poses, time.perf_counter() - began)
+        return Rollouts(latent, force, torque, poses, elapsed(began, time.perf_counter()))
 
     def _from_rest(
         self, poses: np.ndarray, points: np.ndarray, context: Tensor

@@ -7,10 +7,23 @@ import math
 
 import numpy as np
 import pytest
+import warp as wp
 from beds import cut
 
-from mpm_warp import Bed, Excavation, Material, Plate, Scene, SceneError
+from mpm_warp import (
+    Bed,
+    Excavation,
+    Material,
+    Plate,
+    Scene,
+    SceneError,
+    Solver,
+    Wheel,
+    effects_for,
+)
+from mpm_warp import size as size_module
 from mpm_warp.rotation import rotate
+from mpm_warp.size import scene_size
 
 
 def test_a_scene_survives_json():
@@ -83,7 +96,16 @@ def test_recorded_particles_are_one_of_every_few():
         ({"motion": "path"}, "needs scene.path"),
         ({"path": ((0.0,) * 8,)}, "use scene.motion=path"),
         ({"gravity": -1.0}, "scene.gravity"),
+        ({"gravity": 1e300}, r"scene.gravity is 1e\+300 m/s\^2; allowed: 0 to 100000"),
         ({"duration": 0.0}, "scene.duration"),
+        ({"duration": 1e300}, r"scene.duration is 1e\+300 s; allowed: at most 1e\+06"),
+        (
+            {"duration": 1e5},
+            r"scene.duration is 100000.0 s at scene.frame_rate 60.0 Hz: 6e\+06 frames; at most 1e\+06",
+        ),
+        ({"frame_rate": 1e300}, r"scene.frame_rate is 1e\+300 Hz; allowed: 0.001 to 1e\+06"),
+        ({"frame_rate": 1e-300}, "scene.frame_rate is 1e-300 Hz; allowed"),
+        ({"courant": 1e-300}, "scene.courant is 1e-300; allowed: 0.0001 to 0.8"),
         ({"courant": 1.5}, "scene.courant is 1.5; allowed"),
         ({"elastic_damping": -0.1}, "scene.elastic_damping is -0.1; allowed"),
         ({"volume_averaging": 1.5}, "scene.volume_averaging is 1.5; allowed"),
@@ -109,6 +131,15 @@ def test_what_a_scene_refuses(change, words):
         (Bed, {"size": (0.8, 0.6)}, "three lengths"),
         (Bed, {"spacing": 0.2}, "half the bin"),
         (Bed, {"spacing": 1e-4}, "particles; at most"),
+        (Bed, {"spacing": 1e-320}, "inf particles; at most"),
+        (Bed, {"size": (1e200, 1e200, 1e200)}, "inf particles; at most"),
+        (
+            Bed,
+            {"headroom": 1e300},
+            r"bed.headroom is 1e\+300 m .* nodes; at most 2e\+08 are allowed: lower bed.headroom",
+        ),
+        (Bed, {"headroom": math.inf}, "bed.headroom is inf m"),
+        (Bed, {"spacing": 2e-4, "particles_per_cell": 1e-4}, "nodes; .* larger bed.spacing"),
         (Bed, {"arrangement": "heap"}, "allowed: lattice, jittered, poisson"),
         (Bed, {"store_every": 0}, "bed.store_every is 0; it must be a whole number"),
         (Bed, {"store_every": 2.5}, "bed.store_every is 2.5; it must be a whole number"),
@@ -116,6 +147,13 @@ def test_what_a_scene_refuses(change, words):
         (Plate, {"thickness": 0.0}, "blade.thickness"),
         (Plate, {"friction": -1.0}, "blade.friction"),
         (Material, {"poissons_ratio": 0.5}, "poissons_ratio"),
+        (
+            Material,
+            {"poissons_ratio": 0.4999999},
+            "poissons_ratio is 0.4999999; allowed: 0 to 0.499: soil that keeps",
+        ),
+        (Material, {"packing": 1e-300}, "material.packing is 1e-300; allowed: 0.05 to 1"),
+        (Material, {"youngs_modulus": 1e300}, r"youngs_modulus is 1e\+300 Pa; allowed: 1 to 1e\+12"),
         (Material, {"limit_friction": 0.5}, "must be above material.static_friction"),
         (Material, {"youngs_modulus": float("inf")}, "youngs_modulus"),
     ],
@@ -149,3 +187,64 @@ def test_warnings_name_thin_plates_and_weak_soil():
     weak = cut(material=Material(static_friction=0.4))
     assert any("K0" in w for w in weak.warnings())
     assert cut().warnings() == []
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        (
+            Wheel(load=1e-6),
+            r"[78]\.\d+e\+08 substeps of .* at most 1e\+06 .* mass of 1.02e-07 kg .*: raise scene.load",
+        ),
+        (Scene(material=Material(youngs_modulus=1e12, grain_density=1e-6)), "raise material.grain_density"),
+        (
+            Scene(courant=1e-4, material=Material(youngs_modulus=1e12)),
+            "1e.06 are allowed: raise scene.courant",
+        ),
+        (Scene(frame_rate=1e-3, duration=1e4, courant=0.1), "allowed: raise scene.frame_rate"),
+        (
+            Scene(courant=0.02, duration=1e4),
+            r"the run would take .* lower scene.duration \(10000 s\), or raise scene.cou",
+        ),
+        (Wheel(rim_speed=1e9, slip=1.0), "the body moves at up to .* scene.rim_speed slower"),
+    ],
+    ids=["mass", "density", "courant", "rate", "duration", "speed"],
+)
+def test_too_many_substeps_are_refused_before_anything_is_there(scene, words, monkeypatch):
+    """With the key that asks for them. Particles are never made."""
+    monkeypatch.setattr(Bed, "filled", property(lambda self: pytest.fail("particles were made")))
+    for refusing in (Solver, effects_for, scene_size):
+        with pytest.raises(SceneError, match=words) as caught:
+            refusing(scene)
+        assert "\n" not in str(caught.value)
+
+
+def test_large_scenes_are_no_problem():
+    """Ten million particles, and a hundred thousand substeps in a frame."""
+    size = scene_size(Scene(bed=Bed(size=(2.0, 1.0, 0.5), spacing=0.0046)))
+    assert 1e7 < size.particles < size.nodes < 3e7
+    assert 4e9 < size.memory < 1e10
+    assert scene_size(Wheel(load=0.01)).substeps > 7e4
+
+
+@pytest.mark.parametrize("arrangement", ["lattice", "jittered", "poisson"])
+def test_the_size_is_that_of_the_solver(arrangement):
+    bed = Bed(size=(0.4, 0.3, 0.1), spacing=0.02, arrangement=arrangement)
+    scene = Scene(bed=bed, duration=0.5)
+    solver, size = Solver(scene), scene_size(scene)
+    assert solver.particle_count == pytest.approx(size.particles, rel=0.3 if arrangement == "poisson" else 0)
+    assert (size.substeps, size.steps) == (solver.substeps_per_frame, 30 * solver.substeps_per_frame)
+    assert size.nodes == len(solver._inverse_mass)
+    assert bed.particle_volume == bed.filled[1]
+    arrays = [a for a in vars(solver).values() if isinstance(a, wp.array)] + list(
+        solver._memory._good.values()
+    )
+    assert sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays) < size.memory
+
+
+def test_a_scene_that_memory_does_not_hold_is_refused(monkeypatch):
+    monkeypatch.setattr(size_module, "_memory", lambda device: 5e6)
+    with pytest.raises(
+        SceneError, match=r"needs about .* GB of memory and cpu has 0.005 GB: 2.97e\+04 particles"
+    ):
+        Solver(Scene())

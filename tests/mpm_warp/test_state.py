@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from beds import block, cut
 
-from mpm_warp import Bed, Effects, Incline, Material, SceneError, Solver, SolverStopped, State, Walls, Wheel
+from mpm_warp import (
+    Bed,
+    Effects,
+    Incline,
+    Material,
+    SceneError,
+    Solver,
+    SolverStopped,
+    State,
+    Walls,
+    Wheel,
+)
+from mpm_warp.batch import all_together
 from mpm_warp.guard import Guard
 
 
@@ -142,3 +155,79 @@ def test_a_state_of_another_scene_is_refused():
 
 def test_nothing_to_go_on_from_before_the_first_frame():
     assert Solver(cut()).state() is None
+
+
+def same(one, two) -> bool:
+    """Whether two sequences of frames are equal bit by bit."""
+    return len(one) == len(two) and all(
+        np.array_equal(getattr(a, name), getattr(b, name))
+        for a, b in zip(one, two, strict=True)
+        for name in ("index", "time", "position", "velocity", "body_pose", "body_points", "force", "torque")
+    )
+
+
+@pytest.mark.parametrize(
+    ("scene", "effects"),
+    [
+        (cut(duration=0.05), Effects(symmetry=True, fluidity=True, nonlocality=True)),
+        (wheel(), Effects()),
+        (slope(), Effects()),
+    ],
+    ids=["half", "wheel", "periodic"],
+)
+def test_every_call_begins_anew(scene, effects):
+    """Whatever the call before left: all frames, some of them, none, or a soil that went wrong."""
+    solver = Solver(scene, effects)
+    first = list(solver.frames())
+    assert same(list(solver.frames()), first)
+    some = [frame for frame, _ in zip(solver.frames(), range(2), strict=False)]
+    assert same(some, first[:2])
+    solver._v.fill_(np.nan)
+    frames = solver.frames()
+    next(frames)
+    solver._v.fill_(np.nan)
+    with pytest.raises(SolverStopped):
+        next(frames)
+    assert same(list(solver.frames()), first)
+
+
+def test_every_call_begins_at_the_state_that_was_given():
+    scene, whole = cut(duration=0.1), []
+    solver = Solver(scene)
+    for frame in solver.frames():
+        whole.append(frame)
+        if frame.index == 2:
+            state = solver.state()
+    later = Solver(scene, start=state)
+    state.arrays["position"] += 1.0  # no longer the solver's business
+    assert same(list(later.frames()), whole[3:])
+    assert same(list(later.frames()), whole[3:])
+    stages = [stage for _, stage in all_together([later.stages()], 1, "cpu")]
+    assert same(stages, whole[3:])
+
+
+def test_an_earlier_call_ends_where_a_later_one_begins():
+    solver = Solver(cut(duration=0.05))
+    earlier, later = solver.frames(), solver.frames()
+    next(earlier)
+    first = next(later)
+    with pytest.raises(SceneError, match="asked for again, and it began anew: take them from the later call"):
+        next(earlier)
+    assert same([first, *later], list(Solver(cut(duration=0.05)).frames()))
+    with pytest.raises(SceneError, match="make a Solver for each"):
+        list(all_together([solver.stages(), solver.stages()], 2, "cpu"))
+
+
+def test_what_was_given_stays_as_it_was():
+    """Frames and states are copies, though on a CPU the solver's arrays could be looked at in place."""
+    for precision in ("float32", "float64"):
+        solver = Solver(wheel(), precision=precision)
+        frames = solver.frames()
+        given = [next(frames), next(frames)]
+        state = solver.state()
+        before = copy.deepcopy((given, state))
+        for _ in frames:
+            pass
+        assert same(given, before[0])
+        for name, array in before[1].arrays.items():
+            np.testing.assert_array_equal(state.arrays[name], array)

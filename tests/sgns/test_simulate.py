@@ -66,12 +66,14 @@ def test_command_writes_fewer_particles(tmp_path):
         ("scene.bed.store_every=0", "bed.store_every is 0"),
         ("shards=4", "give dataset=..."),
         ("solver.batch=0", "solver.batch is 0"),
+        ("scene.courant=1e-3 material.youngs_modulus=1e12", "lower material.youngs_modulus"),
+        ("scene.duration=1e300", "scene.duration is 1e+300 s; allowed: at most"),
         ("scene.depth=deep", "scene.depth is 'deep'"),
         ("scene.path=nowhere.csv", "scene.path"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, override, words):
-    done = sgns(tmp_path, "simulate", *SMALL, override)
+    done = sgns(tmp_path, "simulate", *SMALL, *override.split())
     assert done.returncode == 2
     lines = done.stderr.splitlines()
     assert len(lines) == 1

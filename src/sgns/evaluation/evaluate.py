@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from sgns.clock import elapsed
 from sgns.errors import UserError
 from sgns.evaluation.bodies import is_wheel
 from sgns.evaluation.costs import forget_peak, network_costs, peak_memory
@@ -75,7 +76,7 @@ def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTimin
                 simulator.basis.inverse(latent)
             if repeat:
                 stepping.append(float(rollout.wall_time_s) / simulated)
-                decoding.append(stepping[-1] + (time.perf_counter() - began) / simulated)
+                decoding.append(stepping[-1] + elapsed(began, time.perf_counter()) / simulated)
             decoding_bytes = peak_memory()
         return NetworkTiming(
             statistics.median(stepping),

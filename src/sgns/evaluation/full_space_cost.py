@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from sgns.clock import elapsed
 from sgns.evaluation.costs import forget_peak, peak_memory
 from sgns.evaluation.results import FullSpaceCost
 from sgns.full_space.body_surface import box_surface
@@ -76,5 +77,5 @@ def _wall_time(action: Callable[[], object], repeats: int) -> float:
     for _ in range(repeats):
         began = time.perf_counter()
         action()
-        found.append(time.perf_counter() - began)
+        found.append(elapsed(began, time.perf_counter()))
     return statistics.median(found)

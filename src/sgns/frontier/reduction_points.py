@@ -19,6 +19,7 @@ import torch
 
 from sgns.campaign import Dataset
 from sgns.claim import claimed
+from sgns.clock import elapsed
 from sgns.errors import UserError
 from sgns.frontier.point import Point
 from sgns.frontier.study import PointSettings, Study, StudyScene
@@ -90,7 +91,10 @@ def measure_scene(study: Study, scene: StudyScene, missing: list[Wanted]) -> Non
     training, held_out = dataset.runs("train"), [*dataset.runs("validation"), *dataset.runs("test")]
     pca = fit_runs(training, max(w.modes for w in missing))
     log.info(
-        "%s, reduction: fitted on %d runs (%.0f s)", scene.name, len(training), time.perf_counter() - began
+        "%s, reduction: fitted on %d runs (%.0f s)",
+        scene.name,
+        len(training),
+        elapsed(began, time.perf_counter()),
     )
     motion = held_out_motion(pca.basis("particle_axis", 1), held_out)
     workload = Workload()
@@ -120,7 +124,9 @@ def measure_scene(study: Study, scene: StudyScene, missing: list[Wanted]) -> Non
             )
         if beyond := [w.modes for w in missing if w.centring == centring and w.modes > basis.num_modes]:
             log.info("%s: r %s left out, the data has %d modes", scene.name, beyond, basis.num_modes)
-    log.info("%s, reduction: %d points (%.0f s)", scene.name, len(missing), time.perf_counter() - began)
+    log.info(
+        "%s, reduction: %d points (%.0f s)", scene.name, len(missing), elapsed(began, time.perf_counter())
+    )
 
 
 def described(study: Study, scene: StudyScene, one: Wanted) -> Point:
@@ -175,7 +181,7 @@ def coding_times(basis: Basis, path: Path) -> CodingTimes:
         end = time.perf_counter()
         if repeat:
             per_second = rate / len(positions)
-            times.both.append((end - began) * per_second)
-            times.processor.append((time.process_time() - clock) * per_second)
-            times.decoding.append((end - between) * per_second)
+            times.both.append(elapsed(began, end) * per_second)
+            times.processor.append(elapsed(clock, time.process_time()) * per_second)
+            times.decoding.append(elapsed(between, end) * per_second)
     return times

@@ -11,6 +11,7 @@ import numpy as np
 
 from mpm_warp import Solver, SolverStopped
 from sgns.claim import claimed
+from sgns.clock import elapsed
 from sgns.frontier.observation import Observation, Observer, observed_frames
 from sgns.frontier.point import Point
 from sgns.frontier.study import PointSettings, Study, StudyScene
@@ -38,7 +39,7 @@ def measure_solver(study: Study) -> None:
                     workload = workload or Workload()
                     began = time.perf_counter()
                     study.store.save(*measured(study, scene, settings, workload))
-                    took = time.perf_counter() - began
+                    took = elapsed(began, time.perf_counter())
                     log.info("%s, solver: %s (%.0f s)", scene.name, settings.label, took)
 
 
@@ -92,8 +93,8 @@ def timed_run(overrides: list[str]) -> tuple[Observation, list[float], float, in
     for _ in range(scene.frame_count):
         start = time.perf_counter(), time.process_time()
         frame = next(frames)
-        wall.append(time.perf_counter() - start[0])
-        processor.append(time.process_time() - start[1])
+        wall.append(elapsed(start[0], time.perf_counter()))
+        processor.append(elapsed(start[1], time.process_time()))
         observer.add(frame.time, frame.force, frame.torque, frame.body_pose)
         if frame.index in wanted:
             observer.add_soil(frame.time, frame.position)

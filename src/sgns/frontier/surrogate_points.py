@@ -32,6 +32,7 @@ from omegaconf import OmegaConf
 from mpm_warp import Scene
 from sgns.campaign import Dataset
 from sgns.claim import claimed
+from sgns.clock import elapsed
 from sgns.errors import UserError
 from sgns.evaluation.costs import network_costs
 from sgns.evaluation.scores import Scores
@@ -121,7 +122,7 @@ def measure_surrogates(study: Study) -> None:
                     workload = workload or Workload()
                     began = time.perf_counter()
                     study.store.save(*measured(study, scene, entry, plan, workload))
-                    took = time.perf_counter() - began
+                    took = elapsed(began, time.perf_counter())
                     log.info("%s, surrogate: %s (%.0f s)", scene.name, entry.label, took)
 
 
@@ -230,12 +231,12 @@ def timed_rollouts(
             simulated = (len(poses) - 1) / simulator.frame_rate
             clock = time.process_time()
             rollout = simulator.rollout(poses, points, values=values)
-            clocks.append((time.process_time() - clock) / simulated)
+            clocks.append(elapsed(clock, time.process_time()) / simulated)
             walls.append(rollout.wall_time_s / simulated)
             began = time.perf_counter()
             for latent in torch.as_tensor(rollout.latent):
                 simulator.basis.inverse(latent)
-            decodings.append(walls[-1] + (time.perf_counter() - began) / simulated)
+            decodings.append(walls[-1] + elapsed(began, time.perf_counter()) / simulated)
             rollouts[case] = (scenes[case], rollout)
         if repeat:
             for series, values_ in ((rates, walls), (processor, clocks), (decoded, decodings)):

@@ -14,6 +14,8 @@ from typing import Any
 
 import torch
 
+from sgns.clock import elapsed
+from sgns.errors import UserError
 from sgns.learning.kinds import model_settings
 from sgns.learning.model_settings import ModelSettings
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
@@ -27,6 +29,7 @@ log = logging.getLogger(__name__)
 
 # Steps that are timed to find out how many fit, after as many that warm up.
 PILOT_STEPS = 12
+SHORTEST_STEP = 1e-6  # [s]; less no step takes
 # How often the validation runs choose the best checkpoint.
 VALIDATIONS = 4
 _SCHEME = 1  # of what a folder of a training stands for
@@ -98,7 +101,7 @@ def train_for(
             "seconds": seconds,
         },
     )
-    done = TimedTraining(output / "best.ckpt", round(time.process_time() - began, 1), steps, samples)
+    done = TimedTraining(output / "best.ckpt", round(elapsed(began, time.process_time()), 1), steps, samples)
     write_whole(record, json.dumps({k: v for k, v in asdict(done).items() if k != "checkpoint"}) + "\n")
     return done
 
@@ -106,7 +109,11 @@ def train_for(
 def seconds_per_step(
     reduced: ReducedDataset, model: ModelSettings, training: Mapping[str, Any], seed: int
 ) -> float:
-    """Processor time of an optimiser step with its batch, median of a few [s]."""
+    """Processor time of an optimiser step with its batch, median of a few [s].
+
+    Raises:
+        UserError: the processor's clock stands still.
+    """
     settings = TrainingSettings.from_dict(training)
     surrogate, data = prepared(reduced, reduced.num_modes, model, settings, seed, {}, None)
     module = SurrogateTraining(surrogate, settings)
@@ -120,8 +127,14 @@ def seconds_per_step(
         sum(settings.loss[name] * value for name, value in losses.items()).backward()
         torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
         optimiser.step()
-        taken.append(time.process_time() - began)
-    return statistics.median(taken[PILOT_STEPS:])
+        taken.append(elapsed(began, time.process_time()))
+    found = statistics.median(taken[PILOT_STEPS:])
+    if found < SHORTEST_STEP:
+        raise UserError(
+            "the processor's clock stands still, so nobody knows how many steps a training may take; repeat the "
+            "command when the machine runs undisturbed"
+        )
+    return found
 
 
 def _key(

@@ -24,6 +24,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from mpm_warp import Frame, Scene, Solver, effects_for
 from sgns import __version__
+from sgns.clock import elapsed
 from sgns.evaluation.provenance import command_line, cpu_model
 from sgns.frontier.point import SHARED
 from sgns.scenes import scene_from_config
@@ -78,7 +79,7 @@ class Workload:
             began, processor = time.perf_counter(), time.process_time()
             done = sum(1 for _ in zip(range(FRAMES), self._frames, strict=False))
             if done == FRAMES:
-                wall, processor = time.perf_counter() - began, time.process_time() - processor
+                wall, processor = elapsed(began, time.perf_counter()), elapsed(processor, time.process_time())
                 seconds = processor if wall > SHARED * processor else wall
                 found.append(seconds * self._scene.frame_rate / FRAMES)
         return found or self.measure()

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from sgns.clock import elapsed
 from sgns.errors import UserError
 from sgns.full_space.dynamics import FullSpaceDynamics
 from sgns.full_space.windows import FullSpaceBatch, FullSpaceWindows
@@ -116,5 +117,5 @@ def train(
         schedule.step()
         for values, value in zip(record[:2], found, strict=True):
             values.append(float(value.detach()))
-        record.seconds.append(time.perf_counter() - began)
+        record.seconds.append(elapsed(began, time.perf_counter()))
     return record

@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
+from sgns.clock import elapsed
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.validation import RolloutScore, ValidationRollouts
 
@@ -63,14 +64,14 @@ class RolloutValidation(L.Callback):
         elif step % self.settings.log_every == 0:
             before, then = self._mark
             now = time.perf_counter()
-            rate = (step - before) * self.settings.batch_size / (now - then)
+            rate = (step - before) * self.settings.batch_size / elapsed(then, now)
             self._mark = (step, now)
             current = trainer.optimizers[0].param_groups[0]["lr"]
             trainer.logger.log_metrics({"samples_per_s": rate, "learning_rate": current}, step)
         if step % self.settings.validate_every == 0 or step == self.settings.max_steps:
             paused = time.perf_counter()
             self.validate(trainer, pl_module, step)
-            self._mark = (self._mark[0], self._mark[1] + time.perf_counter() - paused)
+            self._mark = (self._mark[0], self._mark[1] + elapsed(paused, time.perf_counter()))
 
     def validate(self, trainer: L.Trainer, module: SurrogateTraining, step: int) -> None:
         """Measure, log, save."""

@@ -26,6 +26,7 @@ from lightning.pytorch.plugins import TorchCheckpointIO
 from omegaconf import OmegaConf
 
 import sgns
+from sgns.clock import elapsed
 from sgns.errors import UserError
 from sgns.learning.context import varying_context
 from sgns.learning.data import TrainingWindows, WindowDataModule
@@ -151,7 +152,7 @@ def train(
         fitted = fit_polynomial(
             runs, validation_runs, num_modes, model_settings, settings, moves_freely(runs), seed
         )
-        seconds = time.perf_counter() - began
+        seconds = elapsed(began, time.perf_counter())
         surrogate, score, about = surrogate_of(fitted.dynamics, reduced, card), fitted.score, fitted.about()
         make_folder(output)
         surrogate.save(output / "best.ckpt")
@@ -178,7 +179,7 @@ def train(
                     f"{error}; the best checkpoint of before is kept, to go on from into another output: "
                     f"checkpoint={output / 'best.ckpt'}"
                 ) from error
-            seconds = time.perf_counter() - began
+            seconds = elapsed(began, time.perf_counter())
         score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
         about = {"steps": settings.max_steps}
 

@@ -5,6 +5,7 @@ import json
 import pytest
 from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, reduced
 
+from sgns.errors import UserError
 from sgns.frontier import timed_training
 from sgns.frontier.timed_training import seconds_per_step, train_for
 from sgns.learning.model_settings import ModelSettings
@@ -70,3 +71,9 @@ def test_a_step_with_more_windows_takes_longer(tmp_path):
         for size in (2, 2000)
     )
     assert 0 < few < many
+
+
+def test_a_clock_that_stands_still_gives_no_number_of_steps(tmp_path, monkeypatch):
+    monkeypatch.setattr(timed_training.time, "process_time", lambda: 1.0)
+    with pytest.raises(UserError, match="the processor's clock stands still"):
+        train_for(0.2, reduced(tmp_path / "data"), NETWORK, tmp_path / "kept")

@@ -1,0 +1,66 @@
+"""A clock that stands still or goes back, as that of a virtual machine that was paused."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import pytest
+import torch
+from test_campaign import campaign
+
+from mpm_warp import Effects
+from sgns import campaign_runs
+from sgns.clock import elapsed
+from sgns.cost import run_cost
+from sgns.evaluation import full_space_cost
+from sgns.runs import Run
+from sgns.scene_run import simulate_scene
+
+
+@pytest.fixture(params=[0.0, -7.0], ids=["still", "back"])
+def odd_clock(request, monkeypatch):
+    """Every clock moves by so many seconds each time it is read."""
+    for name in ("perf_counter", "process_time", "monotonic"):
+        readings = itertools.count(1e6, request.param)
+        monkeypatch.setattr(time, name, lambda readings=readings: next(readings))
+
+
+def test_a_time_is_above_zero():
+    assert elapsed(2.0, 5.0) == 3.0
+    assert elapsed(2.0, 2.0) == elapsed(2.0, 1.0) == 1e-9
+
+
+def test_a_run_is_made_and_said_to_have_been_quick(tmp_path, odd_clock):
+    scene = next(iter(campaign(tmp_path).scenes.values()))
+    timing = simulate_scene(scene, tmp_path / "run.h5", effects=Effects())
+    assert 0.0 < timing.per_simulated_second < 1e-3
+    assert timing.rate > 1e9
+    with Run(tmp_path / "run.h5") as run:
+        assert run.wall_time_s > 0.0
+
+
+def test_the_time_left_is_some_time(tmp_path, odd_clock):
+    c = campaign(tmp_path, runs=6)
+    costs = {name: run_cost(scene) for name, scene in c.scenes.items()}
+    production = campaign_runs._Production(c, costs, "cpu", 4)
+    try:
+        last = time.monotonic()
+        production._see(1e6, elapsed(last, time.monotonic()), busy=4)
+        assert production._left() == "1 s"
+    finally:
+        production._pool.shutdown()
+
+
+def test_a_trial_ends_and_takes_some_time(tmp_path, odd_clock, monkeypatch):
+    scene = next(iter(campaign(tmp_path).scenes.values()))
+    monkeypatch.setattr(
+        campaign_runs, "_barrier", type("Barrier", (), {"wait": lambda self, timeout: None})()
+    )
+    counts, seconds = campaign_runs._try([scene.to_dict()], [Effects()], "cpu", "float32")
+    assert counts == [scene.frame_count - 1]
+    assert seconds > 0.0
+
+
+def test_other_times_can_be_divided_by(odd_clock):
+    assert full_space_cost._wall_time(lambda: torch.zeros(1), 3) > 0.0
