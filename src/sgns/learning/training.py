@@ -37,6 +37,7 @@ from sgns.learning.polynomial_settings import FitSettings, PolynomialSettings
 from sgns.learning.polynomial_training import check_start, fit_polynomial
 from sgns.learning.statistics import fit_normalisation
 from sgns.learning.stepping import Dynamics
+from sgns.learning.summary import SUMMARY, read_summary
 from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint, write_checkpoint
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.training_range import TrainingRange
@@ -138,7 +139,7 @@ def train(
     }
     resumed = what_is_there(output, card["settings"], settings.resume)
     if resumed == "complete":
-        summary = json.loads((output / "training.json").read_text())
+        summary = read_summary(output)
         log.info("%s is complete: validation skill %.3f", output, summary["skill"])
         return float(summary["skill"])
 
@@ -190,7 +191,7 @@ def train(
     )
     logger.finalize("success")
     summary = {**about, **metrics, "seconds": round(seconds, 1)}
-    write_whole(output / "training.json", json.dumps(summary, indent=2) + "\n")
+    write_whole(output / SUMMARY, json.dumps(summary, indent=2) + "\n")
     log.info(
         "trained in %.0f s; %d validation runs: skill %.3f (from rest %.3f), force NRMSE %.3f; %s",
         seconds,
@@ -300,7 +301,7 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
     Raises:
         UserError: A training with other settings is there.
     """
-    names = ("best.ckpt", "last.ckpt", "training.json")
+    names = ("best.ckpt", "last.ckpt", SUMMARY)
     if resume is False:
         for name in names:
             (output / name).unlink(missing_ok=True)
@@ -319,7 +320,7 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
             f"{output} holds a training with other settings: {key} is {old!r} there and {new!r} here{more}; "
             "use another output, or training.resume=false to overwrite it"
         )
-    if (output / "best.ckpt").exists() and (output / "training.json").exists():
+    if (output / "best.ckpt").exists() and (output / SUMMARY).exists():
         return "complete"
     return "partial" if (output / "last.ckpt").exists() else ""
 
