@@ -26,6 +26,7 @@ __all__ = ["PublishedRun", "excavation_case", "published_files", "read_published
 _SUBSPACE = 6  # the particle type of a subspace node; all others are nodes of the rigid body
 _FREE = 0  # the particle type of a wheel's nodes; those of a blade, which is prescribed, are 3
 _MOST_BYTES = 1 << 33  # of a .tfrecord; the authors' largest has a tenth of that
+_MOST_OF_RUN = 1 << 28  # of one run in it
 _MOST_METADATA = 1 << 22
 _LONGEST = 63  # bits before the last part of a number
 _MARGIN = 0.1  # the authors' bin starts at this coordinate on each axis [m]
@@ -177,8 +178,8 @@ def _lengths(file: BinaryIO, size: int) -> Iterator[int]:
         (length,) = struct.unpack("<Q", file.read(8))
         if at + 16 + length > size:
             raise ValueError("the file is cut short")
-        if length == 0:
-            raise ValueError("it holds an empty run")
+        if not 0 < length <= _MOST_OF_RUN:
+            raise ValueError(f"a run has {length} bytes; allowed: 1 to {_MOST_OF_RUN}")
         file.seek(at + 12)
         yield length
         at += 16 + length
