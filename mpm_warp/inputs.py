@@ -5,26 +5,38 @@ from __future__ import annotations
 import os
 import stat
 from pathlib import Path
+from typing import BinaryIO
 
-__all__ = ["read_bytes", "read_text"]
+__all__ = ["open_file", "read_bytes", "read_text"]
 
 MOST_BYTES = 1 << 30
 """Of a file that is read whole."""
 
 
-def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
-    """Content of a file.
+def open_file(path: Path, most: int = MOST_BYTES) -> BinaryIO:
+    """A file, open for reading.
 
     Raises:
         OSError: It cannot be read.
         ValueError: It is larger than `most` bytes, or a pipe or device, which may never end.
     """
-    with open(path, "rb", opener=_opened) as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise ValueError("it is not a file but a pipe or device")
-        if os.fstat(file.fileno()).st_size > most:
-            raise ValueError(f"it is larger than {most / 1e6:.0f} MB")
-        return file.read()
+    file = open(path, "rb", opener=_opened)
+    status = os.fstat(file.fileno())
+    if stat.S_ISREG(status.st_mode) and status.st_size <= most:
+        return file
+    file.close()
+    if stat.S_ISREG(status.st_mode):
+        raise ValueError(f"it is larger than {most / 1e6:.0f} MB")
+    raise ValueError("it is not a file but a pipe or device")
+
+
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+    """Content of a file; errors as `open_file`."""
+    with open_file(path, most) as file:
+        content = file.read(most + 1)  # some files of the system say that they are empty, and never end
+    if len(content) > most:
+        raise ValueError(f"it is larger than {most / 1e6:.0f} MB")
+    return content
 
 
 def read_text(path: Path, most: int = MOST_BYTES) -> str:

@@ -21,17 +21,19 @@ import yaml
 from omegaconf import OmegaConf
 
 from mpm_warp import Decision, Effects, Scene, SceneError
-from mpm_warp.inputs import read_text
 from sgns.claim import claimed
 from sgns.errors import UserError
 from sgns.scene_effects import decided
 from sgns.settings import flattened
+from sgns.smallfile import read_text
 from sgns.wholefile import write_whole
 from sgns.yaml_text import parse_yaml
 
 __all__ = ["SPLITS", "Campaign", "Dataset", "plan"]
 
 SPLITS = ("train", "validation", "test")
+_MOST_BYTES = 1 << 26
+"""Of dataset.yaml: thousands of scenes, or a hundred with a long path each."""
 
 
 @dataclass(frozen=True)
@@ -283,7 +285,9 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _read(file: Path) -> Any:
+    advice = "repair it, or make the dataset in another folder"
+    text = read_text(file, "no dataset", advice, _MOST_BYTES)
     try:
-        return parse_yaml(read_text(file))
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read {file}: {str(error).splitlines()[0]}") from None
+        return parse_yaml(text)
+    except ValueError as error:
+        raise UserError(f"cannot read {file}: {str(error).splitlines()[0]}; {advice}") from None

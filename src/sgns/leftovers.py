@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import IO
 from uuid import uuid4
 
+from mpm_warp.inputs import open_file
+
 try:
     import fcntl
 except ImportError:  # Windows
@@ -46,7 +48,7 @@ def remove_leftovers(path: Path) -> None:
         if not pid.isdecimal() or _alive(int(pid)):
             continue
         # A live process in a container may have a number that we cannot see; its lock shows that it is there.
-        with contextlib.suppress(OSError), found.open("rb") as file:
+        with contextlib.suppress(OSError, ValueError), open_file(found, 1 << 62) as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             found.unlink()
             log.info("removed %s, left by a process that was killed", found)

@@ -7,23 +7,28 @@ axes and signs: x forward, z up, forces by the soil on the body.
 
 from __future__ import annotations
 
-import json
+import os
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-from mpm_warp.inputs import read_bytes, read_text
+from mpm_warp.inputs import open_file, read_text
 from sgns.errors import UserError
+from sgns.smallfile import parse_json
 
 __all__ = ["PublishedRun", "excavation_case", "published_files", "read_published", "wheel_case"]
 
 _SUBSPACE = 6  # the particle type of a subspace node; all others are nodes of the rigid body
 _FREE = 0  # the particle type of a wheel's nodes; those of a blade, which is prescribed, are 3
 _MOST_BYTES = 1 << 33  # of a .tfrecord; the authors' largest has a tenth of that
+_MOST_OF_RUN = 1 << 28  # of one run in it
+_MOST_METADATA = 1 << 22
+_LONGEST = 63  # bits before the last part of a number
 _MARGIN = 0.1  # the authors' bin starts at this coordinate on each axis [m]
 _BINS = {"excavation": (0.80, 0.60, 0.15), "wheel": (0.40, 0.19, 0.0583)}  # Lx, Ly, Lz [m]
 
@@ -105,34 +110,40 @@ def read_published(
     """
     folder = Path(folder)
     try:
-        metadata = json.loads(read_text(folder / "metadata.json"))
+        metadata = parse_json(read_text(folder / "metadata.json", _MOST_METADATA))
         cases = metadata["dataset_split"].get(split)
-        records = list(_records(read_bytes(folder / f"{split}.tfrecord", _MOST_BYTES)))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, struct.error) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{folder} does not hold the published {split} runs: {error}") from None
-    if cases is None:
-        cases = [None] * len(records)
-    if not isinstance(cases, list) or not all(case is None or type(case) is int for case in cases):
+    if cases is not None and (
+        not isinstance(cases, list) or not all(case is None or type(case) is int for case in cases)
+    ):
         raise UserError(f"{folder}: metadata.json does not name the {split} runs by their numbers")
-    if len(cases) != len(records):
-        raise UserError(
-            f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {len(records)}"
-        )
-    if not records:
-        raise UserError(f"{folder}/{split}.tfrecord holds no run")
     try:
-        return [_run(case, record, bin_size) for case, record in zip(cases, records, strict=True)]
-    except (ValueError, KeyError, IndexError, struct.error) as error:
+        with open_file(folder / f"{split}.tfrecord", _MOST_BYTES) as file:
+            size = os.fstat(file.fileno()).st_size
+            count = sum(1 for _ in _lengths(file, size))
+            if cases is not None and len(cases) != count:
+                raise UserError(
+                    f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {count}"
+                )
+            if not count:
+                raise UserError(f"{folder}/{split}.tfrecord holds no run")
+            file.seek(0)
+            runs = [_run(None, file.read(length), bin_size) for length in _lengths(file, size)]
+    except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
         raise UserError(f"{folder}/{split}.tfrecord is not a file of published runs: {error}") from None
+    return [replace(run, case=case) for run, case in zip(runs, cases or [None] * len(runs), strict=True)]
 
 
 def _run(case: int | None, record: bytes, bin_size: tuple[float, float, float] | None) -> PublishedRun:
     about, frames = _sequence_example(record)
     types = np.frombuffer(about["particle_type"], dtype="<i8")
-    nodes = np.array([np.frombuffer(f, dtype="<f4") for f in frames["position"]], dtype=float)
-    nodes = nodes.reshape(len(nodes), len(types), 3)[1:]
-    force = np.array([np.frombuffer(f, dtype="<f4") for f in frames["force"]], dtype=float).reshape(-1, 3)[1:]
-    context = [np.frombuffer(f, dtype="<f4") for f in frames.get("step_context", [b""] * (len(nodes) + 1))]
+    nodes = _series(frames["position"], 3 * len(types)).reshape(-1, len(types), 3)[1:]
+    force = _series(frames["force"], 3)[1:]
+    given = frames.get("step_context", ())
+    context = _series(given, len(given[0]) // 4)[1:] if given and given[0] else np.zeros((len(nodes), 0))
+    if not len(nodes) == len(force) == len(context):
+        raise ValueError("its series have different numbers of frames")
     if not (len(nodes) and np.isfinite(nodes).all() and np.isfinite(force).all()):
         raise ValueError("a run has no frames, or values that are not finite")
     soil = types == _SUBSPACE
@@ -146,19 +157,33 @@ def _run(case: int | None, record: bytes, bin_size: tuple[float, float, float] |
         body,
         nodes[:, soil],
         force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0],
-        np.array(context, dtype=float)[1:],
+        context,
     )
 
 
-def _records(data: bytes) -> Iterator[bytes]:
-    """Payloads of a TFRecord file: length (8), check sum (4), payload, check sum (4)."""
+def _series(frames: Sequence[bytes], values: int) -> np.ndarray:
+    """Numbers of every frame, so many in each, shape (T, values)."""
+    if not values or any(len(frame) != 4 * values for frame in frames):
+        raise ValueError(f"a frame does not hold {values} numbers")
+    return np.frombuffer(b"".join(frames), dtype="<f4").astype(float).reshape(-1, values)
+
+
+def _lengths(file: BinaryIO, size: int) -> Iterator[int]:
+    """Lengths of the payloads of a TFRecord file: length (8), check sum (4), payload, check sum (4).
+
+    The file stands at the beginning of each payload when its length is given.
+    """
     at = 0
-    while at < len(data):
-        (length,) = struct.unpack_from("<Q", data, at)
-        if at + 16 + length > len(data):
+    while at < size:
+        (length,) = struct.unpack("<Q", file.read(8))
+        if at + 16 + length > size:
             raise ValueError("the file is cut short")
-        yield data[at + 12 : at + 12 + length]
+        if not 0 < length <= _MOST_OF_RUN:
+            raise ValueError(f"a run has {length} bytes; allowed: 1 to {_MOST_OF_RUN}")
+        file.seek(at + 12)
+        yield length
         at += 16 + length
+        file.seek(at)
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -180,6 +205,8 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
     while True:
         byte = data[at]
         value |= (byte & 0x7F) << shift
+        if shift > _LONGEST:
+            raise ValueError("a number is longer than 64 bits")
         at += 1
         shift += 7
         if byte < 0x80:

@@ -32,21 +32,23 @@ def read_path(file: Path) -> list[list[float]]:
     """Rows t, x, y, z, qx, qy, qz, qw of a CSV file with a header line."""
     wanted = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
     try:
-        rows = list(csv.reader(io.StringIO(read_text(file, _MOST_BYTES), newline="")))
+        rows = csv.reader(io.StringIO(read_text(file, _MOST_BYTES), newline=""))
+        first = next(rows, [])
     except (OSError, ValueError, csv.Error) as error:
         raise UserError(f"scene.path: cannot read {file}: {error}") from None
-    if not rows or [name.strip() for name in rows[0]] != wanted:
+    if [name.strip() for name in first] != wanted:
         raise UserError(f"scene.path: the first line of {file} must be {','.join(wanted)}")
-    values = []
-    for number, row in enumerate(rows[1:], start=2):
-        try:
+    values: list[list[float]] = []
+    number = 1
+    try:
+        for number, row in enumerate(rows, start=2):
+            if len(row) != len(wanted):
+                raise UserError(
+                    f"scene.path: line {number} of {file} has {len(row)} values instead of {len(wanted)}"
+                )
             values.append([float(v) for v in row])
-        except ValueError:
-            raise UserError(
-                f"scene.path: line {number} of {file} holds something that is not a number"
-            ) from None
-        if len(row) != len(wanted):
-            raise UserError(
-                f"scene.path: line {number} of {file} has {len(row)} values instead of {len(wanted)}"
-            )
+    except csv.Error as error:
+        raise UserError(f"scene.path: cannot read {file} after line {number}: {error}") from None
+    except ValueError:
+        raise UserError(f"scene.path: line {number} of {file} holds something that is not a number") from None
     return values

@@ -5,13 +5,19 @@ Every hostile file tries to leave a canary; none may appear.
 
 from __future__ import annotations
 
+import copy
 import json
+import math
 import os
 import pickle
+import shutil
 import subprocess
 import sys
+import time
 import zipfile
+import zlib
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -27,16 +33,23 @@ from mpm_warp.mesh_file import read_mesh
 from sgns.campaign import Dataset
 from sgns.cli import main
 from sgns.errors import UserError
+from sgns.evaluation.costs import network_costs
+from sgns.evaluation.training_curves import read_log
+from sgns.frontier.observation import read_observation
+from sgns.frontier.point import read_points
+from sgns.frontier.store import Store
+from sgns.frontier.timed_training import read_record
 from sgns.learning.surrogate import load_surrogate, read_checkpoint
 from sgns.learning.training import train
 from sgns.published import read_published
 from sgns.reduction import Basis
-from sgns.reduction.reduced import read_reduced, reduce_dataset
+from sgns.reduction.reduced import ReducedDataset, read_reduced, reduce_dataset
 from sgns.runs import Run, check_run
 from sgns.scenes import read_path
 from sgns.yaml_text import parse_yaml
 
 SECRET = "canary-in-another-file"
+FEW = TRAINING | {"max_steps": 2, "validate_every": 2}
 
 
 @pytest.fixture
@@ -148,6 +161,134 @@ def test_a_checkpoint_that_claims_more_values_than_it_holds(trained, tmp_path) -
             new.writestr(part.filename, old.read(part))
     with pytest.raises(UserError, match="cannot be read as a checkpoint"):
         load_surrogate(tmp_path / "b.ckpt")
+
+
+def endless() -> list:
+    """A list that holds itself."""
+    found: list = []
+    found.append(found)
+    return found
+
+
+def doubled(value: object, times: int = 40) -> object:
+    """A value that stands for 2 ** times of what it holds."""
+    for _ in range(times):
+        value = [value, value]
+    return value
+
+
+UNFIT = {
+    "in itself": endless,
+    "many lists": lambda: doubled("x"),
+    "much text": lambda: doubled("x" * 1000, 16),
+    "huge number": lambda: 1 << 100,
+    "tensor": lambda: torch.ones(1),
+}
+
+
+@pytest.mark.parametrize("kind", UNFIT)
+def test_cards_that_unfold_without_end_or_are_not_plain(trained, tmp_path, kind) -> None:
+    value = UNFIT[kind]()
+    content = torch.load(trained, weights_only=True)
+    torch.save(
+        content | {"hyper_parameters": content["hyper_parameters"] | {"x": value}}, tmp_path / "a.ckpt"
+    )
+    began = time.process_time()
+    with pytest.raises(UserError, match=r"a\.ckpt has a card that cannot be used"):
+        read_checkpoint(tmp_path / "a.ckpt")
+    assert time.process_time() - began < 2.0
+
+
+@pytest.mark.parametrize(
+    "settings", [3, {"training": []}, {"validation_runs": [3]}, {"training": {"batch_size": "x"}}]
+)
+def test_cards_with_odd_settings(trained, tmp_path, settings) -> None:
+    content = torch.load(trained, weights_only=True)
+    card = content["hyper_parameters"] | {"settings": settings}
+    torch.save(content | {"hyper_parameters": card}, tmp_path / "a.ckpt")
+    with pytest.raises(UserError, match="a card that cannot be used"):
+        read_checkpoint(tmp_path / "a.ckpt")
+
+
+def test_a_checkpoint_whose_parts_overlap(trained, tmp_path) -> None:
+    """A part that is named many times is read many times."""
+    with zipfile.ZipFile(tmp_path / "a.ckpt", "w") as archive:
+        archive.writestr("a/x", b"x" * 10_000)
+        for number in range(10):
+            twin = copy.copy(archive.infolist()[0])
+            twin.filename = f"a/{number}"
+            archive.filelist.append(twin)
+            archive.NameToInfo[twin.filename] = twin
+    with pytest.raises(UserError, match="cannot be read as a checkpoint") as caught:
+        read_checkpoint(tmp_path / "a.ckpt")
+    assert "overlap" in str(caught.value.__cause__)
+
+
+@pytest.fixture(scope="module")
+def halfway(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReducedDataset, Path]:
+    """A dataset and the folder of a training of it that was stopped."""
+    folder = tmp_path_factory.mktemp("halfway")
+    data = reduced(folder / "data")
+    train(data, num_modes=4, model=MODEL, training=FEW, output=folder / "out")
+    (folder / "out" / "training.json").unlink()
+    return data, folder / "out"
+
+
+def odd_state(content: dict[str, Any]) -> None:
+    first = content["optimizer_states"][0]["state"][0]
+    first["exp_avg"] = first["exp_avg"][:1, :1]
+
+
+def infinite_state(content: dict[str, Any]) -> None:
+    content["optimizer_states"][0]["state"][0]["exp_avg_sq"].fill_(torch.inf)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: content.pop("optimizer_states"),
+        lambda content: content.pop("lr_schedulers"),
+        lambda content: content.pop("loops"),
+        lambda content: content.pop("callbacks"),
+        lambda content: content.pop("pytorch-lightning_version"),
+        lambda content: content.update(optimizer_states=[]),
+        lambda content: content.update(optimizer_states=[{"state": {}, "param_groups": []}]),
+        lambda content: content["optimizer_states"][0].update(state={}),
+        lambda content: content["optimizer_states"][0]["param_groups"][0].update(lr="fast"),
+        lambda content: content["lr_schedulers"][0].update(last_epoch=None),
+        lambda content: content["loops"].update(fit_loop=3),
+        lambda content: content["loops"]["fit_loop"].update({"epoch_loop.batch_progress": 3}),
+        lambda content: content.update(global_step=10**9),
+        lambda content: content.update(first_loss="small"),
+        lambda content: content["callbacks"].update(RolloutValidation={"best": "x"}),
+        odd_state,
+        infinite_state,
+    ],
+)
+def test_trainings_that_cannot_be_gone_on_from(halfway, tmp_path, damage) -> None:
+    data, there = halfway
+    shutil.copytree(there, tmp_path / "out")
+    last = tmp_path / "out" / "last.ckpt"
+    content = torch.load(last, weights_only=True)
+    damage(content)
+    torch.save(content, last)
+    before = last.read_bytes()
+    with pytest.raises(
+        UserError, match=r"last\.ckpt cannot be gone on from .*training\.resume=false"
+    ) as caught:
+        train(data, num_modes=4, model=MODEL, training=FEW, output=tmp_path / "out")
+    assert "\n" not in str(caught.value) and last.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "null", '{"skill": "x", "seconds": 1}', "[" * 10**5, "\0" * 100]
+)
+def test_a_complete_training_whose_summary_is_damaged(halfway, tmp_path, text) -> None:
+    data, there = halfway
+    shutil.copytree(there, tmp_path / "out")
+    (tmp_path / "out" / "training.json").write_text(text)
+    with pytest.raises(UserError, match=r"training\.json is not the summary of a training"):
+        train(data, num_modes=4, model=MODEL, training=FEW, output=tmp_path / "out")
 
 
 # --- settings ---------------------------------------------------------------------------------------------
@@ -391,6 +532,92 @@ def test_bases_and_reduced_runs_that_point_elsewhere_or_claim_too_much(tmp_path,
         read_reduced(run)
 
 
+PACKED = {"compression": "gzip", "compression_opts": 9}
+
+
+def bomb(path: Path, name: str, shape: tuple[int, ...]) -> None:
+    """Replace a dataset by zeros that are packed as tightly as deflate can."""
+    with h5py.File(path, "r+") as file:
+        dtype = file[name].dtype
+        del file[name]
+        made = file.create_dataset(name, shape, dtype, chunks=(1, *shape[1:]), **PACKED)
+        packed = zlib.compress(bytes(math.prod(shape[1:]) * dtype.itemsize), 9)
+        for row in range(shape[0]):
+            made.id.write_direct_chunk((row, *[0] * (len(shape) - 1)), packed)
+
+
+def test_small_hdf5_files_that_unfold_to_more_than_fits(tmp_path) -> None:
+    folder = reduced(tmp_path / "data").folder
+    bomb(folder / "basis.h5", "modes", (9, 1_000_000))
+    with pytest.raises(UserError, match="would unfold"):
+        Basis.load(folder / "basis.h5")
+    run = next(path for path in folder.glob("*.h5") if path.name != "basis.h5")
+    bomb(run, "pose", (2, 6_000_000))
+    with pytest.raises(ValueError, match="would unfold"):
+        read_reduced(run)
+    path = make_run(tmp_path / "a.h5", frames=2, n=3)
+    bomb(path, "particles/soil/position/value", (2, 6_000_000, 3))
+    assert any("would unfold" in problem for problem in check_run(path))
+    assert path.stat().st_size < 1e6
+    with pytest.raises(UserError, match="would unfold"):
+        Run(path)
+
+
+def test_good_runs_may_be_compressed(tmp_path) -> None:
+    path = make_run(tmp_path / "a.h5", frames=3, n=4)
+    with h5py.File(path, "r+") as file:
+        for name in ("particles/soil/velocity/value", "observables/body/pose/value"):
+            values = file[name][...]
+            del file[name]
+            file.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), **PACKED)
+    with Run(path) as run:
+        assert run.pose.shape == (3, 7) and run.velocities().shape == (3, 4, 3)
+
+
+def test_texts_that_are_stored_once_and_shown_many_times(tmp_path) -> None:
+    path = make_run(tmp_path / "a.h5", frames=2, n=3)
+    with h5py.File(path, "r+") as file:
+        file.attrs["scene"] = np.array(["x"] * 2000, dtype=object)
+    with pytest.raises(UserError, match="holds more than 1000 values"):
+        Run(path)
+    assert check_run(path) == ["the file is damaged (attribute 'scene' holds more than 1000 values)"]
+    basis = reduced(tmp_path / "data").folder / "basis.h5"
+    with h5py.File(basis, "r+") as file:
+        del file["fitted_on"]
+        file["fitted_on"] = ["[]"] * 3
+    with pytest.raises(UserError, match="holds many texts"):
+        Basis.load(basis)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("latent", np.zeros((14, 5, 3)), "latent has shape"),
+        ("time", np.zeros(3), "time has shape"),
+        ("pose", np.zeros((14, 6)), "pose has shape"),
+        ("force", np.zeros((14, 3), dtype=int), "floating-point"),
+        ("torque", np.full((14, 3), np.nan), "not finite"),
+        ("body_points", np.zeros((14, 0, 3)), "body_points has shape"),
+        ("scene", "[" * 10**5, "nested too deep"),
+        ("scene", "[]", "no group of keys"),
+    ],
+)
+def test_reduced_runs_that_do_not_fit_together_are_reduced_again(
+    tmp_path, caplog, name, value, words
+) -> None:
+    data = make_dataset(tmp_path)
+    folder = reduce_dataset(data, REDUCTION, progress=False).folder
+    run = min(path for path in folder.glob("*.h5") if path.name != "basis.h5")
+    with h5py.File(run, "r+") as file:
+        del file[name]
+        file[name] = value
+    caplog.clear()
+    again = reduce_dataset(data, REDUCTION, progress=False)
+    assert words in caplog.text and "is damaged" in caplog.text
+    assert all(np.isfinite(one.torque).all() for one in again.runs("train"))
+    read_reduced(run)
+
+
 def test_a_content_hash_does_not_name_a_file_elsewhere(tmp_path) -> None:
     make_dataset(tmp_path / "data")
     with h5py.File(tmp_path / "data" / "runs" / "a.h5", "r+") as file:
@@ -462,7 +689,40 @@ def test_inputs_that_never_end(tmp_path, kind) -> None:
     place("dataset.yaml")
     with pytest.raises(UserError):
         Dataset.open(tmp_path)
+    with pytest.raises((OSError, ValueError)):  # what makes it be reduced again
+        read_reduced(place("reduced.h5"))
+    with pytest.raises(UserError, match=r"training\.json"):
+        place("training.json")
+        network_costs(tmp_path / "best.ckpt", {})
+    (tmp_path / "tensorboard").mkdir()
+    with pytest.raises(UserError, match="tfevents"):
+        place("tensorboard/events.out.tfevents.1.x")
+        read_log(tmp_path / "tensorboard")
+    with pytest.raises(UserError, match=r"points\.csv"):
+        read_points(place("points.csv"))
+    with pytest.raises(UserError, match="observed"):
+        read_observation(place("observed.npz"))
+    with pytest.raises(UserError, match=r"timed\.json"):
+        read_record(place("timed.json"))
+    (tmp_path / "points").mkdir()
+    with pytest.raises(UserError, match=r"a\.json"):
+        place("points/a.json")
+        Store(tmp_path).points()
     (tmp_path / "metadata.json").write_text(json.dumps({"dataset_split": {}}))
     place("valid.tfrecord")
     with pytest.raises(UserError):
         read_published(tmp_path)
+
+
+def test_published_runs_of_nothing_but_one_byte(tmp_path) -> None:
+    """Numbers of a record may not grow with it: adding to them took the square of its length."""
+    (tmp_path / "metadata.json").write_text(json.dumps({"dataset_split": {}}))
+    began = time.monotonic()
+    for byte in (b"\x00", b"\x7f", b"\x80", b"\xff"):
+        payload = byte * 2_000_000
+        record = len(payload).to_bytes(8, "little") + bytes(4) + payload + bytes(4)
+        for content in (payload, record):
+            (tmp_path / "valid.tfrecord").write_bytes(content)
+            with pytest.raises(UserError, match="is not a file of published runs"):
+                read_published(tmp_path)
+    assert time.monotonic() - began < 5.0

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
-from sgns.errors import UserError
 from sgns.evaluation.results import Costs
+from sgns.learning.summary import SUMMARY, read_summary
 from sgns.learning.surrogate import load_surrogate
 
 __all__ = ["forget_peak", "network_costs", "peak_memory"]
@@ -41,18 +41,12 @@ def trained(checkpoint: Path, card: dict[str, Any]) -> dict[str, float]:
     Raises:
         UserError: it is damaged.
     """
-    file = checkpoint.parent / "training.json"
-    if not file.is_file():
+    if not os.path.lexists(checkpoint.parent / SUMMARY):
         return {}
-    try:
-        summary = json.loads(file.read_text(encoding="utf-8"))
-        found = {"training_seconds": float(summary["seconds"])}
-        if "steps" in summary:  # polynomials are fitted without any
-            found["training_steps"] = int(summary["steps"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{file} is not the summary of a training ({type(error).__name__}: {error}); remove it or train again"
-        ) from error
+    summary = read_summary(checkpoint.parent)
+    found = {"training_seconds": float(summary["seconds"])}
+    if "steps" in summary:  # polynomials are fitted without any
+        found["training_steps"] = summary["steps"]
     batch = card.get("settings", {}).get("training", {}).get("batch_size")
     return found | ({"batch_size": int(batch)} if batch else {})
 

@@ -41,6 +41,7 @@ from sgns.reduction import Basis
 from sgns.reduction.reconstruction import reduction_curves
 from sgns.rollout import single_thread, write_rollout
 from sgns.runs import Run
+from sgns.runs.runlayout import scene_problems
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -115,7 +116,9 @@ def training_means(paths: Sequence[Path], history: int) -> tuple[np.ndarray, np.
 
 
 def require_known_run(simulator: Simulator, run: Run, checkpoint: Path) -> None:
-    """Refuses a run that the checkpoint's subspace cannot describe."""
+    """Refuses a run that the checkpoint's subspace, or the report, cannot describe."""
+    if problems := scene_problems(run.scene):
+        raise UserError(f"{run.path}: {problems[0]}; repeat the run")
     if run.arrangement_hash != simulator.arrangement_hash:
         raise UserError(
             f"{run.path} has another particle arrangement ({run.arrangement_hash}) than {checkpoint} was "
@@ -168,6 +171,7 @@ def evaluate(
         with Run(path) as run:
             require_known_run(simulator, run, checkpoint)
     costs = network_costs(checkpoint, simulator.card)
+    training_log = read_log(checkpoint.parent / "tensorboard")
     try:
         (output / "rollouts").mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -213,7 +217,7 @@ def evaluate(
         full_space=full_space_cost(paths[0], network, repeats) if network else None,
         mean_force=mean_force,
         mean_torque=mean_torque,
-        training_log=read_log(checkpoint.parent / "tensorboard"),
+        training_log=training_log,
         trained_on=trained_on,
         chosen_by=chosen_by,
         curves=reduction_curves(full_basis(dataset, simulator.basis), paths),

@@ -15,9 +15,10 @@ from typing import Any, ParamSpec, TypeVar
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator
+from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator
 
 from sgns.evaluation.surface import SurfaceGrid, height_map
 
@@ -41,6 +42,7 @@ STYLE: dict[str, Any] = {
     "legend.frameon": False,
     "legend.fontsize": 9.0,
     "lines.linewidth": 1.6,
+    "text.parse_math": False,  # names of runs may hold anything
 }
 
 
@@ -139,6 +141,7 @@ def energy_figure(energy: np.ndarray, displacement_energy: np.ndarray, num_modes
     ):
         missing = np.maximum(1.0 - np.asarray(values, dtype=np.float64), 1e-12)
         axis.semilogy(r, missing, color=colour, linewidth=width, label=label)
+    plain_log_numbers(axis.yaxis)
     log_modes(axis, len(energy), num_modes)
     axis.set_ylabel("1 − energy(r), training runs")
     axis.legend(loc="lower left")
@@ -185,6 +188,12 @@ def reconstruction_figure(
     axis.set_ylabel("reconstruction RMSE [mm]")
     axis.legend(loc="lower left")
     return figure
+
+
+def plain_log_numbers(axis: Axis) -> None:
+    """Numbers along a logarithmic axis without the formulas that matplotlib would write."""
+    axis.set_major_formatter(LogFormatter())
+    axis.set_minor_formatter(LogFormatter())
 
 
 def log_modes(axis: Axes, last: int, num_modes: int) -> None:

@@ -7,7 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from sgns.evaluation.figures import ACCENT, NETWORK, PICTURE_WIDTH, new_figure, styled
+from sgns.evaluation.figures import (
+    ACCENT,
+    NETWORK,
+    PICTURE_WIDTH,
+    new_figure,
+    plain_log_numbers,
+    styled,
+)
 from sgns.evaluation.metrics import ParticleErrors
 
 __all__ = ["error_bins", "histogram_figure"]
@@ -45,5 +52,6 @@ def histogram_figure(runs: Sequence[ParticleErrors]) -> Figure:
         axis.set_ylabel("particles [%]")
         axis.grid(alpha=0.25, linewidth=0.6, axis="y")
     axes[0].set_xscale("log")
+    plain_log_numbers(axes[0].xaxis)
     axes[1].set_xlabel("position MSE of a particle [m²]")
     return figure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from mpm_warp.inputs import open_file
+from sgns.errors import UserError
 from sgns.evaluation.figures import ACCENT, BASELINE, NETWORK, PICTURE_WIDTH, TRUTH, new_figure, styled
 
 __all__ = ["read_log", "training_figure"]
@@ -22,13 +25,31 @@ VALIDATION = {
 COLOURS = {"total": TRUTH, "force": ACCENT, "torque": BASELINE}
 # Skill and NRMSE beyond these say only that a rollout ran away.
 LOWEST, HIGHEST = -0.5, 1.5
+MOST_BYTES = 1 << 26  # of a log, all files together; a day of training writes a tenth of that
 
 
 def read_log(folder: Path) -> dict[str, np.ndarray]:
-    """Scalars of a TensorBoard folder: name → steps and values, shape (k, 2); empty if there is no log."""
+    """Scalars of a TensorBoard folder: name → steps and values, shape (k, 2); empty if there is no log.
+
+    Raises:
+        UserError: It holds what is no log.
+    """
     if not folder.is_dir():
         return {}
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
+    advice = "remove it: only a figure of the report needs it"
+    left = MOST_BYTES
+    for file in sorted(folder.iterdir()):
+        if "tfevents" in file.name:  # what TensorBoard would read
+            try:
+                with open_file(file, left) as content:
+                    left -= os.fstat(content.fileno()).st_size
+            except (OSError, ValueError) as error:
+                raise UserError(f"{file} is no log of TensorBoard ({error}); {advice}") from error
+    try:
+        events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
+    except Exception as error:  # whatever bytes do to a reader that is not ours
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"{folder} holds no log of TensorBoard ({reason:.200}); {advice}") from error
     # A training that was killed logs some steps again, and its files are out of order if the clock went back.
     return {
         name: np.array(sorted({e.step: e.value for e in events.Scalars(name)}.items()), dtype=np.float64)

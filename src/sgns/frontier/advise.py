@@ -229,10 +229,10 @@ def positive(key: str, value: Any) -> float:
 
 def shipped(study: str, scene: str) -> dict[str, Any]:
     """Settings of a scene of a study that ships with the package; empty for others."""
-    file = files("sgns.conf").joinpath(f"study/{study}.yaml")
-    if not file.is_file():
-        return {}
-    return yaml.safe_load(file.read_text(encoding="utf-8"))["scenes"].get(scene, {})
+    for file in files("sgns.conf").joinpath("study").iterdir():  # a table may name anything
+        if file.name == f"{study}.yaml":
+            return yaml.safe_load(file.read_text(encoding="utf-8"))["scenes"].get(scene, {})
+    return {}
 
 
 def bands(study: str, scene: str) -> dict[str, float]:

@@ -7,10 +7,11 @@ import math
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
 
 from sgns.frontier.gather import effective_error, front, usable
 from sgns.frontier.labels import place_labels
@@ -39,12 +40,16 @@ STYLES = {
 }
 DPI = 110
 
+plain_text = rc_context({"text.parse_math": False})
+"""For figures that show labels from anybody's table, in which $ is no formula."""
+
 
 def known(points: Sequence[Point], column: str) -> list[Point]:
     """Usable points whose error is known."""
     return [point for point in points if usable(point) and not math.isnan(getattr(point, column))]
 
 
+@plain_text
 def scene_figure(points: Sequence[Point], column: str, bands: Mapping[str, float], title: str) -> bytes:
     """Error over wall time per simulated second, as PNG.
 
@@ -137,6 +142,7 @@ def plain_numbers(axes: Axes) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.xaxis.set_minor_formatter(LogFormatter())
 
 
 def settle(figure: Figure) -> None:
@@ -162,6 +168,7 @@ def set_limits(axes: Axes, points: Sequence[Point], column: str, band: float) ->
     axes.set_ylim(min(y) / 1.8, max(y) * 1.5)
 
 
+@plain_text
 def through_time_figure(points: Sequence[Point], title: str) -> bytes:
     """Errors of force and displacement at the quarters of the run, as PNG."""
     figure = Figure(figsize=(11, 4.5), dpi=DPI, layout="constrained")
@@ -180,6 +187,7 @@ def through_time_figure(points: Sequence[Point], title: str) -> bytes:
     return png(figure)
 
 
+@plain_text
 def reduction_figure(points: Sequence[Point], title: str) -> bytes:
     """What r modes leave out of held-out runs, over the time of encoding and decoding, as PNG; a line per centring."""
     figure = Figure(figsize=(11, 5.5), dpi=DPI, layout="constrained")
@@ -210,6 +218,7 @@ def reduction_figure(points: Sequence[Point], title: str) -> bytes:
     return png(figure)
 
 
+@plain_text
 def training_figure(points: Sequence[Point], title: str) -> bytes:
     """What training time buys: errors against the solver that made the runs, over processor time, as PNG."""
     figure = Figure(figsize=(13, 5.5), dpi=DPI, layout="constrained")

@@ -23,6 +23,8 @@ import numpy as np
 from mpm_warp import Scene
 from sgns.errors import UserError
 from sgns.evaluation.surface import SurfaceGrid, height_map
+from sgns.shapes import require_shapes
+from sgns.smallfile import read_arrays
 from sgns.wholefile import whole_file
 
 __all__ = ["Observation", "Observer", "observe_arrays", "observed_frames", "read_observation"]
@@ -30,6 +32,15 @@ __all__ = ["Observation", "Observer", "observe_arrays", "observed_frames", "read
 LATTICE = 0.02  # of displacements, coarse enough for the coarsest beds of a study [m]
 COLUMN = 0.03  # edge of a column of the surface [m]
 TIMES_PER_SECOND = 5  # that the soil is observed
+_SHAPES: dict[str, tuple[int | str, ...]] = {
+    "time": ("T",),
+    "force": ("T", 3),
+    "torque": ("T", 3),
+    "pose": ("T", 7),
+    "soil_time": ("K",),
+    "moved": ("K", "P", 3),
+    "surface": ("K", "nx", "ny"),
+}
 
 
 @dataclass(frozen=True)
@@ -73,13 +84,16 @@ def read_observation(file: Path) -> Observation:
     Raises:
         UserError: it is missing or damaged.
     """
+    advice = "remove it and its point to make it again"
+    content = read_arrays(file, "not an observed run", advice)
     try:
-        with np.load(file) as content:
-            return Observation(**{f.name: content[f.name] for f in fields(Observation)})
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise UserError(
-            f"{file} is not an observed run ({error}); remove it and its point to make it again"
-        ) from error
+        require_shapes(content, _SHAPES)
+        for name in ("time", "soil_time"):
+            if not (np.isfinite(content[name]).all() and (np.diff(content[name]) > 0).all()):
+                raise ValueError(f"{name} does not increase")
+    except ValueError as error:
+        raise UserError(f"{file} is not an observed run ({error}); {advice}") from error
+    return Observation(**{name: content[name] for name in _SHAPES})
 
 
 def observed_frames(frame_count: int, frame_rate: float) -> np.ndarray:

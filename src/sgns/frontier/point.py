@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sgns.errors import UserError
+from sgns.smallfile import read_table
 from sgns.wholefile import whole_file
 
 __all__ = ["KINDS", "Point", "read_points", "write_points"]
@@ -170,15 +171,26 @@ class Point:
             if given is None or given == "":
                 continue
             try:
-                values[field.name] = _KINDS_OF_VALUE[str(field.type)](given)
-            except (ValueError, KeyError) as error:
-                raise UserError(f"{field.name} is {given!r}, which is not a {field.type}") from error
+                values[field.name] = value = _KINDS_OF_VALUE[str(field.type)](given)
+                if isinstance(value, float) and (
+                    math.isinf(value) or (field.name in _ABOVE_ZERO and value <= 0.0)
+                ):
+                    raise ValueError
+            except (ValueError, KeyError, TypeError) as error:
+                kind = "float above 0" if field.name in _ABOVE_ZERO else field.type
+                raise UserError(f"{field.name} is {given!r:.40}, which is not a {kind}") from error
         try:
             return cls(**values)
         except TypeError as error:
             raise UserError(f"a row of operating points lacks columns: {error}") from None
 
 
+_ABOVE_ZERO = (
+    "wall_s_per_simulated_s",
+    "processor_s_per_simulated_s",
+    "decoded_wall_s_per_simulated_s",
+)
+"""Columns that others are divided by."""
 _KINDS_OF_VALUE = {"str": str, "float": float, "bool": lambda v: {"True": True, "False": False}[str(v)]}
 
 
@@ -203,11 +215,7 @@ def read_points(file: Path) -> list[Point]:
     Raises:
         UserError: it cannot be read or is no such table.
     """
-    try:
-        with file.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.DictReader(stream))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"cannot read {file}: {error}; make it: sgns frontier") from None
+    rows = read_table(file, "no table of operating points", "make it: sgns frontier")
     try:
         return [Point.from_row(row) for row in rows]
     except UserError as error:

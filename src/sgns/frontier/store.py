@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from pathlib import Path
 from sgns.errors import UserError
 from sgns.frontier.observation import Observation, read_observation
 from sgns.frontier.point import Point
+from sgns.smallfile import read_json
 from sgns.wholefile import write_whole
 
 __all__ = ["Store"]
@@ -52,13 +54,17 @@ class Store:
         """
         found = []
         for file in sorted((self.folder / "points").glob("*.json")):
+            advice = "remove it to make it again"
+            content = read_json(file, "no operating point", advice)
             try:
-                content = json.loads(file.read_text(encoding="utf-8"))
-                found.append((Point.from_row(content["point"]), list(content["cases"])))
+                point, cases = content["point"], content["cases"]
+                if not isinstance(point, dict) or not isinstance(cases, list):
+                    raise TypeError("its point is no group of keys, or its cases are no list")
+                if wrong := [c for c in cases if not isinstance(c, str) or set(c) & {"/", os.sep, "\0"}]:
+                    raise ValueError(f"{wrong[0]!r:.40} is no name of a case")
+                found.append((Point.from_row(point), cases))
             except (ValueError, KeyError, TypeError, UserError) as error:
-                raise UserError(
-                    f"{file} is no operating point ({error}); remove it to make it again"
-                ) from None
+                raise UserError(f"{file} is no operating point ({error}); {advice}") from None
         return found
 
     def observation(self, point: Point, case: str) -> Observation:

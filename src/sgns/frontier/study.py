@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +15,7 @@ from mpm_warp import Scene
 from sgns.errors import UserError
 from sgns.frontier.store import Store
 from sgns.frontier.timing import composed_scene
+from sgns.smallfile import read_text
 from sgns.wholefile import write_whole
 from sgns.yaml_text import parse_yaml
 
@@ -145,12 +147,14 @@ class Study:
                 taken for this study's.
         """
         file, asked = self.folder / "study.yaml", self._asked()
+        advice = "give another output"
         try:
-            known = parse_yaml(file.read_text(encoding="utf-8")) if file.exists() else {}
+            there = os.path.lexists(file)
+            known = parse_yaml(read_text(file, "no text of a study", advice)) if there else {}
         except ValueError:
             known = None
         if not isinstance(known, dict):
-            raise UserError(f"{file} does not say what was measured; give another output")
+            raise UserError(f"{file} does not say what was measured; {advice}")
         # Of what was never measured nothing can be taken for something else.
         measured = any((self.folder / "points").glob("*.json"))
         for key in known.keys() & asked.keys():

@@ -12,7 +12,6 @@ also be given for all entries of a scene under `training`:
 
 from __future__ import annotations
 
-import csv
 import logging
 import math
 import shlex
@@ -46,6 +45,7 @@ from sgns.frontier.training_sets import every_nth_frame, with_training_runs
 from sgns.reduction.reduced import reduce_dataset
 from sgns.rollout import finite_frames
 from sgns.simulator import Simulator
+from sgns.smallfile import read_table
 from sgns.states import Rollout
 
 __all__ = ["TrainingPlan", "measure_surrogates"]
@@ -289,10 +289,14 @@ def measure_elsewhere(study: Study, scene: StudyScene, entry: PointSettings) -> 
     if not file.exists():
         log.info("%s: %s is left out, there is no %s here", scene.name, entry.label, file)
         return
-    with file.open(newline="", encoding="utf-8") as stream:
-        rows = {row.get("case", ""): row for row in csv.DictReader(stream)}
+    table = read_table(file, "no table of trainings", "make it: experiments/full_space/run.py")
+    rows = {row.get("case", ""): row for row in table}
     if case not in rows:
         raise UserError(f"{file} has no case {case!r}; there are: {'; '.join(rows)}")
+    try:
+        columns = full_space_fields(rows[case])
+    except ValueError as error:
+        raise UserError(f"{file}: {case!r} has a column that is no number ({error})") from None
     point = Point(
         study=study.name,
         scene=scene.name,
@@ -301,7 +305,7 @@ def measure_elsewhere(study: Study, scene: StudyScene, entry: PointSettings) -> 
         label=entry.label,
         includes=FULL_SPACE_INCLUDES,
         note=f"{case!r} of {file.as_posix()}",
-        **full_space_fields(rows[case]),
+        **columns,
     )
     study.store.save(point, {})
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import statistics
 import time
 from collections.abc import Mapping
@@ -21,6 +22,7 @@ from sgns.learning.model_settings import ModelSettings
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.training import prepared, train
 from sgns.reduction.reduced import ReducedDataset
+from sgns.smallfile import read_json
 from sgns.wholefile import write_whole
 
 __all__ = ["TimedTraining", "train_for"]
@@ -72,8 +74,7 @@ def train_for(
     output = folder / _key(seconds, reduced, model, training, seed)
     record = output / "timed.json"
     if record.exists():
-        known = json.loads(record.read_text(encoding="utf-8"))
-        return TimedTraining(output / "best.ckpt", **known)
+        return read_record(record)
     torch.set_num_threads(1)
     frames = sum(len(run.latent) - 1 for run in reduced.runs("train"))
     checked = model_settings(model)
@@ -104,6 +105,24 @@ def train_for(
     done = TimedTraining(output / "best.ckpt", round(elapsed(began, time.process_time()), 1), steps, samples)
     write_whole(record, json.dumps({k: v for k, v in asdict(done).items() if k != "checkpoint"}) + "\n")
     return done
+
+
+def read_record(record: Path) -> TimedTraining:
+    """What `train_for` keeps beside a checkpoint.
+
+    Raises:
+        UserError: It is damaged.
+    """
+    advice = "remove it to train again"
+    known = read_json(record, "not the record of a training", advice)
+    kinds = {"processor_s": (int, float), "steps": int, "samples": int}
+    if not isinstance(known, dict) or known.keys() != kinds.keys():
+        raise UserError(f"{record} does not say {', '.join(kinds)}; {advice}")
+    for key, kind in kinds.items():
+        value = known[key]
+        if not isinstance(value, kind) or isinstance(value, bool) or not 0 <= value < math.inf:
+            raise UserError(f"{record}: {key} is {value!r:.40}, not a number of 0 or more; {advice}")
+    return TimedTraining(record.with_name("best.ckpt"), **known)
 
 
 def seconds_per_step(

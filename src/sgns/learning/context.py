@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -41,4 +42,6 @@ def _value(scene: Mapping[str, Any], key: str) -> float | None:
     found: Any = scene
     for part in key.split("."):
         found = found.get(part) if isinstance(found, Mapping) else None
-    return float(found) if isinstance(found, (int, float)) and not isinstance(found, bool) else None
+    if isinstance(found, bool) or not isinstance(found, (int, float)) or not abs(found) < math.inf:
+        return None
+    return float(found)

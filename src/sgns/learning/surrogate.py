@@ -30,6 +30,9 @@ __all__ = ["Surrogate", "load_surrogate", "read_checkpoint", "write_checkpoint"]
 _FORMAT = "sgns-surrogate"
 _FORMAT_VERSION = 2
 _PREFIX = "surrogate."
+_DEEPEST = 100  # nesting of a card
+_MOST_VALUES = 1_000_000  # of a card
+_MOST_TEXT = 1 << 24  # characters of a card
 # How far the soil's modes may leave the range of the training runs, in widths of that range. Held-out runs leave it by
 # up to 0.57 (of four training runs), rollouts five times as deep as trained by 0.45.
 _MARGIN = 0.75
@@ -169,6 +172,11 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise UserError(
             f"{path} has format {version!r}, newer than this program reads ({_FORMAT_VERSION}); update sgns"
         )
+    try:
+        _require_tree(card)
+        _require_settings(card.get("settings", {}))
+    except ValueError as error:
+        raise UserError(f"{path} has a card that cannot be used ({error}); train again") from error
     return content
 
 
@@ -211,11 +219,53 @@ def _require_plain_archive(path: Path) -> None:
     the formats of before them."""
     try:
         with zipfile.ZipFile(path) as archive:
-            compressed = any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist())
+            parts = archive.infolist()
+            compressed = any(part.compress_type != zipfile.ZIP_STORED for part in parts)
     except (zipfile.BadZipFile, NotImplementedError) as error:
         raise ValueError(str(error)) from error
     if compressed:
         raise ValueError("its parts are compressed")
+    if sum(part.file_size for part in parts) > path.stat().st_size:
+        raise ValueError("its parts overlap")
+
+
+def _require_tree(card: dict[str, Any]) -> None:
+    """Refuses a card that is not plain values, each in its place, as JSON and YAML hold them.
+
+    Pickles can put a list into itself, or one list into another many times: whoever writes that out never ends.
+    """
+    values = characters = 0
+    unfinished: list[tuple[Any, int]] = [(card, 0)]
+    while unfinished:
+        value, depth = unfinished.pop()
+        values += 1
+        if isinstance(value, str):
+            characters += len(value)
+        elif isinstance(value, (dict, list, tuple)):
+            inside = [*value.keys(), *value.values()] if isinstance(value, dict) else value
+            values += len(inside)
+            unfinished += [(one, depth + 1) for one in inside] if values <= _MOST_VALUES else []
+        elif not (value is None or isinstance(value, (bool, float))) and not (
+            isinstance(value, int) and value.bit_length() < 64
+        ):
+            raise ValueError(f"it holds a {type(value).__name__}")
+        if depth > _DEEPEST:
+            raise ValueError(f"it is nested more than {_DEEPEST} deep, or in itself")
+        if values > _MOST_VALUES or characters > _MOST_TEXT:
+            raise ValueError(f"it stands for more than {_MOST_VALUES} values or {_MOST_TEXT} characters")
+
+
+def _require_settings(settings: Any) -> None:
+    """Refuses settings of a training that the report could not name."""
+    training = settings.get("training", {}) if isinstance(settings, dict) else None
+    runs = settings.get("validation_runs", []) if isinstance(settings, dict) else None
+    if not isinstance(training, dict) or not isinstance(runs, list):
+        raise ValueError("its settings are no group of keys with a group training and a list validation_runs")
+    if not all(isinstance(run, str) for run in runs):
+        raise ValueError("validation_runs are not names")
+    batch = training.get("batch_size", 1)
+    if type(batch) is not int or batch < 1:
+        raise ValueError(f"training.batch_size is {batch!r:.40}")
 
 
 def _require_own_values(state: dict[str, Any]) -> None:

@@ -140,6 +140,7 @@ class SurrogateTraining(L.LightningModule):
         self.surrogate = surrogate
         self.settings = settings
         self.first_loss: float | None = None
+        self.begun = False
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Squared errors of the normalised quantities, unweighted: summed over axes, averaged over the nodes that
@@ -237,6 +238,10 @@ class SurrogateTraining(L.LightningModule):
                     f"the weights {name} are not finite after step {self.global_step}; likely the learning rate is too "
                     f"high: lower training.learning_rate (now {self.settings.learning_rate:g})"
                 )
+
+    def on_train_start(self) -> None:
+        """What there was to go on from has been taken."""
+        self.begun = True
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The card makes the checkpoint self-contained."""

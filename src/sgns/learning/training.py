@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import shutil
 import signal
 import threading
@@ -38,6 +39,7 @@ from sgns.learning.polynomial_settings import FitSettings, PolynomialSettings
 from sgns.learning.polynomial_training import check_start, fit_polynomial
 from sgns.learning.statistics import fit_normalisation
 from sgns.learning.stepping import Dynamics
+from sgns.learning.summary import SUMMARY, read_summary
 from sgns.learning.surrogate import Surrogate, load_surrogate, read_checkpoint, write_checkpoint
 from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.training_range import TrainingRange
@@ -57,6 +59,8 @@ log = logging.getLogger(__name__)
 
 # Settings that change speed or reporting, not the result.
 _NO_MATTER = ("threads", "log_every", "resume")
+_ANEW = "train anew with training.resume=false, or into another output"
+_MOMENTS = ("exp_avg", "exp_avg_sq")  # what AdamW keeps of each weight
 
 
 def main(cfg: DictConfig) -> float:
@@ -139,7 +143,7 @@ def train(
     }
     resumed = what_is_there(output, card["settings"], settings.resume)
     if resumed == "complete":
-        summary = json.loads((output / "training.json").read_text())
+        summary = read_summary(output)
         log.info("%s is complete: validation skill %.3f", output, summary["skill"])
         return float(summary["skill"])
 
@@ -170,8 +174,11 @@ def train(
         with quiet_lightning():
             trainer = make_trainer(output, settings, device, callbacks, logger)
             began = time.perf_counter()
+            last = output / "last.ckpt" if resumed else None
+            if last is not None:
+                require_resumable(last, trainer, module, settings)
             try:
-                fit(trainer, module, data, output / "last.ckpt" if resumed else None)
+                fit(trainer, module, data, last)
             except UserError as error:
                 if not (output / "best.ckpt").exists():
                     raise
@@ -191,7 +198,7 @@ def train(
     )
     logger.finalize("success")
     summary = {**about, **metrics, "seconds": round(seconds, 1)}
-    write_whole(output / "training.json", json.dumps(summary, indent=2) + "\n")
+    write_whole(output / SUMMARY, json.dumps(summary, indent=2) + "\n")
     log.info(
         "trained in %.0f s; %d validation runs: skill %.3f (from rest %.3f), force NRMSE %.3f; %s",
         seconds,
@@ -301,7 +308,7 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
     Raises:
         UserError: A training with other settings is there.
     """
-    names = ("best.ckpt", "last.ckpt", "training.json")
+    names = ("best.ckpt", "last.ckpt", SUMMARY)
     if resume is False:
         for name in names:
             (output / name).unlink(missing_ok=True)
@@ -320,9 +327,70 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
             f"{output} holds a training with other settings: {key} is {old!r} there and {new!r} here{more}; "
             "use another output, or training.resume=false to overwrite it"
         )
-    if (output / "best.ckpt").exists() and (output / "training.json").exists():
+    if (output / "best.ckpt").exists() and (output / SUMMARY).exists():
         return "complete"
     return "partial" if (output / "last.ckpt").exists() else ""
+
+
+def require_resumable(
+    last: Path, trainer: L.Trainer, module: SurrogateTraining, settings: TrainingSettings
+) -> None:
+    """Refuses a checkpoint that lacks, or has in odd shape, what a training goes on from.
+
+    Raises:
+        UserError: It does.
+    """
+    load_surrogate(last)
+    content = read_checkpoint(last)
+    fresh = module.configure_optimizers()
+    weights = fresh["optimizer"].param_groups[0]["params"]
+    try:
+        (optimizer,), (schedule,) = content["optimizer_states"], content["lr_schedulers"]
+        step = content["global_step"]
+        done = content["loops"]["fit_loop"]["epoch_loop.automatic_optimization.optim_progress"]
+        if type(step) is not int or not 0 <= step <= settings.max_steps:
+            raise ValueError(f"global_step is {step!r:.40}, of {settings.max_steps} steps")
+        if done["optimizer"]["step"]["total"]["completed"] != step:
+            raise ValueError("it disagrees with itself about its steps")
+        require_alike(content["loops"]["fit_loop"], trainer.fit_loop.state_dict(), "loops")
+        require_alike(optimizer["param_groups"], fresh["optimizer"].state_dict()["param_groups"], "optimiser")
+        require_alike(schedule, fresh["lr_scheduler"]["scheduler"].state_dict(), "schedule")
+        if not set(optimizer["state"]) <= set(range(len(weights))) or (step and not optimizer["state"]):
+            raise ValueError("the optimiser knows other weights")
+        for index, state in optimizer["state"].items():
+            for key, shape in (("step", ()), *((key, weights[index].shape) for key in _MOMENTS)):
+                if tuple(state[key].shape) != tuple(shape) or not bool(state[key].isfinite().all()):
+                    raise ValueError(f"{key} of weights {index} is not finite or has another shape")
+        for key, value in (
+            ("first_loss", content.get("first_loss")),
+            ("best skill", content["callbacks"]["RolloutValidation"]["best"]),
+        ):
+            if value is not None and type(value) not in (int, float):
+                raise ValueError(f"{key} is {value!r:.40}")
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise UserError(f"{last} cannot be gone on from ({reason}); {_ANEW}") from error
+
+
+def require_alike(given: Any, fresh: Any, where: str) -> None:
+    """Refuses plain values that lack keys of fresh ones, or hold another kind of value there.
+
+    Raises:
+        ValueError: Which.
+    """
+    if isinstance(fresh, (float, int)) and not isinstance(fresh, bool):
+        if isinstance(given, bool) or not isinstance(given, (float, int)) or not math.isfinite(given):
+            raise ValueError(f"{where} is {given!r:.40}, not a finite number")
+    elif type(given) is not type(fresh):
+        raise ValueError(f"{where} is a {type(given).__name__}, not a {type(fresh).__name__}")
+    elif isinstance(fresh, dict):
+        for key in fresh.keys() & given.keys():
+            require_alike(given[key], fresh[key], f"{where}.{key}")
+    elif isinstance(fresh, (list, tuple)):
+        if len(given) != len(fresh):
+            raise ValueError(f"{where} has {len(given)} entries, not {len(fresh)}")
+        for one, other in zip(given, fresh, strict=True):
+            require_alike(one, other, where)
 
 
 def make_folder(output: Path) -> None:
@@ -390,7 +458,7 @@ def quiet_lightning() -> Iterator[None]:
 
 
 def fit(
-    trainer: L.Trainer, module: L.LightningModule, data: L.LightningDataModule, last: Path | None
+    trainer: L.Trainer, module: SurrogateTraining, data: L.LightningDataModule, last: Path | None
 ) -> None:
     """Run the trainer; an interruption stays one."""
     in_main_thread = threading.current_thread() is threading.main_thread()
@@ -407,6 +475,13 @@ def fit(
         except SystemExit as error:
             # Lightning turns Ctrl-C into an exit of its own.
             raise KeyboardInterrupt from error
+        except UserError:
+            raise
+        except Exception as error:
+            if last is None or module.begun:
+                raise
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise UserError(f"{last} cannot be gone on from ({reason:.200}); {_ANEW}") from error
         finally:
             if in_main_thread and handler is not None:
                 signal.signal(signal.SIGINT, handler)

@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import torch
 from torch import Tensor
 
 from sgns.errors import UserError
-from sgns.hdf5 import BROKEN, own_dataset
+from sgns.hdf5 import BROKEN, open_hdf5, own_attribute, own_dataset
 from sgns.runs.newfile import new_hdf5
+from sgns.smallfile import parse_json
 
 __all__ = ["CENTRINGS", "Basis"]
 
@@ -215,11 +215,12 @@ class Basis:
         if not path.is_file():
             raise UserError(f"no basis file at {path}; make one with `sgns reduce`")
         try:
-            with h5py.File(path, "r") as file:
-                if file.attrs.get("format") != _FORMAT:
+            with open_hdf5(path) as file:
+                if own_attribute(file, "format") != _FORMAT:
                     raise UserError(f"{path}: an HDF5 file but not a basis; make one with `sgns reduce`")
-                state = {key: value for key, value in file.attrs.items()}
-                state["fitted_on"] = json.loads(own_dataset(file, "fitted_on")[()])
+                keys = ("format_version", *_NUMBERS, *_WORDS)
+                state = {key: own_attribute(file, key) for key in keys if key in file.attrs}
+                state["fitted_on"] = parse_json(own_dataset(file, "fitted_on")[()])
                 state.update((key, torch.from_numpy(own_dataset(file, key)[()])) for key in _ARRAYS)
         except (*BROKEN, AttributeError) as error:
             reason = " ".join(str(error).split())

@@ -21,14 +21,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypedDict
 
-import h5py
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from sgns.campaign import SPLITS, Dataset
 from sgns.errors import UserError
-from sgns.hdf5 import BROKEN, own_dataset
+from sgns.hdf5 import BROKEN, open_hdf5, own_attribute, own_dataset
 from sgns.reduction.basis import CENTRINGS, Basis
 from sgns.reduction.choice import MEASURES, choose_modes
 from sgns.reduction.fitting import fit_runs, require_positions
@@ -36,13 +35,22 @@ from sgns.reduction.incremental_pca import checked_device
 from sgns.runs import Run, frame_chunks
 from sgns.runs.newfile import new_hdf5
 from sgns.settings import check_fields
+from sgns.shapes import require_shapes
+from sgns.smallfile import parse_json
 
 __all__ = ["ReducedDataset", "ReducedRun", "reduce_dataset"]
 
 log = logging.getLogger(__name__)
 
 _FORMAT = "sgns-reduced-run-1"
-_SERIES = ("latent", "time", "pose", "body_points", "force", "torque")
+_SERIES: dict[str, tuple[int | str, ...]] = {
+    "latent": ("T", "r", 3),
+    "time": ("T",),
+    "pose": ("T", 7),
+    "body_points": ("T", "M", 3),
+    "force": ("T", 3),
+    "torque": ("T", 3),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +261,7 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
     """The cached reduced run, or a new one."""
     if path.exists():
         try:
-            return replace(read_reduced(path), name=run_path.stem)
+            return replace(read_reduced(path, {"r": basis.num_modes}), name=run_path.stem)
         except BROKEN as error:
             log.warning("%s is damaged (%s); reducing %s again", path, error, run_path)
     with Run(run_path) as run:
@@ -287,16 +295,24 @@ def write_reduced(path: Path, run: ReducedRun) -> None:
         file.attrs["format"] = _FORMAT
 
 
-def read_reduced(path: Path) -> ReducedRun:
+def read_reduced(path: Path, counts: Mapping[str, int] | None = None) -> ReducedRun:
     """Read a reduced run.
 
+    Args:
+        path: The file.
+        counts: T, r or M where they are known.
+
     Raises:
-        One of sgns.hdf5.BROKEN: Not one.
+        One of sgns.hdf5.BROKEN: Not one, or its arrays do not fit together.
     """
-    with h5py.File(path, "r") as file:
-        if file.attrs.get("format") != _FORMAT:
+    with open_hdf5(path) as file:
+        if own_attribute(file, "format") != _FORMAT:
             raise ValueError("not a reduced run")
         series = {name: own_dataset(file, name)[()] for name in _SERIES}
-        return ReducedRun(
-            name=str(file.attrs["name"]), scene=json.loads(own_dataset(file, "scene")[()]), **series
-        )
+        require_shapes(series, _SERIES, counts)
+        if infinite := [name for name, values in series.items() if not np.isfinite(values).all()]:
+            raise ValueError(f"{infinite[0]} is not finite")
+        scene = parse_json(own_dataset(file, "scene")[()])
+        if not isinstance(scene, dict):
+            raise ValueError("its scene is no group of keys")
+        return ReducedRun(name=str(own_attribute(file, "name")), scene=scene, **series)

@@ -5,7 +5,6 @@ Letters: T frames, n soil particles, M body points.
 
 from __future__ import annotations
 
-import math
 import os
 
 import h5py
@@ -20,6 +19,7 @@ from sgns.runs.runlayout import (
     one_line,
     open_run,
     read_attributes,
+    scene_problems,
     structure_problems,
 )
 from sgns.runs.runwriter import ContentHash
@@ -93,6 +93,8 @@ def _check_attributes(file: h5py.File) -> list[str]:
             continue
         if not isinstance(data, dict):
             problems.append(f"root attribute {name!r} is not a group of keys")
+        elif name == "scene":
+            problems += scene_problems(data)
         elif name == "effects":
             problems += [
                 f"effect {key!r} does not say whether it is on and why"
@@ -102,12 +104,6 @@ def _check_attributes(file: h5py.File) -> list[str]:
     producer = values.get("producer")
     if isinstance(producer, str) and producer not in PRODUCERS:
         problems.append(f"producer is {producer!r}; allowed: {', '.join(PRODUCERS)}")
-    frame_rate = values.get("frame_rate")
-    if isinstance(frame_rate, float) and not (math.isfinite(frame_rate) and frame_rate > 0):
-        problems.append(f"frame_rate is {frame_rate}; it must be above 0 Hz")
-    wall_time = values.get("wall_time_s")
-    if isinstance(wall_time, float) and not (math.isfinite(wall_time) and wall_time >= 0):
-        problems.append(f"wall_time_s is {wall_time}; it must be 0 s or more")
     return problems
 
 

@@ -5,8 +5,10 @@ Letters: T frames, n soil particles, M body points.
 
 from __future__ import annotations
 
+import math
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -16,7 +18,7 @@ import h5py
 import numpy as np
 
 from sgns.errors import UserError
-from sgns.hdf5 import BROKEN, own_dataset
+from sgns.hdf5 import BROKEN, own_attribute, own_dataset
 
 __all__ = [
     "ATTRIBUTES",
@@ -29,6 +31,7 @@ __all__ = [
     "open_run",
     "package_version",
     "read_attributes",
+    "scene_problems",
     "structure_problems",
     "write_text",
 ]
@@ -57,6 +60,21 @@ ATTRIBUTES = (
 """Root attributes; `scene`, `effects` and `extra` are YAML text in UTF-8."""
 OPTIONAL = ("stopped",)
 """Root attributes that only some files have: why a run ended before its time."""
+
+
+_SCENE_NUMBERS = (
+    "depth",
+    "speed",
+    "rake",
+    "diameter",
+    "width",
+    "grouser_height",
+    "load",
+    "slip",
+    "friction_angle",
+    "gravity",
+)
+_SCENE_GROUPS = {"blade": ("thickness", "width", "length")}
 
 
 @dataclass(frozen=True)
@@ -110,7 +128,7 @@ def package_version() -> str:
 
 def read_attributes(file: h5py.File) -> dict[str, Any]:
     """The root attributes, those that only some files have too; text as str."""
-    return {name: _text(value) for name, value in file.attrs.items() if name in ATTRIBUTES + OPTIONAL}
+    return {name: own_attribute(file, name) for name in ATTRIBUTES + OPTIONAL if name in file.attrs}
 
 
 def write_text(owner: h5py.Group | h5py.Dataset, name: str, text: str) -> None:
@@ -120,10 +138,6 @@ def write_text(owner: h5py.Group | h5py.Dataset, name: str, text: str) -> None:
     """
     data = text.encode("utf-8") or b" "  # HDF5 has no text of length 0
     owner.attrs.create(name, data, dtype=h5py.string_dtype("utf-8", len(data)))
-
-
-def _text(value: Any) -> Any:
-    return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else value
 
 
 def one_line(error: object) -> str:
@@ -178,8 +192,8 @@ def _reason(error: Exception) -> str:
 
 def _require_ours(file: h5py.File, path: Path) -> None:
     try:
-        made_as = _text(file.attrs.get("format"))
-        version = file.attrs.get("format_version")
+        made_as = own_attribute(file, "format")
+        version = own_attribute(file, "format_version")
     except BROKEN as error:
         raise UserError(f"{path} is damaged ({_reason(error)}); copy it again or repeat the run") from error
     if not isinstance(made_as, str) or made_as != FORMAT:
@@ -227,10 +241,33 @@ def _attribute_problems(file: h5py.File) -> list[str]:
     for name, kind in kinds.items():
         if name in values and not isinstance(values[name], kind):
             problems.append(f"root attribute {name!r} has the wrong type ({type(values[name]).__name__})")
+    for name, allowed in (("frame_rate", "above 0 Hz"), ("wall_time_s", "0 s or more")):
+        value = values.get(name)
+        if isinstance(value, (float, np.floating)) and not (
+            math.isfinite(value) and (value > 0 if name == "frame_rate" else value >= 0)
+        ):
+            problems.append(f"{name} is {value}; it must be {allowed}")
     digest = values.get("content_hash")  # it becomes the name of a file
     if isinstance(digest, str) and not re.fullmatch("[0-9a-f]{32}", digest):
         problems.append(f"root attribute 'content_hash' is {digest[:40]!r}, not 32 hexadecimal digits")
     return problems
+
+
+def scene_problems(scene: Mapping[str, Any]) -> list[str]:
+    """Values of a scene that are not the numbers which others calculate with, in words; what is not there is none."""
+    found = [(key, scene[key]) for key in _SCENE_NUMBERS if scene.get(key) is not None]
+    for group, keys in _SCENE_GROUPS.items():
+        part = scene.get(group)
+        if part is None:
+            continue
+        if not isinstance(part, Mapping):
+            return [f"scene.{group} is {part!r:.40}, not a group of keys"]
+        found += [(f"{group}.{key}", part.get(key)) for key in keys]
+    return [
+        f"scene.{key} is {value!r:.40}, not a finite number"
+        for key, value in found
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf
+    ]
 
 
 def _element_problems(file: h5py.File, element: Element, counts: dict[str, int]) -> list[str]:
@@ -240,7 +277,7 @@ def _element_problems(file: h5py.File, element: Element, counts: dict[str, int])
     for part in ("value", "step", "time"):
         path = f"{element.path}/{part}"
         try:
-            found = own_dataset(file, path)
+            found = own_dataset(file, path, by_frame="n" in element.tail and part == "value")
         except KeyError:
             problems.append(f"dataset /{path} is missing")
             continue

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpm_warp import State
 from sgns.errors import UserError
-from sgns.hdf5 import BROKEN, own_dataset, own_object
+from sgns.hdf5 import BROKEN, own_attribute, own_dataset, own_object
 from sgns.runs.runlayout import one_line, open_run
 
 __all__ = ["read_state", "stopped_path", "write_state"]
@@ -46,7 +46,8 @@ def read_state(path: str | os.PathLike[str]) -> State:
                     "solver stops"
                 )
             return State(
-                int(group.attrs["frame"]), {name: _numbers(group, name, path) for name in sorted(group)}
+                int(own_attribute(group, "frame")),
+                {name: _numbers(group, name, path) for name in sorted(group)},
             )
         except BROKEN as error:
             raise UserError(f"{path}: its state is damaged ({one_line(error)}); repeat the run") from error

@@ -95,7 +95,7 @@ def view_problems(file: h5py.File, frames: int, particles: int) -> list[str]:
         except KeyError:
             problems.append(f"dataset /VTKHDF/{name} is missing")
             continue
-        if not np.array_equal(found[...], values):
+        if found.shape != values.shape or not np.array_equal(found[...], values):
             problems.append(f"dataset /VTKHDF/{name} does not fit {frames} frames of {particles} particles")
     for name in ("Points", "PointData/velocity"):
         found = own_object(group, name)

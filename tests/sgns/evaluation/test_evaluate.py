@@ -1,8 +1,11 @@
 import csv
 import json
+import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -16,6 +19,7 @@ from sgns.evaluation.report import write_report
 from sgns.poses import in_body_frame, in_world_frame
 from sgns.rollout import write_rollout
 from sgns.runs import Run, check_run
+from sgns.runs.runlayout import write_text
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +147,33 @@ def test_damaged_summary_of_the_training_is_refused_before_anything_is_rolled_ou
     (tmp_path / "training.json").write_text("{")
     with pytest.raises(UserError, match="not the summary of a training"):
         evaluate(simulator(dataset, basis), dataset, tmp_path / "out", checkpoint=tmp_path / "best.ckpt")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_log_is_refused_before_anything_is_rolled_out(dataset, basis, tmp_path):
+    (tmp_path / "tensorboard").mkdir()
+    os.mkfifo(tmp_path / "tensorboard" / "events.out.tfevents.1.x")
+    with pytest.raises(UserError, match="no log of TensorBoard"):
+        evaluate(simulator(dataset, basis), dataset, tmp_path / "out", checkpoint=tmp_path / "best.ckpt")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        ({"speed": "fast"}, "scene.speed is 'fast'"),
+        ({"blade": {"width": None}}, "scene.blade.thickness is None"),
+    ],
+)
+def test_scenes_without_numbers_are_refused_before_anything_is_rolled_out(
+    dataset, basis, tmp_path, scene, words
+):
+    odd = make_run(tmp_path / "odd.h5", frames=20, n=120)
+    with h5py.File(odd, "r+") as file:
+        write_text(file, "scene", json.dumps(scene))
+    splits = dataset.splits | {"test": [odd]}
+    with pytest.raises(UserError, match=re.escape(words)):
+        evaluate(simulator(dataset, basis), replace(dataset, splits=splits), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

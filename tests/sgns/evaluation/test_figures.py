@@ -111,6 +111,12 @@ def test_complete_energy_and_no_residual_can_be_drawn():
     pixels(figures.reconstruction_figure(np.array([1e-5, 1e-6, 0.0]), None, 2))
 
 
+@pytest.mark.parametrize("name", [r"$\frac$", "50 % $x^$_2", "a\nb", "_"])
+def test_names_are_no_formulas(run, name):
+    start = run.positions(slice(0, 1))[0].astype(np.float64)
+    pixels(side_views({name: run}, [4], start))
+
+
 def test_settings_of_matplotlib_stay_as_they_were():
     before = dict(matplotlib.rcParams)
     pixels(figures.energy_figure(np.array([0.5]), np.array([0.5]), 1))

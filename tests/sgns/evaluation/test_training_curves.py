@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
 from pictures import pixels
+from tensorboard.summary.writer.record_writer import masked_crc32c
 from torch.utils.tensorboard import SummaryWriter
 
+from sgns.errors import UserError
 from sgns.evaluation.training_curves import HIGHEST, LOWEST, read_log, training_figure
 
 
@@ -34,3 +36,21 @@ def test_rollouts_that_ran_away_do_not_flatten_the_rest():
     log = {"skill/validation": np.array([[1.0, -1e9], [2.0, np.nan], [3.0, 0.9]])}
     low, high = training_figure(log).axes[1].get_ylim()
     assert LOWEST - 0.1 < low < LOWEST and 1.0 < high < HIGHEST
+
+
+def test_a_file_that_is_no_log_is_one_line(tmp_path):
+    record = b"\xff\xff\xff\x0f"  # no event
+    length = len(record).to_bytes(8, "little")
+    content = length + _masked(length) + record + _masked(record)
+    (tmp_path / "events.out.tfevents.1.x").write_bytes(content)
+    with pytest.raises(UserError, match="holds no log of TensorBoard") as caught:
+        read_log(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def _masked(data):
+    return masked_crc32c(data).to_bytes(4, "little")
+
+
+def test_names_of_losses_are_no_formulas():
+    pixels(training_figure({r"loss/$\frac$ %_": np.array([[1.0, 0.5], [2.0, 0.4]])}))

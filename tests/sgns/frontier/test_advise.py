@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns.errors import UserError
-from sgns.frontier.advise import advice, main, table, wished
+from sgns.frontier.advise import advice, main, shipped, table, wished
 from sgns.frontier.point import Point, read_points, write_points
 
 POINTS = [
@@ -134,3 +134,8 @@ def test_the_table_that_ships_answers() -> None:
     points = read_points(table(None))
     lines = advice(points, wished(asked("error.force=0.6", "time=0.01"), points))
     assert lines[0].startswith("use: ")
+
+
+@pytest.mark.parametrize("study", ["../train", "x" * 300, "a/b", "$"])
+def test_tables_of_studies_that_do_not_ship(study: str) -> None:
+    assert shipped(study, "cut") == {}

@@ -88,3 +88,16 @@ def test_the_figure_of_reductions_is_a_picture() -> None:
         for r in (1, 2, 4)
     ]
     assert reduction_figure(points, "t").startswith(b"\x89PNG")
+
+
+def test_labels_are_no_formulas() -> None:
+    evil = r"$\frac$ 50 % a_b"
+    quarters = {f"{c}_q{q}": 0.1 * q for c in ("force_nrmse", "position_rmse_mm") for q in (1, 2, 3, 4)}
+    known = {"own_force_nrmse": 0.5, "own_position_rmse_mm": 3.0, **quarters}
+    points = [
+        point(evil, time, 0.4, "surrogate", training_s=300.0 * time, modes=10.0 * time, **known)
+        for time in (0.1, 0.2)
+    ]
+    assert scene_figure(points, "force_nrmse", {}, evil).startswith(b"\x89PNG")
+    for figure in (through_time_figure, training_figure, reduction_figure):
+        assert figure(points, evil).startswith(b"\x89PNG")

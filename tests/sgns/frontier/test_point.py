@@ -29,6 +29,12 @@ def test_points_come_back_from_a_table_to_five_digits(tmp_path: Path) -> None:
         ("study,scene\nfull,cut\n", "lacks columns"),
         ("study,scene,kind,axis,label\nfull,cut,magic,dx,a\n", "allowed: solver"),
         ("study,scene,kind,axis,label,ratio\nfull,cut,solver,dx,a,fast\n", "ratio is 'fast'"),
+        ("study,scene,kind,axis,label,ratio\nfull,cut,solver,dx,a,inf\n", "ratio is 'inf'"),
+        ("study,scene,kind,axis,label\nfull,cut,solver,dx\n", "line 2 has 4 values"),
+        (
+            "study,scene,kind,axis,label,wall_s_per_simulated_s\nfull,cut,solver,dx,a,0\n",
+            "wall_s_per_simulated_s is '0', which is not a float above 0",
+        ),
     ],
 )
 def test_a_file_that_is_no_table_is_refused_in_one_line(tmp_path: Path, content: str, line: str) -> None:

@@ -97,9 +97,12 @@ def test_an_empty_folder_cannot_be_gathered(tmp_path: Path) -> None:
         main(settings(tmp_path, "none"))
 
 
-def test_a_damaged_point_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", '{"point": 3, "cases": []}', '{"point": {}, "cases": ["../x"]}', "[" * 10**5]
+)
+def test_a_damaged_point_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "points").mkdir()
-    (tmp_path / "points" / "a.json").write_text("{")
+    (tmp_path / "points" / "a.json").write_text(text)
     with pytest.raises(UserError, match=r"a\.json is no operating point"):
         main(settings(tmp_path, "none"))
 

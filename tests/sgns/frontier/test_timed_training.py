@@ -7,7 +7,7 @@ from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, reduced
 
 from sgns.errors import UserError
 from sgns.frontier import timed_training
-from sgns.frontier.timed_training import seconds_per_step, train_for
+from sgns.frontier.timed_training import read_record, seconds_per_step, train_for
 from sgns.learning.model_settings import ModelSettings
 from sgns.learning.surrogate import read_checkpoint
 
@@ -29,6 +29,15 @@ def test_as_many_steps_as_fit_and_the_rate_falls_over_them(data, tmp_path):
     assert training["max_steps"] == 20
     assert training["warmup_steps"] == 2
     assert json.loads((done.checkpoint.parent / "training.json").read_text())["steps"] == 20
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"processor_s": 1, "steps": "x", "samples": 3}', "[" * 10**5]
+)
+def test_a_damaged_record_is_one_line(tmp_path, text):
+    (tmp_path / "timed.json").write_text(text)
+    with pytest.raises(UserError, match=r"timed\.json.*; remove it to train again"):
+        read_record(tmp_path / "timed.json")
 
 
 def test_what_is_complete_is_taken_and_what_is_not_is_begun_anew(data, tmp_path):
