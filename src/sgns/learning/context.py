@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +28,7 @@ def context_of(scene: Mapping[str, Any], keys: Sequence[str]) -> np.ndarray:
     """The numbers of a scene by their keys, in the units of the scene, shape (K,).
 
     Raises:
-        UserError: The scene lacks one.
+        UserError: The scene lacks one, or it is not finite.
     """
     values = [_value(scene, key) for key in keys]
     if None in values:
@@ -34,6 +36,9 @@ def context_of(scene: Mapping[str, Any], keys: Sequence[str]) -> np.ndarray:
             f"the scene has no number {keys[values.index(None)]}, which this network needs; "
             f"it was trained with different values of {', '.join(keys)}"
         )
+    for key, value in zip(keys, values, strict=True):
+        if not math.isfinite(value):
+            raise UserError(f"the scene's {key} is {value}; it must be finite")
     return np.array(values, dtype=np.float64)
 
 
@@ -41,4 +46,4 @@ def _value(scene: Mapping[str, Any], key: str) -> float | None:
     found: Any = scene
     for part in key.split("."):
         found = found.get(part) if isinstance(found, Mapping) else None
-    return float(found) if isinstance(found, (int, float)) and not isinstance(found, bool) else None
+    return float(found) if isinstance(found, Real) and not isinstance(found, bool) else None
