@@ -619,7 +619,9 @@ def test_an_interrupted_step_is_as_if_not_tried(trained, monkeypatch) -> None:
     with pytest.raises(KeyboardInterrupt):
         simulator.step(turned)
     monkeypatch.undo()
-    assert_same(simulator.step(path[2]), plain.step(path[2]))
+    found = simulator.step(path[2])
+    assert_same(found, plain.step(path[2]))
+    np.testing.assert_array_equal(found.latent, simulator.rollout(path).latent[2])
 
 
 def test_what_rollouts_are_given_is_looked_at(trained) -> None:
