@@ -9,9 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from sgns.errors import UserError
+from sgns.given import real_array
 
 __all__ = [
+    "check_pose",
     "check_poses",
+    "first_pose",
     "fitted_poses",
     "in_body_frame",
     "in_world_frame",
@@ -72,13 +75,39 @@ def quaternions(matrices: np.ndarray) -> np.ndarray:
 
 
 def fitted_poses(points: np.ndarray, world: np.ndarray) -> np.ndarray:
-    """The poses (T, 7) in which body points (M, 3) [m] lie nearest to world points (T, M, 3) [m] (Kabsch 1976)."""
-    middle, there = points.mean(axis=0), world.mean(axis=1)
-    u, _, vt = np.linalg.svd(np.einsum("mi,tmj->tij", points - middle, world - there[:, None]))
+    """The poses (T, 7) in which body points (M, 3) [m] lie nearest to world points (T, M, 3) [m] (Kabsch 1976); a place
+    that is not finite where these are not."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        middle, there = points.mean(axis=0), world.mean(axis=1)
+        product = np.einsum("mi,tmj->tij", points - middle, world - there[:, None])
+    # The decomposition fails where one of many is not finite.
+    sound = np.isfinite(product).all(axis=(1, 2), keepdims=True)
+    u, _, vt = np.linalg.svd(np.where(sound, product, 0.0))
     turn = np.ones((len(world), 3))
     turn[:, 2] = np.sign(np.linalg.det(u @ vt))
     rotation = np.swapaxes((u * turn[:, None]) @ vt, -1, -2)
     return np.concatenate([there - rotation @ middle, quaternions(rotation)], axis=1)
+
+
+def check_pose(pose: np.ndarray, what: str = "tool pose") -> np.ndarray:
+    """One pose as float64 with an exactly unit quaternion.
+
+    Args:
+        pose: Centre of mass [m] and quaternion x, y, z, w, shape (7,).
+        what: How to call it in an error.
+
+    Returns:
+        Shape (7,), a copy.
+
+    Raises:
+        UserError: As `check_poses`; several poses are refused, too.
+    """
+    return require_poses(pose_rows(pose, what, "x, y, z, qx, qy, qz, qw, shape (7,)", 1), what, "")[0]
+
+
+def first_pose(poses: np.ndarray, what: str = "first pose") -> np.ndarray:
+    """As `check_pose`, of a pose (7,) or of the first of some (T, 7), the others not looked at."""
+    return require_poses(pose_rows(poses, what)[:1], what, "")[0]
 
 
 def check_poses(poses: np.ndarray, what: str = "tool path") -> np.ndarray:
@@ -89,31 +118,43 @@ def check_poses(poses: np.ndarray, what: str = "tool path") -> np.ndarray:
         what: How to call them in an error.
 
     Returns:
-        Shape (T, 7).
+        Shape (T, 7), a copy.
 
     Raises:
-        UserError: Wrong shape, a value that is not finite, or a quaternion off unit length by more than 1e-3.
+        UserError: No real numbers, wrong shape, a value that is not finite, or a quaternion off unit length by more
+            than 1e-3.
     """
-    try:
-        poses = np.atleast_2d(np.asarray(poses, dtype=np.float64)).copy()
-    except (TypeError, ValueError) as error:
-        raise UserError(f"the {what} is not numeric; it needs rows x, y, z, qx, qy, qz, qw") from error
-    if poses.ndim != 2 or poses.shape[1] != 7 or len(poses) == 0:
-        raise UserError(
-            f"the {what} has shape {poses.shape}; it needs rows x, y, z, qx, qy, qz, qw, shape (T, 7)"
-        )
+    return require_poses(pose_rows(poses, what), what)
+
+
+def pose_rows(
+    poses: np.ndarray,
+    what: str,
+    needs: str = "rows x, y, z, qx, qy, qz, qw, shape (T, 7)",
+    most: int = 2,
+) -> np.ndarray:
+    """A float64 copy of what has the shape of poses, (T, 7) or (7,), of at most so many axes; shape (T, 7)."""
+    poses = real_array(poses, what, needs)
+    if not 1 <= poses.ndim <= most or poses.shape[-1] != 7 or len(poses) == 0:
+        raise UserError(f"the {what} has shape {poses.shape}; it needs {needs}")
+    return np.atleast_2d(poses)
+
+
+def require_poses(poses: np.ndarray, what: str, where: str = " at frame {}") -> np.ndarray:
+    """Poses (T, 7), whose quaternions are made exactly unit in place, or a UserError that says where they are none."""
     bad = ~np.isfinite(poses).all(axis=1)
     if bad.any():
         frame = int(bad.argmax())
         raise UserError(
-            f"the {what} is not finite at frame {frame}: {poses[frame].tolist()}; every pose must be finite"
+            f"the {what} is not finite{where.format(frame)}: {poses[frame].tolist()}; every pose must be finite"
         )
-    length = np.linalg.norm(poses[:, 3:], axis=1)
+    with np.errstate(over="ignore"):  # the length is refused below
+        length = np.linalg.norm(poses[:, 3:], axis=1)
     bad = np.abs(length - 1) > 1e-3
     if bad.any():
         frame = int(bad.argmax())
         raise UserError(
-            f"the {what} has a quaternion of length {length[frame]:.4g} at frame {frame}; "
+            f"the {what} has a quaternion of length {length[frame]:.4g}{where.format(frame)}; "
             "x, y, z, w must have length 1 (within 0.001)"
         )
     poses[:, 3:] /= length[:, None]

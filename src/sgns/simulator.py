@@ -7,6 +7,7 @@ Letters: B paths, T frames, n particles, M body points, N body nodes, d history 
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -20,13 +21,14 @@ from torch import Tensor
 
 from sgns.clock import elapsed
 from sgns.errors import UserError
+from sgns.given import finite_array, is_whole, real_array
 from sgns.learning.body import BodyTrack, body_track
 from sgns.learning.context import context_of
 from sgns.learning.prediction import Step
 from sgns.learning.surrogate import Surrogate, load_surrogate
-from sgns.learning.training_range import Excess
+from sgns.learning.training_range import Excess, TrainingRange
 from sgns.learning.travel import Travel, markers, stepped_frames
-from sgns.poses import check_poses, fitted_poses, in_world_frame
+from sgns.poses import check_pose, check_poses, first_pose, fitted_poses, in_world_frame
 from sgns.states import Rollout, Rollouts, State
 
 __all__ = ["Simulator"]
@@ -38,12 +40,23 @@ _SETTLING = 0.5
 class Simulator:
     """Steps a bed of soil in a few modes under a tool whose poses are given.
 
+    Copies go on from where this one is, to the bit as it does, and on their own: `copy.copy`, which shares the weights,
+    `copy.deepcopy`, and pickled ones, in other processes too. `reset` and `step` are for one thread at a time: give
+    each thread a copy. `rollout` and `rollouts` change nothing and may run in several threads.
+
     Args:
         surrogate: Network, basis and start.
         device: "cpu" or "cuda".
         num_modes: Of the soil, the first of those it was trained with; None: all.
         rate_independent: Whether the soil follows the travel of a prescribed tool, not the clock, where the tool is
             slower than in all training runs (see `sgns.learning.travel`).
+
+    Attributes:
+        start_positions: Of all particles at rest [m], shape (n, 3).
+        body_points: Those of the training runs, in the body frame [m], shape (M, 3).
+
+    Raises:
+        UserError: The device cannot be used, or the modes are more than there are.
     """
 
     def __init__(
@@ -53,10 +66,17 @@ class Simulator:
         num_modes: int | None = None,
         rate_independent: bool = True,
     ) -> None:
+        if not isinstance(rate_independent, (bool, np.bool_)):
+            raise UserError(f"rate_independent is {rate_independent!r}; it must be True or False")
+        if num_modes is not None:
+            surrogate.dynamics.check_modes(num_modes)
         try:
             self.device = torch.device(device)
+            # On others, such as "meta", tensors hold no values or no float64.
+            if self.device.type not in ("cpu", "cuda"):
+                raise ValueError('allowed: "cpu", "cuda"')
             self._surrogate = surrogate.to(self.device).eval()
-        except (RuntimeError, AssertionError) as error:
+        except (RuntimeError, AssertionError, TypeError, ValueError) as error:
             raise UserError(
                 f"device={device} cannot be used: {str(error).splitlines()[0]}; use device=cpu"
             ) from error
@@ -65,10 +85,18 @@ class Simulator:
             self._dynamics, self.basis = self._dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
         self._follows_travel = rate_independent and not self._dynamics.predicts_body
         self._pace = surrogate.slowest_travel, math.ceil(_SETTLING * surrogate.frame_rate)
-        self.start_positions = surrogate.start_positions.cpu().numpy()
-        self.body_points = surrogate.body_points.cpu().numpy()
+        # Copies: what a tensor shares with an array is freed when the tensor is sent to another process.
+        self.start_positions = surrogate.start_positions.cpu().numpy().copy()
+        self.body_points = surrogate.body_points.cpu().numpy().copy()
         self._start_latent = self.basis.transform(surrogate.start_positions.cpu())
         self.reset()
+
+    def __copy__(self) -> Simulator:
+        twin = object.__new__(type(self))
+        twin.__dict__.update(self.__dict__)
+        # All else is replaced, not written to, from step to step.
+        twin._stepper = copy.copy(self._stepper)
+        return twin
 
     @classmethod
     def load(
@@ -103,7 +131,7 @@ class Simulator:
     @property
     def mean_force(self) -> np.ndarray:
         """Of the training runs [N], shape (3,): the simplest prediction of a force."""
-        return self._dynamics.force.mean.cpu().numpy()
+        return self._dynamics.force.mean.cpu().numpy().copy()
 
     @property
     def context_keys(self) -> tuple[str, ...]:
@@ -122,8 +150,8 @@ class Simulator:
 
     @property
     def scene(self) -> dict[str, Any]:
-        """Scene of one of the training runs, as plain data: its bed is the bed it knows."""
-        return self._surrogate.card["scene"]
+        """Scene of one of the training runs, as plain data, a copy: its bed is the bed it knows."""
+        return copy.deepcopy(self._surrogate.card["scene"])
 
     @property
     def card(self) -> dict[str, Any]:
@@ -156,7 +184,8 @@ class Simulator:
             The state at frame 0.
 
         Raises:
-            UserError: The scene has another bed, or a pose is bad.
+            UserError: The scene has another bed, or what is given is not of the shape and kind above; then the
+                simulator stays where it was.
         """
         points, pose = self.body_points, None
         if scene is not None and hasattr(scene, "body_poses"):
@@ -165,30 +194,26 @@ class Simulator:
                     f"the scene's particles ({scene.arrangement_hash}) are not those of the checkpoint "
                     f"({self.arrangement_hash}); use the bed of simulator.scene"
                 )
-            points, pose = np.asarray(scene.body_points()), scene.body_poses()[0]
-            values = scene.to_dict()
+            points, pose, values = scene.body_points(), first_pose(scene.body_poses()), scene.to_dict()
         elif scene is not None:
-            pose = np.atleast_2d(np.asarray(scene, dtype=np.float64))[0]
-        self._frame, self._points, self._values = 0, points, values
-        self._stepper = self._dynamics.stepper(len(points), self._context_of(values))
-        self._poses: list[np.ndarray] = []
+            pose = first_pose(scene)
+        points, numbers = self._checked_points(points), self._numbers_of(values)
+        poses: list[np.ndarray] = []
         if history is None:
             latent = self._start_latent.expand(self.history, -1, -1)
             if pose is not None:
-                self._poses = [check_poses(pose, "first pose")[0]] * self.history
+                poses = [pose] * self.history
         else:
-            latent = self._checked_history(history[0])
-            self._poses = list(check_poses(history[1], "history of poses"))
-            if len(self._poses) != self.history:
-                raise UserError(
-                    f"the history has {len(self._poses)} poses; this network looks back on {self.history}"
-                )
-        self._latent = latent.clone()[None].to(self.device)
+            latent, poses = self._checked_beginning(history)
+        stepper = self._dynamics.stepper(len(points), self._told(numbers))
+        # All is in order: nothing is changed before.
+        self._frame, self._points, self._numbers, self._stepper = 0, points, numbers, stepper
+        self._poses, self._latent = poses, latent.clone()[None].to(self.device)
         self._load = np.zeros(3), np.zeros(3)
         self._travel: Travel | None = None
         # The last two frames; what the network sees may be further apart.
-        poses = self._poses[-2:] or [np.full(7, np.nan)]
-        self._shown = list(zip(poses, latent[-len(poses) :].numpy().copy(), strict=True))
+        last = poses[-2:] or [np.full(7, np.nan)]
+        self._shown = list(zip(last, latent[-len(last) :].numpy().copy(), strict=True))
         return self._state()
 
     def step(self, tool_pose: np.ndarray) -> State:
@@ -201,37 +226,45 @@ class Simulator:
             The state after the step.
 
         Raises:
-            UserError: The pose is not finite or its quaternion not of unit length, or the answer is not finite.
+            UserError: The pose is no finite array of shape (7,), its quaternion is not of unit length, or the answer is
+                not finite; then the simulator stays where it was.
         """
-        pose = check_poses(tool_pose, f"tool pose of frame {self._frame + 1}")[0]
+        pose = check_pose(tool_pose, f"tool pose of frame {self._frame + 1}")
         poses, shown = self._poses, self._shown[-1]
         if not poses:
             poses, shown = [pose] * self.history, (pose, shown[1])
         before = self._travel or Travel.along(self._markers(poses), *self._pace)
         travel = before.moved(self._markers([pose])[0])
+        latent, load = self._latent, self._load
         if travel.steps or not self._follows_travel:
-            pose = self._step_soil(poses, pose)
+            pose, latent, load = self._step_soil(poses, pose)
             poses = [*poses[1:], pose]
-        self._poses, self._travel = poses, travel
-        self._shown = [shown, (pose, self._latent[0, -1].cpu().numpy())]
+        self._poses, self._travel, self._latent, self._load = poses, travel, latent, load
+        self._shown = [shown, (pose, latent[0, -1].cpu().numpy().copy())]
         self._frame += 1
         return self._state()
 
-    def _step_soil(self, poses: Sequence[np.ndarray], pose: np.ndarray) -> np.ndarray:
-        """Let the network take a step after d poses; returns where the tool is then. What is not finite changes
-        nothing."""
+    def _step_soil(
+        self, poses: Sequence[np.ndarray], pose: np.ndarray
+    ) -> tuple[np.ndarray, Tensor, tuple[np.ndarray, np.ndarray]]:
+        """Let the network take a step after d poses; returns where the tool is then (7,), the last d latent positions
+        (1, d, r, 3), and force and torque. What fails changes nothing."""
         # One frame more than the network sees, because the first motion needs a frame before it.
         window = np.stack([*poses, pose])
         body = self._track(window, in_world_frame(window, self._points)).frames(slice(1, None))
-        with torch.inference_mode():
-            step = self._stepper.advance(self._latent, body)
-            self._require_finite(step)
-            self._latent = torch.cat([self._latent[:, 1:], step.latent[:, None]], dim=1)
-        if self.predicts_body:
-            there = body.position[0, -2] + step.displacement[0]
-            pose = self._predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
-        self._load = step.force[0].cpu().numpy(), step.torque[0].cpu().numpy()
-        return pose
+        memory = self._stepper.memory
+        try:
+            with torch.inference_mode():
+                step = self._stepper.advance(self._latent, body)
+                self._require_finite(step)
+                latent = torch.cat([self._latent[:, 1:], step.latent[:, None]], dim=1)
+            if self.predicts_body:
+                there = body.position[0, -2] + step.displacement[0]
+                pose = self._predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
+        except BaseException:  # an interruption as well
+            self._stepper.memory = memory
+            raise
+        return pose, latent, (step.force[0].cpu().numpy().copy(), step.torque[0].cpu().numpy().copy())
 
     def rollout(
         self,
@@ -249,7 +282,7 @@ class Simulator:
             body_points: In the body frame [m], shape (M, 3); None: those of the training runs.
             latent_history: The first d frames [m], shape (d, r, 3); frames d to T - 1 are predicted. None:
                 the soil is at rest at its common start in frame 0, and frames 1 to T - 1 are predicted.
-            force_history: Force of the first d frames [N], shape (d, 3), copied; zero if None.
+            force_history: Force of the first d frames [N], shape (d, 3), copied; zero if None. Needs a latent history.
             torque_history: Torque of the first d frames [N m], likewise.
             values: The scene as plain data, as for `reset`.
 
@@ -257,13 +290,21 @@ class Simulator:
             The rollout.
 
         Raises:
-            UserError: A pose is bad, or the path is shorter than the history.
+            UserError: What is given is not of the shape and kind above, or the path is shorter than the history.
         """
         poses = check_poses(poses)
-        points = self.body_points if body_points is None else np.asarray(body_points, dtype=np.float64)
+        points = self._checked_points(body_points)
         d = self.history
+        loads = {"force history": force_history, "torque history": torque_history}
+        given_loads = [
+            None if load is None else finite_array(load, what, (d, 3)) for what, load in loads.items()
+        ]
         if latent_history is None:
             padding, given, latent = d - 1, 1, self._start_latent.expand(d, -1, -1)
+            if any(load is not None for load in given_loads):
+                raise UserError(
+                    "a force or torque history needs the latent history of the same frames; give it, too"
+                )
         else:
             padding, given, latent = 0, d, self._checked_history(latent_history)
             if len(poses) < d:
@@ -271,7 +312,8 @@ class Simulator:
                     f"the path has {len(poses)} frames; with a given history it needs at least {d}"
                 )
         world = in_world_frame(poses, points)
-        context = self._context_of(values)
+        numbers = self._numbers_of(values)
+        context = self._told(numbers)
         began = time.perf_counter()
         frames, newest = self._steps_of(poses, world, given)
         track = self._track(pad_start(poses[frames], padding), pad_start(world[frames], padding))
@@ -281,16 +323,15 @@ class Simulator:
                 part[0, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque)
             )
         wall_time = elapsed(began, time.perf_counter())
-        if latent_history is not None:
-            for part, known in ((force, force_history), (torque, torque_history)):
-                if known is not None:
-                    part[:d] = np.asarray(known)[:d]
+        for part, load in zip((force, torque), given_loads, strict=True):
+            if load is not None:
+                part[:d] = load
         states, force, torque = states[newest], force[newest], torque[newest]
         if self.predicts_body:
             nodes = path.body.position[0, padding:].cpu().numpy()
             poses = self._predicted_poses(poses, nodes, points)
             world = nodes if self._dynamics.settings.body_nodes == "points" else in_world_frame(poses, points)
-        excess = partial(self._excess_of, poses, points, states, values)
+        excess = self._excess(poses, points, states, numbers)
         return Rollout(states, force, torque, poses, world, wall_time, excess)
 
     def rollouts(
@@ -312,19 +353,19 @@ class Simulator:
             The rollouts.
 
         Raises:
-            UserError: A pose is bad, or `poses` is no array of paths.
+            UserError: What is given is not of the shape and kind above.
         """
-        poses = np.asarray(poses, dtype=np.float64)
+        poses = real_array(poses, "array of paths", "shape (paths, frames, 7)")
         if poses.ndim != 3 or poses.shape[2] != 7 or 0 in poses.shape:
-            raise UserError(f"the paths have shape {poses.shape}; they need (paths, frames, 7)")
-        if paths_at_once < 1:
-            raise UserError(f"paths_at_once is {paths_at_once}; it must be at least 1")
-        points = self.body_points if body_points is None else np.asarray(body_points, dtype=np.float64)
+            raise UserError(f"the array of paths has shape {poses.shape}; it needs shape (paths, frames, 7)")
+        if not is_whole(paths_at_once) or paths_at_once < 1:
+            raise UserError(f"paths_at_once is {paths_at_once!r}; it must be a whole number, at least 1")
+        points, context = self._checked_points(body_points), self._told(self._numbers_of(values))
         poses = np.stack([check_poses(path, f"path {i}") for i, path in enumerate(poses)])
         began = time.perf_counter()
         with torch.inference_mode():
             parts = [
-                self._from_rest(poses[first : first + paths_at_once], points, self._context_of(values))
+                self._from_rest(poses[first : first + paths_at_once], points, context)
                 for first in range(0, len(poses), paths_at_once)
             ]
         latent, force, torque, poses = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -374,7 +415,12 @@ class Simulator:
 
     def _require_finite(self, step: Step) -> None:
         """Refuses a step that says nothing; the simulator stays where it was."""
-        found = {"the soil's state": step.latent, "the force": step.force, "the torque": step.torque}
+        found = {
+            "the soil's state": step.latent,
+            "the force": step.force,
+            "the torque": step.torque,
+            "the tool's motion": step.displacement,
+        }
         bad = [name for name, part in found.items() if not bool(torch.isfinite(part).all())]
         if bad:
             raise UserError(
@@ -386,44 +432,80 @@ class Simulator:
         """The newest state."""
         # How far it is outside takes the frame before as well, for velocities.
         poses, latent = (np.stack(part) for part in zip(*self._shown, strict=True))
-        excess = partial(self._excess_of, poses, self._points, latent, self._values)
+        excess = self._excess(poses, self._points, latent, self._numbers)
         force, torque = (part.copy() for part in self._load)
-        return State(self._frame, latent[-1].copy(), force, torque, poses[-1], self.basis, excess)
+        return State(self._frame, latent[-1].copy(), force, torque, poses[-1].copy(), self.basis, excess)
 
-    def _excess_of(
-        self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, values: Mapping[str, Any] | None
-    ) -> Excess | None:
-        """How far frames are outside the training range; body points (M, 3) in the body frame."""
-        known, keys = self._surrogate.training_range, self.context_keys
-        if known is None or not np.isfinite(poses).all():
-            return None
-        numbers = context_of(self.scene if values is None else values, keys).tolist()
-        return known.excess(
-            poses, in_world_frame(poses, points), latent, dict(zip(keys, numbers, strict=True))
-        )
+    def _excess(
+        self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, numbers: np.ndarray
+    ) -> partial[Excess | None]:
+        """Says when asked how far frames are outside the training range. It holds nothing of the simulator that goes
+        on changing."""
+        context = dict(zip(self.context_keys, numbers.tolist(), strict=True))
+        return partial(excess_of, self._surrogate.training_range, poses, points, latent, context)
 
-    def _context_of(self, values: Mapping[str, Any] | None) -> Tensor:
-        scene = self.scene if values is None else values
-        return torch.as_tensor(context_of(scene, self._dynamics.context_keys))[None].to(self.device)
+    def _numbers_of(self, values: Mapping[str, Any] | None) -> np.ndarray:
+        """Those of a scene that the network is told, shape (K,)."""
+        if values is not None and not isinstance(values, Mapping):
+            raise UserError(
+                f"values is a {type(values).__name__}; it must be a scene as plain data, such as simulator.scene"
+            )
+        return context_of(self._surrogate.card["scene"] if values is None else values, self.context_keys)
+
+    def _told(self, numbers: np.ndarray) -> Tensor:
+        """Numbers (K,) as the dynamics take them, shape (1, K)."""
+        return torch.as_tensor(numbers)[None].to(self.device)
 
     def _track(self, poses: np.ndarray, points: np.ndarray) -> BodyTrack:
         track = body_track(poses, points, self._dynamics.settings.body_nodes)
         return BodyTrack(*(part[None].to(self.device) for part in track))
 
     def _checked_history(self, latent: np.ndarray | Tensor) -> Tensor:
-        latent = torch.as_tensor(latent).double().cpu()
-        expected = (self.history, self.num_modes, 3)
-        if tuple(latent.shape) != expected:
+        if isinstance(latent, Tensor):
+            latent = latent.detach().cpu()
+        shape = (self.history, self.num_modes, 3)
+        return torch.as_tensor(finite_array(latent, "latent history", shape))
+
+    def _checked_beginning(self, history: tuple[np.ndarray, np.ndarray]) -> tuple[Tensor, list[np.ndarray]]:
+        """Latent positions (d, r, 3) and d poses (7,) to go on from."""
+        if not isinstance(history, Sequence) or len(history) != 2:
+            raise UserError("the history must be a pair: latent positions (d, r, 3) and tool poses (d, 7)")
+        latent, poses = self._checked_history(history[0]), check_poses(history[1], "history of poses")
+        if len(poses) != self.history:
+            raise UserError(f"the history has {len(poses)} poses; this network looks back on {self.history}")
+        return latent, list(poses)
+
+    def _checked_points(self, points: np.ndarray | None) -> np.ndarray:
+        """Body points (M, 3) [m], a copy; those of the training runs if None."""
+        if points is None:
+            return self.body_points.copy()
+        # Runs without points have a network that needs none.
+        found = finite_array(points, "array of body points", ("M" if len(self.body_points) else 0, 3))
+        fitted = self.predicts_body and self._dynamics.settings.body_nodes == "points"
+        if fitted and np.linalg.matrix_rank(found - found[0]) < 2:
             raise UserError(
-                f"the latent history has shape {tuple(latent.shape)}; this network needs {expected}"
+                f"the {len(found)} body points lie on one line; the pose of a body that the network moves needs three "
+                "that do not"
             )
-        if not bool(torch.isfinite(latent).all()):
-            raise UserError("the latent history holds values that are not finite; every value must be")
-        return latent
+        return found
 
     def _markers(self, poses: Sequence[np.ndarray]) -> np.ndarray:
         path = np.stack(poses)
         return markers(path, in_world_frame(path, self._points))
+
+
+def excess_of(
+    known: TrainingRange | None,
+    poses: np.ndarray,
+    points: np.ndarray,
+    latent: np.ndarray,
+    context: Mapping[str, float],
+) -> Excess | None:
+    """How far frames are outside a training range; body points (M, 3) in the body frame [m], else as
+    `TrainingRange.excess`. None where nobody knows, or the tool is nowhere yet."""
+    if known is None or not np.isfinite(poses).all():
+        return None
+    return known.excess(poses, in_world_frame(poses, points), latent, context)
 
 
 def pad_start(values: np.ndarray, count: int) -> np.ndarray:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 from synthetic import random_poses
 
 from sgns.errors import UserError
 from sgns.poses import (
+    check_pose,
     check_poses,
+    first_pose,
     fitted_poses,
     in_body_frame,
     in_world_frame,
@@ -51,10 +54,55 @@ def test_a_quaternion_must_have_unit_length() -> None:
     np.testing.assert_allclose(np.linalg.norm(check_poses(poses)[:, 3:], axis=1), 1.0, atol=1e-14)
 
 
-@pytest.mark.parametrize("bad", [np.zeros((4, 6)), np.zeros((0, 7)), "path", None])
+OTHERS = [
+    np.ones(7, dtype=bool),
+    ["0", "0", "0", "0", "0", "0", "1"],
+    np.ones(7, dtype=complex),
+    np.ones(7, dtype=object),
+    [[0.0], [0.0, 1.0]],
+    torch.zeros(7, requires_grad=True),
+]
+
+
+@pytest.mark.parametrize(
+    "bad", [np.zeros((4, 6)), np.zeros((0, 7)), np.zeros((2, 3, 7)), "path", None, *OTHERS]
+)
 def test_poses_of_a_wrong_kind(bad: object) -> None:
     with pytest.raises(UserError, match="needs rows"):
         check_poses(bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("bad", [random_poses()[:3], random_poses()[:1], np.zeros(6), 1.0, *OTHERS])
+def test_one_pose_is_no_path_and_of_numbers(bad: object) -> None:
+    with pytest.raises(UserError, match=r"tool pose .*needs x, y, z, qx, qy, qz, qw, shape \(7,\)"):
+        check_pose(bad)  # type: ignore[arg-type]
+
+
+def test_of_a_path_the_first_pose_alone_is_looked_at() -> None:
+    poses = random_poses()
+    known = poses[0].copy()
+    poses[1] = np.nan
+    found = [
+        first_pose(poses),
+        first_pose(poses[0]),
+        first_pose(poses[0].tolist()),
+        check_pose(torch.tensor(poses[0])),
+    ]
+    poses[0] = 5.0  # what was given does not matter any more
+    for pose in found:
+        np.testing.assert_allclose(pose, known, atol=1e-15)
+    with pytest.raises(UserError, match="first pose has a quaternion of length 10;"):
+        first_pose(poses)
+
+
+def test_poses_of_points_that_are_nowhere_are_nowhere() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(4, 3))
+    world = np.stack([points, points + np.nan, points])
+    world[2] *= np.inf
+    found = fitted_poses(points, world)
+    np.testing.assert_allclose(found[0], [0, 0, 0, 0, 0, 0, 1], atol=1e-14)
+    assert not np.isfinite(found[1:, :3]).any()
 
 
 def test_a_quarter_turn_about_y_takes_z_to_x() -> None:

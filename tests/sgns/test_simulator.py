@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+import multiprocessing
+import pickle
+import sys
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -417,3 +423,258 @@ def test_a_first_pose_that_is_refused_is_forgotten(trained) -> None:
     expected = simulator.step(pose)
     assert state.frame == 1 and state.outside == expected.outside
     np.testing.assert_array_equal(state.latent, expected.latent)
+
+
+def assert_same(found, expected) -> None:
+    """Two states or rollouts, to the bit."""
+    for name in ("latent", "force", "torque"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def reloaded(something):
+    return pickle.loads(pickle.dumps(something))
+
+
+@pytest.mark.parametrize("num_modes", [None, 2])
+@pytest.mark.parametrize("kind", ["pose", "points", "polynomial"])
+def test_copies_go_on_to_the_bit_and_on_their_own(trained, kind, num_modes) -> None:
+    data, folder = trained
+    path = data.runs("test")[0].pose
+    away = data.runs("train")[0].pose[::-1]
+    simulator = Simulator.load(folder / kind / "best.ckpt", num_modes=num_modes)
+    for first in (None, path):  # as it was loaded; put on its place
+        for taken in (0, 5):
+            simulator.reset(first)
+            expected = [simulator.step(pose) for pose in path[1:9]]
+            simulator.reset(first)
+            for pose in path[1 : 1 + taken]:
+                simulator.step(pose)
+            ways = copy.copy, copy.deepcopy, reloaded
+            others = [simulator, *(way(simulator) for way in ways)]
+            strays = [way(simulator) for way in ways]
+            for t in range(taken, 8):
+                for stray in strays:
+                    stray.step(away[t])
+                for each in others:
+                    state = each.step(path[1 + t])
+                    assert_same(state, expected[t])
+                    assert (state.frame, state.outside) == (expected[t].frame, expected[t].outside)
+
+
+def test_a_copy_is_pickled_without_what_is_computed_again(trained) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / "points" / "best.ckpt")
+    size = len(pickle.dumps(simulator._surrogate))
+    state = simulator.reset(data.runs("test")[0].pose)
+    assert len(pickle.dumps(simulator)) < size + 30_000 and len(pickle.dumps(state)) < 20_000
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
+@pytest.mark.parametrize(
+    "method", [m for m in ("fork", "spawn") if m in multiprocessing.get_all_start_methods()]
+)
+def test_other_processes_answer_the_same(trained, method) -> None:
+    data, folder = trained
+    path = data.runs("test")[0].pose
+    context = multiprocessing.get_context(method)
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        for kind in ("points", "polynomial"):
+            simulator = Simulator.load(folder / kind / "best.ckpt")
+            known = simulator.body_points.copy(), simulator.start_positions.copy(), simulator.mean_force
+            mean_force = known[2].copy()
+            simulator.reset(path)
+            for pose in path[1:7]:
+                # A step from here there, then here: what was sent away has not moved what stayed.
+                there = pool.submit(copy.copy(simulator).step, pose).result(timeout=100)
+                here = simulator.step(pose)
+                assert_same(there, here)
+                assert there.outside == here.outside
+                np.testing.assert_array_equal(there.soil(), here.soil())
+            assert_same(pool.submit(simulator.rollout, path).result(timeout=100), simulator.rollout(path))
+            np.testing.assert_array_equal(here.latent, simulator.rollout(path).latent[6])
+            np.testing.assert_array_equal(simulator.body_points, known[0])
+            np.testing.assert_array_equal(simulator.start_positions, known[1])
+            np.testing.assert_array_equal(known[2], mean_force)
+
+
+def test_threads_with_a_simulator_each_do_not_meet(trained) -> None:
+    data, folder = trained
+    path = data.runs("test")[0].pose
+    surrogate = load_surrogate(folder / "points" / "best.ckpt")
+    whole, fewer = Simulator(surrogate), Simulator(surrogate, num_modes=2)
+    both = np.stack([path, path[::-1]])
+
+    def stepped(simulator: Simulator) -> list[np.ndarray]:
+        simulator.reset(path)
+        latent = [simulator.step(pose).latent for pose in path[1:]]
+        return [np.stack(latent), simulator.rollout(path).latent, simulator.rollouts(both).latent]
+
+    simulators = [whole, fewer, copy.copy(whole), copy.copy(fewer)]
+    expected = [stepped(each) for each in simulators]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            for _ in range(3):
+                for found, known in zip(pool.map(stepped, simulators), expected, strict=True):
+                    for part, known_part in zip(found, known, strict=True):
+                        np.testing.assert_array_equal(part, known_part)
+    finally:
+        sys.setswitchinterval(interval)
+
+
+@pytest.mark.parametrize("kind", ["points", "polynomial"])
+def test_what_was_given_and_what_was_answered_may_be_written_to(trained, kind) -> None:
+    data, folder = trained
+    path = data.runs("test")[0].pose
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    expected = simulator.rollout(path)
+    given, points, values = path.copy(), simulator.body_points.copy(), simulator.scene
+    rollout = simulator.rollout(given, points, values=values)
+    state = simulator.reset(given, values=values)
+    kept = reloaded(state)
+    states = [state]
+    for t in range(1, 14):
+        row = given[t].copy()
+        states.append(simulator.step(row))
+        row[:] = np.nan
+        for part in (states[-1].latent, states[-1].force, states[-1].torque, states[-1].pose):
+            part += 1.0
+            part -= 1.0
+        assert states[-1].outside == pytest.approx(expected.excess.amount[t], rel=1e-9)
+    given[:], points[:] = np.nan, np.nan
+    values.clear()
+    simulator.scene.clear()
+    np.testing.assert_allclose(np.stack([s.latent for s in states]), expected.latent, rtol=0, atol=1e-12)
+    assert_same(state, kept)
+    np.testing.assert_array_equal(state.pose, path[0])
+    assert state.outside == kept.outside
+    assert_same(rollout, expected)
+    np.testing.assert_array_equal(reloaded(rollout).excess.amount, expected.excess.amount)
+    np.testing.assert_array_equal(rollout.excess.amount, expected.excess.amount)
+    assert_same(simulator.rollout(path), expected)
+
+
+class Other:
+    """A scene of the bed that the simulator knows, with points and poses of its own."""
+
+    def __init__(self, simulator: Simulator, points: object, poses: object) -> None:
+        self.arrangement_hash = simulator.arrangement_hash
+        self.to_dict = lambda: simulator.scene
+        self.body_points = lambda: points
+        self.body_poses = lambda: poses
+
+
+@pytest.mark.parametrize("kind", ["points", "polynomial"])
+def test_a_refusal_changes_nothing(trained, kind) -> None:
+    data, folder = trained
+    path, z = data.runs("test")[0].pose, data.runs("test")[0].latent[:3, :4]
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    points = simulator.body_points
+    simulator.reset(path)
+    for pose in path[1:5]:
+        simulator.step(pose)
+    refused = {
+        "first pose": lambda: simulator.reset(np.full(7, np.nan)),
+        "first pose is not numeric": lambda: simulator.reset({"kind": "excavation"}),
+        "particles": lambda: simulator.reset(OtherBed()),
+        "body points holds": lambda: simulator.reset(Other(simulator, points * np.nan, path)),
+        r"body points has shape \(0, 3\)": lambda: simulator.reset(Other(simulator, points[:0], path)),
+        "first pose has shape": lambda: simulator.reset(Other(simulator, points, path[:, :6])),
+        "must be a pair": lambda: simulator.reset(history=(z,)),
+        "pair": lambda: simulator.reset(history=5),
+        "history holds": lambda: simulator.reset(history=(z * np.nan, path[:3])),
+        "history is not numeric": lambda: simulator.reset(history=(z.astype(str), path[:3])),
+        "has 2 poses": lambda: simulator.reset(history=(z, path[:2])),
+        "history of poses": lambda: simulator.reset(history=(z, path[:3] * np.nan)),
+        "values is a str": lambda: simulator.reset(path, values="scene"),
+        r"has shape \(3, 7\); it needs .* shape \(7,\)": lambda: simulator.step(path[5:8]),
+        r"has shape \(1, 7\)": lambda: simulator.step(path[5:6]),
+        "bool": lambda: simulator.step(np.ones(7, dtype=bool)),
+        "complex": lambda: simulator.step(path[5] + 0j),
+    }
+    for match, attempt in refused.items():
+        plain = copy.copy(simulator)
+        with pytest.raises(UserError, match=match):
+            attempt()
+        found, expected = simulator.step(path[5]), plain.step(path[5])
+        assert (found.frame, found.outside) == (expected.frame, expected.outside)
+        assert_same(found, expected)
+
+
+def test_an_interrupted_step_is_as_if_not_tried(trained, monkeypatch) -> None:
+    data, folder = trained
+    simulator = Simulator.load(folder / "points" / "best.ckpt")
+    path = along_x(simulator, data.runs("test")[0].pose[0], [1.5, 1.7, 1.9, 2.1])
+    simulator.reset(path)
+    simulator.step(path[1])
+    plain, memory = copy.copy(simulator), simulator._stepper.memory
+    turned = path[2].copy()
+    turned[3:] = [0.0, 1.0, 0.0, 0.0]
+
+    def interrupted(step: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(simulator, "_require_finite", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        simulator.step(turned)
+    monkeypatch.undo()
+    # What is kept of the edges within the body is that of the step before, too: it differs by rounding only.
+    assert all(now is then for now, then in zip(simulator._stepper.memory, memory, strict=True))
+    for pose in path[2:]:
+        assert_same(simulator.step(pose), plain.step(pose))
+
+
+def test_what_rollouts_are_given_is_looked_at(trained) -> None:
+    data, folder = trained
+    path, z = data.runs("test")[0].pose, data.runs("test")[0].latent[:3, :4]
+    simulator = Simulator.load(folder / "pose" / "best.ckpt")
+    points, force = simulator.body_points, np.zeros((3, 3))
+    for match, bad in {
+        "body points holds": np.full((4, 3), np.nan),
+        r"\(0, 3\); it needs shape \(M, 3\)": points[:0],
+        r"\(3,\); it needs": points[0],
+        "not numeric": "points",
+    }.items():
+        with pytest.raises(UserError, match=match):
+            simulator.rollout(path, bad)
+        with pytest.raises(UserError, match=match):
+            simulator.rollouts(path[None], bad)
+    for match, given in {
+        "force history holds": {"latent_history": z, "force_history": force * np.nan},
+        r"force history has shape \(3,\); it needs shape \(3, 3\)": {
+            "latent_history": z,
+            "force_history": force[0],
+        },
+        "torque history is not numeric": {"latent_history": z, "torque_history": force.astype(bool)},
+        "needs the latent history": {"force_history": force},
+        "latent history is not numeric": {"latent_history": z.astype(complex)},
+        "latent history holds": {"latent_history": np.full_like(z, np.inf)},
+        "values is a list": {"values": []},
+    }.items():
+        with pytest.raises(UserError, match=match):
+            simulator.rollout(path, **given)
+    for count in ("a", 1.5, True, None):
+        with pytest.raises(UserError, match="paths_at_once"):
+            simulator.rollouts(path[None], paths_at_once=count)
+    expected = simulator.rollout(path, latent_history=z)
+    fixed = z.copy()
+    fixed.flags.writeable = False
+    for same in (z.tolist(), torch.tensor(z), torch.tensor(z).requires_grad_(), fixed):
+        assert_same(simulator.rollout(path.tolist(), latent_history=same), expected)
+
+
+def test_what_a_simulator_is_made_of_is_looked_at(trained) -> None:
+    _, folder = trained
+    surrogate = load_surrogate(folder / "pose" / "best.ckpt")
+    for device in ("meta", "mps", 5000, "nonsense", None, 1.5):
+        with pytest.raises(UserError, match=r"cannot be used: .*; use device=cpu"):
+            Simulator(surrogate, device)
+    for num_modes in (0, 1.5, True, 5, "2"):
+        with pytest.raises(UserError, match="allowed: 1 to 4"):
+            Simulator(surrogate, num_modes=num_modes)
+    for rate_independent in (None, 1, "yes"):
+        with pytest.raises(UserError, match="rate_independent"):
+            Simulator(surrogate, rate_independent=rate_independent)
+    # None of this has harmed what was given.
+    assert Simulator(surrogate, num_modes=np.int64(3), rate_independent=np.True_).num_modes == 3

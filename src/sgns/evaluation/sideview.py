@@ -19,6 +19,7 @@ from matplotlib.ticker import MaxNLocator
 from sgns.evaluation.bodies import body_corners, is_wheel
 from sgns.evaluation.figures import NETWORK, PICTURE_WIDTH, TRUTH, new_figure, styled
 from sgns.evaluation.surface import particle_spacing
+from sgns.learning.travel import distance, markers
 
 __all__ = [
     "Scales",
@@ -82,7 +83,8 @@ def middle_slice(start: np.ndarray) -> np.ndarray:
 
 def view_times(run: Any, history: int, count: int = 3) -> list[int]:
     """Frames to show: spread over the time in which the body moves, the last a little before it stops."""
-    moving = np.linalg.norm(np.diff(run.pose[:, :3], axis=0), axis=1)
+    path = markers(run.pose, run.body_points)  # which show a turn as well
+    moving = distance(path[1:], path[:-1])
     still = moving <= 1e-3 * max(float(moving.max(initial=0.0)), 1e-12)
     last = run.frame_count - 1 if still.all() else int(np.flatnonzero(~still)[-1]) + 1
     first = min(history, last)

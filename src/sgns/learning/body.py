@@ -109,10 +109,13 @@ def nearest_rigid(reference: Tensor, points: Tensor) -> Tensor:
         points: Where they are said to be [m], shape (..., M, 3).
 
     Returns:
-        Shape (..., M, 3).
+        Shape (..., M, 3); not finite where the points are not.
     """
     here, there = reference.mean(-2, keepdim=True), points.mean(-2, keepdim=True)
-    u, _, vh = torch.linalg.svd((reference - here).transpose(-1, -2) @ (points - there))
+    product = (reference - here).transpose(-1, -2) @ (points - there)
+    # The decomposition fails where one of many is not finite; there `there` is not finite either, and what comes out.
+    sound = product.isfinite().flatten(-2).all(-1)[..., None, None]
+    u, _, vh = torch.linalg.svd(torch.where(sound, product, 0.0))
     # A reflection is no motion: turn the direction of least extent round.
     flip = torch.ones_like(u[..., 0])
     flip[..., 2] = torch.sign(torch.linalg.det(u @ vh))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,14 +21,17 @@ def varying_context(runs: Sequence[ReducedRun], candidates: Sequence[str]) -> li
     """Those of the candidates, keys of the scene such as `load` or `material.friction_angle`, whose numbers differ
     between runs: a constant tells nothing."""
     values = {key: [_value(run.scene, key) for run in runs] for key in candidates}
-    return [key for key, found in values.items() if None not in found and len(set(found)) > 1]
+    numbers = {
+        key: found for key, found in values.items() if all(v is not None and math.isfinite(v) for v in found)
+    }
+    return [key for key, found in numbers.items() if len(set(found)) > 1]
 
 
 def context_of(scene: Mapping[str, Any], keys: Sequence[str]) -> np.ndarray:
     """The numbers of a scene by their keys, in the units of the scene, shape (K,).
 
     Raises:
-        UserError: The scene lacks one.
+        UserError: The scene lacks one, or it is not finite.
     """
     values = [_value(scene, key) for key in keys]
     if None in values:
@@ -35,6 +39,9 @@ def context_of(scene: Mapping[str, Any], keys: Sequence[str]) -> np.ndarray:
             f"the scene has no number {keys[values.index(None)]}, which this network needs; "
             f"it was trained with different values of {', '.join(keys)}"
         )
+    for key, value in zip(keys, values, strict=True):
+        if not math.isfinite(value):
+            raise UserError(f"the scene's {key} is {value}; it must be finite")
     return np.array(values, dtype=np.float64)
 
 
@@ -42,6 +49,4 @@ def _value(scene: Mapping[str, Any], key: str) -> float | None:
     found: Any = scene
     for part in key.split("."):
         found = found.get(part) if isinstance(found, Mapping) else None
-    if isinstance(found, bool) or not isinstance(found, (int, float)) or not abs(found) < math.inf:
-        return None
-    return float(found)
+    return float(found) if isinstance(found, Real) and not isinstance(found, bool) else None

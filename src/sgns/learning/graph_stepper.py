@@ -6,6 +6,7 @@ Shapes: V nodes, E edges, H hidden width.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -66,6 +67,9 @@ class GraphStepper:
     The same function as the network's, with every pair of linear layers that meet multiplied into one. What is
     encoded of the edges within the body can be kept while they stay as they are.
 
+    Its memory is shared between views, which a copy of the object would tear apart: copies, pickled ones too, are
+    built anew from the network as it is then.
+
     Args:
         network: One that `covers` approves of; its weights are copied.
         edge_index: Senders and receivers, shape (2, E).
@@ -76,10 +80,19 @@ class GraphStepper:
     def __init__(
         self, network: EncodeProcessDecode, edge_index: Tensor, node_count: int, body_nodes: int = 0
     ) -> None:
+        self.arguments = network, edge_index, node_count, body_nodes
         with torch.no_grad():
             self.pairs = pairs_of(edge_index, node_count)
             self.prepare_nodes(network, node_count)
             self.prepare_edges(network, edge_index, node_count - body_nodes)
+
+    def __getstate__(self) -> tuple[tuple[Any, ...], Tensor | None]:
+        return self.arguments, self.kept
+
+    def __setstate__(self, state: tuple[tuple[Any, ...], Tensor | None]) -> None:
+        arguments, kept = state
+        GraphStepper.__init__(self, *arguments)
+        self.kept = kept
 
     @staticmethod
     def covers(network: EncodeProcessDecode) -> bool:

@@ -268,8 +268,7 @@ class EncodeProcessDecode(nn.Module):
         )
         self.decode = MLP(hidden, hidden, hidden_layers, outputs, activation=activation)
         # The edges of the last call: a training or a rollout keeps them.
-        self._edge_index: Tensor | None = None
-        self._pairs: Pairs | None = None
+        self._known_pairs: tuple[Tensor, Pairs] | None = None
 
     def plain(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> Tensor:
         """Node quantities from a batch of graphs, as defined."""
@@ -301,8 +300,9 @@ class EncodeProcessDecode(nn.Module):
 
     def pairs(self, edge_index: Tensor, node_count: int) -> Pairs:
         """The edges as sums; looked at once per `edge_index` object."""
-        if self._pairs is None or self._edge_index is not edge_index:
+        known = self._known_pairs  # looked up once: another thread may have other edges
+        if known is None or known[0] is not edge_index:
             # What is made in inference mode could not be trained with later.
             with torch.inference_mode(False):
-                self._edge_index, self._pairs = edge_index, pairs_of(edge_index, node_count)
-        return self._pairs
+                known = self._known_pairs = edge_index, pairs_of(edge_index, node_count)
+        return known[1]

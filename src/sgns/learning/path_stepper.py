@@ -6,7 +6,7 @@ Shapes: d history positions, r modes, N body nodes, V = r + N nodes, E edges, T 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -36,8 +36,23 @@ class Known(NamedTuple):
     places: Tensor
 
 
+class Memory(NamedTuple):
+    """What is kept from one step to the next; never overwritten, only replaced.
+
+    Attributes:
+        shape: Places of the body's nodes from its first when the edges within it were last computed [1], shape (N, 3).
+        kept: What was computed of these edges (see `GraphStepper`), shape (N, any, H).
+    """
+
+    shape: Tensor | None
+    kept: Tensor | None
+
+
 class PathStepper:
     """`LatentDynamics.advance` and `unroll` for one path and without gradients; to rounding (1e-6) the same.
+
+    Copies, pickled ones too, are built anew from the dynamics as they are then (see `GraphStepper`) and go on to the
+    bit as this one does.
 
     Args:
         dynamics: Its weights and statistics are copied.
@@ -46,6 +61,7 @@ class PathStepper:
     """
 
     def __init__(self, dynamics: LatentDynamics, body_nodes: int, context: Tensor | None = None) -> None:
+        self.arguments = dynamics, body_nodes, context
         self.dynamics = dynamics
         network, r = dynamics.network, dynamics.num_modes
         count = r + body_nodes
@@ -57,6 +73,25 @@ class PathStepper:
             self.prepare_features(dynamics.told(r, body_nodes, 1, context)[0])
             self.prepare_outputs()
         self.reset()
+
+    def __getstate__(self) -> tuple[tuple[Any, ...], Memory]:
+        return self.arguments, self.memory
+
+    def __setstate__(self, state: tuple[tuple[Any, ...], Memory]) -> None:
+        arguments, memory = state
+        PathStepper.__init__(self, *arguments)
+        self.memory = memory
+
+    @property
+    def memory(self) -> Memory:
+        """All that a step depends on of those before it, besides what it is given."""
+        return Memory(self.shape, None if self.graph is None else self.graph.kept)
+
+    @memory.setter
+    def memory(self, memory: Memory) -> None:
+        self.shape = memory.shape
+        if self.graph is not None:
+            self.graph.kept = memory.kept
 
     def reset(self) -> None:
         """Forget the shape of the body seen last: what follows does not depend on what was stepped before."""

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from sgns.errors import UserError
+from sgns.given import is_whole
 from sgns.learning.body import BodyTrack
 from sgns.learning.model_settings import ModelSettings
 from sgns.learning.normalisation import Standardiser
@@ -28,7 +29,13 @@ _REACH = 10.0
 
 
 class Stepper(Protocol):
-    """Takes the steps of one path, whose context it knows."""
+    """Takes the steps of one path, whose context it knows.
+
+    Attributes:
+        memory: All that a step depends on of those before it, besides what it is given; put back, it undoes them.
+    """
+
+    memory: Any
 
     def advance(self, latent: Tensor, body: BodyTrack) -> Step:
         """One step; latent (1, d, r, 3) and body (1, d, N, ...) as for `Dynamics.advance`."""
@@ -141,9 +148,9 @@ class Dynamics(nn.Module):
 
     def check_modes(self, num_modes: int) -> None:
         """For `with_modes`."""
-        if not 1 <= num_modes <= self.num_modes:
+        if not is_whole(num_modes) or not 1 <= num_modes <= self.num_modes:
             raise UserError(
-                f"the {self.settings.kind} was trained with {self.num_modes} modes and cannot have {num_modes}; "
+                f"the {self.settings.kind} was trained with {self.num_modes} modes and cannot have {num_modes!r}; "
                 f"allowed: 1 to {self.num_modes}"
             )
 
@@ -165,6 +172,7 @@ class OwnStepper:
     """
 
     def __init__(self, dynamics: Dynamics, context: Tensor | None) -> None:
+        self.memory = None
         self.dynamics = dynamics
         self.context = context
 

@@ -17,7 +17,7 @@ import numpy as np
 if TYPE_CHECKING:
     from sgns.reduction.reduced import ReducedRun
 
-__all__ = ["Travel", "markers", "slowest_travel", "stepped_frames"]
+__all__ = ["Travel", "distance", "markers", "slowest_travel", "stepped_frames"]
 
 # A tool that moves less than this in a frame [m] rests: round-off of poses, not motion.
 _STILL = 1e-9

@@ -64,6 +64,15 @@ def test_view_times_lie_after_the_history_and_within_the_run(run):
     assert 3 < frames[0] and frames[-1] < run.frame_count
 
 
+def test_a_tool_that_only_turns_moves():
+    pose, points = np.zeros((20, 7)), np.zeros((20, 1, 3))
+    angle = 0.05 * np.minimum(np.arange(20), 12)
+    pose[:, 5], pose[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
+    points[:, 0, 0], points[:, 0, 1] = np.cos(angle), np.sin(angle)
+    run = SimpleNamespace(pose=pose, body_points=points, frame_count=20)
+    assert view_times(run, 3)[-1] == round(3 + 0.9 * (12 - 3))
+
+
 def test_outline_of_a_wheel_is_a_circle_about_its_axle():
     wheel = SimpleNamespace(scene={"diameter": 0.15}, pose=np.array([[0.1, 0.0, 0.07, 0, 0, 0, 1.0]]))
     outline = body_outline(wheel, 0)

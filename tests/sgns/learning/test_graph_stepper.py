@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import pytest
 import torch
 
@@ -71,6 +74,26 @@ def test_single_precision_at_the_papers_size() -> None:
     for same_body in (False, True):
         found = stepper(nodes, features, same_body).double()
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=2e-6 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize(
+    "take", [copy.copy, copy.deepcopy, lambda stepper: pickle.loads(pickle.dumps(stepper))]
+)
+@pytest.mark.parametrize("edges", EDGES)
+def test_copies_are_the_stepper_and_on_their_own(edges, take) -> None:
+    _, stepper, nodes, features = prepared(EDGES[edges])
+    stepper(nodes, features)
+    one, other = take(stepper), take(stepper)
+    expected = stepper(nodes + 0.3, features, same_body=True).clone()
+    other(nodes - 1.0, features - 1.0)
+    assert torch.equal(one(nodes + 0.3, features, same_body=True), expected)
+    other(nodes - 1.0, features - 1.0)
+    assert torch.equal(stepper(nodes + 0.3, features, same_body=True), expected)
+
+
+def test_pickled_it_is_its_network() -> None:
+    network, stepper, *_ = prepared(EDGES["complete"])
+    assert len(pickle.dumps(stepper)) < len(pickle.dumps(network)) + 5000
 
 
 def test_later_weights_do_not_matter() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from typing import Any
 
 import numpy as np
@@ -122,3 +124,35 @@ def test_with_gradients_the_weights_are_differentiated() -> None:
     body, latent = track_of("pose", False), torch.randn(1, 3, 4, 3).double()
     dynamics.unroll(latent, body).force.sum().backward()
     assert all(p.grad is not None for p in dynamics.network.parameters())
+
+
+@pytest.mark.parametrize(
+    "take", [copy.copy, copy.deepcopy, lambda stepper: pickle.loads(pickle.dumps(stepper))]
+)
+@pytest.mark.parametrize("body_nodes", ["pose", "points"])
+@pytest.mark.parametrize("turning", [False, True])
+def test_copies_go_on_to_the_bit(body_nodes, turning, take) -> None:
+    dynamics = dynamics_of(body_nodes=body_nodes, context=["gravity"])
+    body, latent = track_of(body_nodes, turning), torch.randn(1, 3, 4, 3).double()
+    stepper = dynamics.stepper(len(POINTS), torch.tensor([[9.8]]).double())
+    windows = [body.frames(slice(t, t + 3)) for t in range(8)]
+    for window in windows[:4]:
+        stepper.advance(latent, window)
+    one, other = take(stepper), take(stepper)
+    for window, away in zip(windows[4:], windows, strict=False):
+        other.advance(latent + 1.0, away)
+        expected, found = stepper.advance(latent, window), one.advance(latent, window)
+        assert torch.equal(found.latent, expected.latent) and torch.equal(found.force, expected.force)
+
+
+def test_memory_put_back_undoes_a_step() -> None:
+    dynamics = dynamics_of(body_nodes="points")
+    body, latent = track_of("points", False), torch.randn(1, 3, 4, 3).double()
+    stepper, plain = dynamics.stepper(len(POINTS)), dynamics.stepper(len(POINTS))
+    for each in (stepper, plain):
+        each.advance(latent, body.frames(slice(0, 3)))
+    memory = stepper.memory
+    stepper.advance(latent, track_of("points", True).frames(slice(6, 9)))
+    stepper.memory = memory
+    found, expected = (each.advance(latent, body.frames(slice(1, 4))) for each in (stepper, plain))
+    assert torch.equal(found.latent, expected.latent) and torch.equal(found.force, expected.force)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -50,6 +53,55 @@ def test_rollout_is_stepping_and_needs_no_height(trained, kind) -> None:
         # One step after the other goes through poses: equal but for their rounding.
         np.testing.assert_allclose(state.latent, rollout.latent[t], rtol=0, atol=1e-6)
         np.testing.assert_allclose(state.pose, rollout.poses[t], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_copies_go_on_to_the_bit(trained, kind) -> None:
+    data, folder = trained
+    path = data.runs("test")[0].pose
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    simulator.reset(path)
+    for pose in path[1:5]:
+        simulator.step(pose)
+    others = [copy.copy(simulator), copy.deepcopy(simulator), pickle.loads(pickle.dumps(simulator))]
+    for pose in path[5:9]:
+        expected = simulator.step(pose)
+        for other in others:
+            found = other.step(pose)
+            for name in ("latent", "force", "torque", "pose"):
+                np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("kind", ["pose", "points"])  # the third is not told of the way
+def test_a_way_far_from_everything_is_refused_and_forgotten(trained, kind) -> None:
+    data, folder = trained
+    path = data.runs("test")[0].pose
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    simulator.reset(path)
+    simulator.step(path[1])
+    plain, far = copy.copy(simulator), path[2].copy()
+    far[0] = 1e300
+    with pytest.raises(UserError, match="not finite at frame 2"):
+        simulator.step(far)
+    found, expected = simulator.step(path[2]), plain.step(path[2])
+    np.testing.assert_array_equal(found.latent, expected.latent)
+    np.testing.assert_array_equal(found.pose, expected.pose)
+    # A whole path says so in its numbers, also beside others, which are none the worse.
+    broken = path.copy()
+    broken[5:, 0] = 1e300
+    many = simulator.rollouts(np.stack([broken, path]))
+    assert not np.isfinite(many.latent[0, 6:]).any() and np.isfinite(many.poses[1]).all()
+    assert not np.isfinite(simulator.rollout(broken).latent[6:]).any()
+
+
+def test_points_that_fix_no_pose_are_refused(trained) -> None:
+    data, folder = trained
+    path = data.runs("test")[0].pose
+    simulator = Simulator.load(folder / "points" / "best.ckpt")
+    line = simulator.body_points[:1] + 0.01 * np.arange(5.0)[:, None]
+    for points in (simulator.body_points[:1], simulator.body_points[:2], line):
+        with pytest.raises(UserError, match="lie on one line"):
+            simulator.rollout(path, points)
 
 
 def test_soil_under_a_wheel_follows_the_clock(trained) -> None:

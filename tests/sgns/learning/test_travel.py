@@ -9,6 +9,7 @@ import pytest
 from tiny import reduced
 
 from sgns.learning.travel import Travel, markers, slowest_travel, stepped_frames
+from sgns.poses import in_world_frame
 
 
 def line(*steps: float) -> np.ndarray:
@@ -59,6 +60,18 @@ def test_turning_is_travel_of_the_points() -> None:
     np.testing.assert_array_equal(frames, np.arange(0, 20, 3))
     # A body without points shows its centre of mass only.
     assert len(stepped_frames(markers(poses, points[:, :0]), 1, 0.01, 5)) == 1
+
+
+def test_any_turn_of_a_tool_in_its_place_is_seen() -> None:
+    """Of half a degree, a quarter, half and three quarters of a turn between two frames, about each axis."""
+    points = np.random.default_rng(0).normal(size=(5, 3)) * 0.1
+    for axis in range(3):
+        for angle in np.radians([0.5, 90.0, 180.0, 270.0]):
+            turns = angle * np.arange(4)
+            poses = np.zeros((4, 7))
+            poses[:, 3 + axis], poses[:, 6] = np.sin(turns / 2), np.cos(turns / 2)
+            path = markers(poses, in_world_frame(poses, points))
+            np.testing.assert_array_equal(stepped_frames(path, 1, 1e-4, 1), np.arange(4))
 
 
 def test_travel_is_not_changed_by_looking_ahead() -> None:
