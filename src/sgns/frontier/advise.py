@@ -229,8 +229,9 @@ def positive(key: str, value: Any) -> float:
 
 def shipped(study: str, scene: str) -> dict[str, Any]:
     """Settings of a scene of a study that ships with the package; empty for others."""
-    file = files("sgns.conf").joinpath(f"study/{study}.yaml")
-    if not file.is_file():
+    # Looked up among the names that there are: a table may say anything, and must not name a file to be read.
+    found = (file for file in files("sgns.conf").joinpath("study").iterdir() if file.name == f"{study}.yaml")
+    if (file := next(found, None)) is None:
         return {}
     return yaml.safe_load(file.read_text(encoding="utf-8"))["scenes"].get(scene, {})
 

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns.errors import UserError
-from sgns.frontier.advise import advice, main, table, wished
+from sgns.frontier.advise import advice, bands, main, table, wished
 from sgns.frontier.point import Point, read_points, write_points
 
 POINTS = [
@@ -134,3 +134,9 @@ def test_the_table_that_ships_answers() -> None:
     points = read_points(table(None))
     lines = advice(points, wished(asked("error.force=0.6", "time=0.01"), points))
     assert lines[0].startswith("use: ")
+
+
+def test_a_table_names_no_file_to_be_read(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("scenes: {cut: {bands: {force_nrmse: 0.5}}}")
+    assert bands("full", "cut")
+    assert bands(str(tmp_path / "mine"), "cut") == {}
