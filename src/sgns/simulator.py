@@ -121,7 +121,8 @@ class Simulator:
 
     @property
     def scene(self) -> dict[str, Any]:
-        """Scene of one of the training runs, as plain data: its bed is the bed it knows."""
+        """Scene of one of the training runs, as plain data: its bed is the bed it knows. The mesh of a tool is not in
+        it, but in the run (`Run.mesh`)."""
         return self._surrogate.card["scene"]
 
     @property
