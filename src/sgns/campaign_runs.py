@@ -28,7 +28,6 @@ from sgns.cost import RunCost, duration_words, finishing_time, require_space, ru
 from sgns.errors import UserError
 from sgns.leftovers import remove_leftovers
 from sgns.runs import Run
-from sgns.runs.stopped import require_run_place
 from sgns.scene_effects import decision_summary, recorded
 from sgns.scene_run import scene_stages
 from sgns.settings import flattened
@@ -79,8 +78,6 @@ def simulate_campaign(
     by_length = sorted(costs, key=lambda name: costs[name].work, reverse=True)
     share = by_length[shard::shards]
     missing = [name for name in share if not _done(campaign.file(name), campaign.scenes[name])]
-    for name in missing:
-        require_run_place(campaign.file(name))
     for name in set(share) - set(missing):  # nobody will write these again
         remove_leftovers(campaign.file(name))
     part = f", {len(share)} of them in shard {shard} of {shards}" if shards > 1 else ""

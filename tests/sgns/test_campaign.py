@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import yaml
-from meshes import BOX_FACES, box_corners, write_obj
 from omegaconf import OmegaConf
 
 from mpm_warp import Scene, effects_for
@@ -177,6 +176,8 @@ def test_where_picks_runs_by_their_scene(tmp_path) -> None:
 
 
 def test_every_scene_reads_the_mesh_that_the_settings_name(tmp_path):
+    from meshes import BOX_FACES, box_corners, write_obj  # other tests' processes import this module without it
+
     sizes = {"one": (0.08, 0.09, 0.10), "two": (0.08, 0.09, 0.11)}
     files = [
         str(write_obj(tmp_path / f"{name}.obj", box_corners(size), BOX_FACES)) for name, size in sizes.items()

@@ -12,7 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 from test_campaign import campaign
 
-from mpm_warp import Effects, Excavation, SolverStopped
+from mpm_warp import Bed, Effects, Excavation, SolverStopped
 from mpm_warp.batch import all_together
 from sgns import campaign_runs, simulate
 from sgns.claim import only_here
@@ -138,14 +138,15 @@ def test_an_output_that_is_a_pipe_or_taken_is_refused_before_anything_is_compute
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
-def test_a_campaign_looks_at_the_places_of_its_runs_first(tmp_path, monkeypatch):
-    monkeypatch.setattr(campaign_runs, "_compile", None)
-    few = campaign(tmp_path, runs=3)
-    place = few.file(list(few.scenes)[-1])
-    place.parent.mkdir(parents=True)
+def test_a_campaign_refuses_a_pipe_before_the_first_frame(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign_runs, "_frames_done", [0])
+    scene, place = Excavation(bed=Bed(size=(0.8, 0.6, 0.16), spacing=0.04)), tmp_path / "a.h5"
     os.mkfifo(place)
-    with pytest.raises(UserError, match="it is a pipe"):
-        simulate.simulate_campaign(few, device="cpu")
+    described = scene.to_dict(), None
+    task = campaign_runs._make(0, described, place, Effects(), Effects().described(), 0, "cpu", "float32")
+    ((_, (kind, words)),) = all_together([task], 1, "cpu")
+    assert kind == "failed" and "it is a pipe" in words
+    assert campaign_runs._frames_done == [0]
     assert place.is_fifo()
 
 
