@@ -176,7 +176,7 @@ def test_where_picks_runs_by_their_scene(tmp_path) -> None:
 
 
 def test_every_scene_reads_the_mesh_that_the_settings_name(tmp_path):
-    from meshes import BOX_FACES, box_corners, write_obj  # other tests' processes import this module without it
+    from meshes import BOX_FACES, box_corners, write_obj  # not above: other tests' processes do without
 
     sizes = {"one": (0.08, 0.09, 0.10), "two": (0.08, 0.09, 0.11)}
     files = [

@@ -313,7 +313,7 @@ def test_one_training_at_a_time_in_a_folder(data, tmp_path, monkeypatch) -> None
     before = module.fit
 
     def fit(*args) -> None:
-        with pytest.raises(UserError, match="best.ckpt is being made by process"):
+        with pytest.raises(UserError, match=r"best\.ckpt is being made by process"):
             run(data, tmp_path, learning_rate=2e-3)
         before(*args)
 

@@ -85,7 +85,7 @@ def test_a_run_replaces_runs_only(tmp_path):
     with make_writer(tmp_path / "e.h5") as writer:
         writer.append(**random_frame(0))
         os.mkfifo(tmp_path / "e.h5")
-        with pytest.raises(UserError, match="e.h5: it is a pipe"):
+        with pytest.raises(UserError, match=r"e\.h5: it is a pipe"):
             writer.finish(1.0)
     with make_writer(tmp_path / "f.h5") as writer:
         writer.append(**random_frame(0))
