@@ -14,7 +14,7 @@ import numpy as np
 
 from .errors import SceneError
 from .inputs import read_bytes
-from .mesh_file import closed_mesh, read_mesh
+from .mesh_file import checked_mesh, closed_mesh, read_mesh
 
 __all__ = ["Body", "Box", "Cylinder", "MeshBody", "Plate"]
 
@@ -209,7 +209,10 @@ class Cylinder(Body):
 @dataclass(frozen=True)
 class MeshBody(Body):
     """A closed triangle mesh from an STL or OBJ file. Its axes are the file's; its origin becomes the centre
-    of mass of a body of uniform density."""
+    of mass of a body of uniform density.
+
+    The file is read here; a body that is described together with its mesh is made by `of_mesh` and reads none.
+    """
 
     surface: ClassVar[str] = "mesh"
     node_count: ClassVar[int] = 16
@@ -224,8 +227,27 @@ class MeshBody(Body):
     digest: str = field(default="")
     """Names the file's content; filled in when it is read, and checked if it is given."""
 
+    @classmethod
+    def of_mesh(cls, vertices: np.ndarray, triangles: np.ndarray, **values: Any) -> MeshBody:
+        """A body whose mesh is known; no file is opened.
+
+        Args:
+            vertices: about the centre of mass [m], shape (k, 3), as in `mesh`.
+            triangles: shape (t, 3), as in `mesh`.
+            values: of the fields; `file`, `scale` and `digest` only say where the mesh came from.
+
+        Raises:
+            SceneError: it is no such mesh.
+        """
+        body = cls.__new__(cls)
+        body.__dict__["mesh"] = (*checked_mesh(vertices, triangles), False)
+        body.__init__(**values)
+        return body
+
     def __post_init__(self) -> None:
         _require(self, "tool", ("scale",), "")
+        if "mesh" in self.__dict__:  # from `of_mesh`
+            return
         if not self.file:
             raise SceneError("tool.file is missing; a mesh needs an STL or OBJ file")
         try:

@@ -9,8 +9,9 @@ import numpy as np
 from .errors import SceneError
 from .inputs import read_bytes
 
-__all__ = ["closed_mesh", "read_mesh"]
+__all__ = ["checked_mesh", "closed_mesh", "read_mesh"]
 
+_FARTHEST = 1e6  # vertex of a body [m]
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("extra", "<u2")])
 
 
@@ -70,6 +71,29 @@ def closed_mesh(
         raise SceneError(f"tool.file: the mesh in {name} encloses no volume")
     centre = (parts[:, None] * (a + b + c)).sum(axis=0) / (4.0 * volume)
     return vertices - centre, triangles if volume > 0.0 else triangles[:, ::-1], volume < 0.0
+
+
+def checked_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh that `closed_mesh` made before and that was kept since, its vertices (k, 3) [m] to the bit.
+
+    Raises:
+        SceneError: it is none: not closed, not about its centre of mass, facing inwards, not finite, or with corners
+            that are not there.
+    """
+    vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(triangles)
+    if vertices.ndim != 2 or triangles.ndim != 2 or vertices.shape[1] != 3 or triangles.shape[1] != 3:
+        raise SceneError(f"the mesh has vertices {vertices.shape} and triangles {triangles.shape}")
+    if triangles.dtype.kind not in "iu" or len(triangles) == 0:
+        raise SceneError("the mesh has no triangles of whole numbers")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise SceneError("the mesh has a triangle with a vertex that is not there")
+    if not np.isfinite(vertices).all() or np.abs(vertices).max() > _FARTHEST:
+        raise SceneError(f"the mesh has a vertex that is not finite or beyond {_FARTHEST:g} m")
+    triangles = triangles.astype(np.int64)
+    again, _, turned = closed_mesh(vertices, triangles, "the scene")
+    if turned or np.abs(again - vertices).max() > 1e-6 * np.abs(vertices).max():
+        raise SceneError("the mesh faces inwards or is not about its centre of mass")
+    return vertices, triangles
 
 
 def _stl(data: bytes) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from .arrangement import ARRANGEMENTS, arrange, particle_volume
 from .axle import Axle
-from .bodies import Body
+from .bodies import Body, MeshBody
 from .errors import SceneError
 from .limits import (
     FRAME_RATE,
@@ -296,6 +296,11 @@ class Scene:
         return None
 
     @property
+    def mesh(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Vertices (k, 3) [m] about the centre of mass and triangles (t, 3) of a body that is a mesh."""
+        return self.body.mesh[:2] if isinstance(self.body, MeshBody) else None
+
+    @property
     def axle(self) -> Axle | None:
         """The body's vertical motion if it is free; None: all of it is prescribed."""
         return None
@@ -373,16 +378,29 @@ class Scene:
         return ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything that defines the scene, as plain nested data."""
+        """Everything that defines the scene, as plain nested data; of a mesh only its file and digest, see `mesh`."""
         return json.loads(json.dumps(asdict(self)))
 
     @staticmethod
-    def from_dict(data: dict[str, Any]) -> Scene:
-        """The scene described by plain nested data, checked."""
+    def from_dict(data: dict[str, Any], mesh: tuple[np.ndarray, np.ndarray] | None = None) -> Scene:
+        """The scene described by plain nested data, checked.
+
+        Args:
+            data: as from `to_dict`, or less. A `tool.file` without `tool.digest` is read: it is a person's wish. One
+                with a digest has been read before, and `data` may come from any file, which must not make another
+                be read.
+            mesh: of such a tool, see `mesh`.
+        """
         kind = data.get("kind", "bed")
         if not isinstance(kind, str) or kind not in Scene.kinds:
             raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(Scene.kinds)}")
-        return _build(Scene.kinds[kind], data, "scene")
+        tool = data.get("tool")
+        if mesh is None and isinstance(tool, dict) and tool.get("shape") == "mesh" and tool.get("digest"):
+            raise SceneError(
+                "scene.tool is a mesh that was read before and does not come with these data; give it, as in "
+                "Scene.from_dict(scene.to_dict(), scene.mesh), or leave out tool.digest to read tool.file again"
+            )
+        return _build(Scene.kinds[kind], data, "scene", mesh)
 
     # --- checks for scenes with a body --------------------------------------------------------------------
 
@@ -423,8 +441,10 @@ class Scene:
 Scene.kinds["bed"] = Scene
 
 
-def _build(cls: type, data: dict[str, Any], where: str) -> Any:
-    """A dataclass from nested plain data, refusing keys it does not have."""
+def _build(
+    cls: type, data: dict[str, Any], where: str, mesh: tuple[np.ndarray, np.ndarray] | None = None
+) -> Any:
+    """A dataclass from nested plain data, refusing keys it does not have; `mesh` goes to a body that is one."""
     if not isinstance(data, dict):
         raise SceneError(f"{where} is {data!r}; it must be a group of keys")
     hints = get_type_hints(cls)
@@ -437,7 +457,7 @@ def _build(cls: type, data: dict[str, Any], where: str) -> Any:
         if is_dataclass(hints[key]):
             value = _build(hints[key], value, f"{where}.{key}")
         elif shapes := {c.shape: c for c in get_args(hints[key]) if is_dataclass(c)}:
-            value = _build(_chosen(shapes, value, f"{where}.{key}"), value, f"{where}.{key}")
+            value = _build(_chosen(shapes, value, f"{where}.{key}"), value, f"{where}.{key}", mesh)
         elif hints[key] is float or (hints[key] == float | None and value is not None):
             value = _number(value, f"{where}.{key}", float)
         elif hints[key] is bool and not isinstance(value, bool):
@@ -447,7 +467,7 @@ def _build(cls: type, data: dict[str, Any], where: str) -> Any:
         else:
             value = _plain(value, hints[key], f"{where}.{key}")
         values[key] = value
-    return cls(**values)
+    return cls(**values) if mesh is None or cls is not MeshBody else MeshBody.of_mesh(*mesh, **values)
 
 
 def _chosen(shapes: dict[str, type], value: Any, where: str) -> type:

@@ -147,8 +147,11 @@ def plan(
         data = OmegaConf.create(dict(base))
         for key, value in values.items():
             OmegaConf.update(data, key, value, force_add=True)
+        plain = OmegaConf.to_container(data, resolve=True)
+        if isinstance(plain.get("tool"), dict):
+            plain["tool"].pop("digest", None)  # `draw` may name another file; these are the person's settings
         name = f"{index:04d}_" + "_".join(f"{key.split('.')[-1]}-{value}" for key, value in values.items())
-        scenes[name] = Scene.from_dict(OmegaConf.to_container(data, resolve=True))
+        scenes[name] = Scene.from_dict(plain)
         grids.setdefault(grid, []).append(name)
     return Campaign(
         name=settings["name"],

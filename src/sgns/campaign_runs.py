@@ -16,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
@@ -173,7 +174,7 @@ class _Production:
         shares = [sample[worker :: self.workers] for worker in range(self.workers)]
         trials = []
         for share in shares:
-            scenes = [self.campaign.scenes[name].to_dict() for name in share]
+            scenes = [_described(self.campaign.scenes[name]) for name in share]
             effects = [self.campaign.physics[name][0] for name in share]
             trials.append(self._pool.submit(_try, scenes, effects, device, precision))
         for share, trial in zip(shares, trials, strict=True):
@@ -186,7 +187,7 @@ class _Production:
         """Every run is a job, but a worker that makes several at once gets its share of the runs as one job."""
         jobs = []
         for index, name in enumerate(self.costs):
-            scene, file = self.campaign.scenes[name].to_dict(), self.campaign.file(name)
+            scene, file = _described(self.campaign.scenes[name]), self.campaign.file(name)
             effects, decisions = self.campaign.physics[name]
             jobs.append((name, index, scene, file, effects, recorded(decisions)))
         if self.batch > 1:
@@ -270,11 +271,19 @@ def _start_worker(frames_done: Any, ended: Any, barrier: Any) -> None:
     threading.Thread(target=leave_with_parent, daemon=True).start()
 
 
+_Described = tuple[dict[str, Any], tuple[np.ndarray, np.ndarray] | None]
+
+
+def _described(scene: Scene) -> _Described:
+    """A scene as it is sent to another process: its plain data and its mesh, for `Scene.from_dict`."""
+    return scene.to_dict(), scene.mesh
+
+
 def _try(
-    scenes: list[dict[str, Any]], effects: list[Effects], device: str, precision: str
+    scenes: list[_Described], effects: list[Effects], device: str, precision: str
 ) -> tuple[list[int], float]:
     """Frames made of each scene and the seconds they took all together, while the other workers do the same."""
-    found = [Scene.from_dict(scene) for scene in scenes]
+    found = [Scene.from_dict(*scene) for scene in scenes]
     frames = frames_together(found, effects, device, precision, at_once=len(found))
     for _ in found:
         next(frames)  # the state at the start
@@ -289,7 +298,7 @@ def _try(
 
 
 def _make_share(
-    jobs: list[tuple[str, int, dict[str, Any], Path, Effects, dict[str, Any]]],
+    jobs: list[tuple[str, int, _Described, Path, Effects, dict[str, Any]]],
     batch: int,
     seed: int,
     device: str,
@@ -308,7 +317,7 @@ def _make_share(
 
 def _make(
     index: int,
-    scene: dict[str, Any],
+    described: _Described,
     output: Path,
     effects: Effects,
     reasons: dict[str, dict[str, Any]],
@@ -324,12 +333,13 @@ def _make(
 
     outcome = "made", ""
     try:
+        scene = Scene.from_dict(*described)
         with claimed(output) as ours:
-            if not ours or _done(output, Scene.from_dict(scene)):
+            if not ours or _done(output, scene):
                 outcome = "elsewhere", ""
             else:
                 for stage in scene_stages(
-                    Scene.from_dict(scene),
+                    scene,
                     output,
                     effects=effects,
                     reasons=reasons,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from mpm_warp import Effects, Scene, State
+from mpm_warp import Effects, MeshBody, Scene, State
 from sgns.errors import UserError
 from sgns.runs import Run
 from sgns.runs.stopped import read_state
@@ -29,6 +29,7 @@ CHANGES = (
 )
 """Keys of the scene that may change half-way: how it is computed, not what it is."""
 
+_FILE = "scene.tool.file"
 _OTHERS = ("continue_from", "output", "device", "solver.precision", "hydra")
 
 
@@ -62,7 +63,7 @@ class Continuation:
             for group in groups:
                 place = place[group]
             place[last] = value
-        return Scene.from_dict(data)
+        return Scene.from_dict(data, self.scene.mesh)
 
     @property
     def record(self) -> list[dict[str, Any]]:
@@ -92,6 +93,7 @@ def continued(cfg: DictConfig, overrides: Sequence[str]) -> Continuation:
             raise UserError(f"continue_from: {path} is a whole run; there is nothing to go on with")
         scene, reasons, extra = run.scene, run.effects, run.extra
         seed, count, wall_time = run.seed, run.frame_count, run.wall_time_s
+        mesh = _mesh(run, cfg, overrides)
     state = read_state(path)
     if state.frame != count - 1:
         raise UserError(f"{path} holds {count} frames but the state of frame {state.frame}; repeat the run")
@@ -105,7 +107,7 @@ def continued(cfg: DictConfig, overrides: Sequence[str]) -> Continuation:
     asked = any(o.startswith("solver.precision=") for o in overrides)
     return Continuation(
         path=path,
-        scene=Scene.from_dict(scene),
+        scene=Scene.from_dict(scene, mesh),
         changes=changes,
         effects=effects,
         reasons=reasons,
@@ -115,6 +117,31 @@ def continued(cfg: DictConfig, overrides: Sequence[str]) -> Continuation:
         wall_time=wall_time,
         before=before,
     )
+
+
+def _mesh(run: Run, cfg: DictConfig, overrides: Sequence[str]) -> tuple[np.ndarray, np.ndarray] | None:
+    """The tool's mesh: what the run holds, or for a run from before it was kept the file that the command names."""
+    tool = run.scene.get("tool")
+    is_mesh = isinstance(tool, dict) and tool.get("shape") == "mesh"
+    given = any(o.lstrip("+").startswith(f"{_FILE}=") for o in overrides)
+    if is_mesh and run.mesh is None:
+        if not given:
+            raise UserError(
+                f"{run.path} does not hold the mesh of its tool, as runs of before did not, and no file is read "
+                f"because a run names it; give the file: '+{_FILE}=...'"
+            )
+        asked = {"shape": "mesh", "file": str(OmegaConf.select(cfg, _FILE)), "digest": tool["digest"]}
+        return MeshBody(**asked, scale=_scale(tool, run.path)).mesh[:2]
+    if given:
+        raise UserError(f"{run.path} brings its own tool; leave out {_FILE}")
+    return run.mesh
+
+
+def _scale(tool: Mapping[str, Any], path: Path) -> float:
+    scale = tool.get("scale", 1.0)
+    if isinstance(scale, bool) or not isinstance(scale, (int, float)):
+        raise UserError(f"{path}: scene.tool.scale is {scale!r}, which is no number; repeat the run")
+    return float(scale)
 
 
 def _effects(reasons: Mapping[str, Any], path: Path) -> Effects:
@@ -139,7 +166,7 @@ def _changes(cfg: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
     changes = {}
     for override in overrides:
         key = override.split("=")[0].lstrip("+~")
-        if re.split(r"[@./]", key)[0] == "hydra" or key in _OTHERS:
+        if re.split(r"[@./]", key)[0] == "hydra" or key in (*_OTHERS, _FILE):
             continue
         if key.removeprefix("scene.") not in CHANGES or not key.startswith("scene."):
             raise UserError(

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 import socket
+import stat
 from pathlib import Path
 from typing import IO
 from uuid import uuid4
@@ -17,16 +18,66 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["hidden_beside", "hold", "remove_leftovers"]
+from sgns.errors import UserError
+
+__all__ = ["give_name", "hidden_beside", "hold", "is_replaceable", "remove_leftovers", "require_replaceable"]
 
 log = logging.getLogger(__name__)
 
 _SUFFIX = ".partial"
+_KINDS = {
+    stat.S_IFLNK: "a symbolic link; give the name of the file itself",
+    stat.S_IFDIR: "a folder; give the name of a file in it, or another name",
+    stat.S_IFIFO: "a pipe; give the name of a file",
+    stat.S_IFSOCK: "a socket; give the name of a file",
+    stat.S_IFCHR: "a device; give the name of a file",
+    stat.S_IFBLK: "a device; give the name of a file",
+}
+"""What is never replaced by a file. A link is not either, wherever it leads: /dev/stdout is one, and may lead to a
+plain file."""
 
 
 def hidden_beside(path: Path) -> Path:
     """A name in the same folder that says which process of which machine writes `path`."""
     return path.with_name(f"{_start(path)}{os.getpid()}-{uuid4().hex[:8]}{_SUFFIX}")
+
+
+def require_replaceable(*paths: Path) -> None:
+    """Refuse names that stand for something else than a plain file, or nothing yet: a file that takes such a name would
+    destroy a device, a pipe or a link.
+
+    Raises:
+        UserError: says what it is.
+    """
+    for path in paths:
+        kind = _kind(path)
+        if kind not in (None, stat.S_IFREG):
+            what = _KINDS.get(kind, "no plain file; give the name of a file")
+            raise UserError(f"cannot write {path}: it is {what}")
+
+
+def is_replaceable(path: Path) -> bool:
+    """Whether a file of ours may be there, or be put there: see `require_replaceable`."""
+    return _kind(path) in (None, stat.S_IFREG)
+
+
+def give_name(temporary: Path, path: Path) -> None:
+    """Let a complete file take its name, and the place of a plain file that had it.
+
+    Raises:
+        UserError: By now the name stands for something else.
+        OSError: The system refuses.
+    """
+    require_replaceable(path)
+    os.replace(temporary, path)
+
+
+def _kind(path: Path) -> int | None:
+    """What the name itself stands for, as in `stat`; None for nothing, or where that cannot be asked."""
+    try:
+        return stat.S_IFMT(os.lstat(path).st_mode)
+    except (OSError, ValueError):  # a name that no file can have is refused when the file is made
+        return None
 
 
 def hold(file: IO[bytes]) -> None:
@@ -46,6 +97,8 @@ def remove_leftovers(path: Path) -> None:
             continue
         pid = found.name[len(start) :].split("-")[0]
         if not pid.isdecimal() or _alive(int(pid)):
+            continue
+        if _kind(found) != stat.S_IFREG:  # none of ours; opening a pipe may never end
             continue
         # A live process in a container may have a number that we cannot see; its lock shows that it is there.
         with contextlib.suppress(OSError, ValueError), open_file(found, 1 << 62) as file:

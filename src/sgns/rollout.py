@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from sgns.claim import only_here
 from sgns.clock import elapsed
 from sgns.errors import UserError
 from sgns.runs import RunWriter, frame_chunks
+from sgns.runs.stopped import require_run_place
 from sgns.settings import differences
 
 if TYPE_CHECKING:
@@ -84,6 +86,7 @@ def write_rollout(
     seed: int = 0,
     checkpoint: str | Path = "",
     given_frames: int = 1,
+    mesh: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Path:
     """Decodes a rollout and writes it as a run file (producer `rollout`).
 
@@ -98,6 +101,7 @@ def write_rollout(
         seed: recorded seed.
         checkpoint: file that the simulator was loaded from; recorded with its settings.
         given_frames: how many frames at the start are no predictions; recorded as `history`.
+        mesh: of the scene's tool, if it is one.
 
     Returns:
         The path written.
@@ -137,6 +141,7 @@ def write_rollout(
             "outside_training": None if excess is None else excess.largest,
             "outside_training_words": None if excess is None else excess.words(),
         },
+        mesh=mesh,
     ) as writer:
         previous = None
         for frames in frame_chunks(particle_count, len(latent)):
@@ -260,7 +265,9 @@ def rollout_scene(
     if rollout.excess is not None and (words := rollout.excess.words()):
         log.warning("%s: forces and soil are a guess there", words)
     began = time.perf_counter()
-    write_rollout(path, simulator, scene.to_dict(), rollout, seed=seed, checkpoint=checkpoint)
+    write_rollout(
+        path, simulator, scene.to_dict(), rollout, seed=seed, checkpoint=checkpoint, mesh=scene.mesh
+    )
     writing = elapsed(began, time.perf_counter())
     steps = len(rollout.latent) - 1
     return RolloutTiming(steps / float(simulator.frame_rate), float(rollout.wall_time_s), writing)
@@ -274,6 +281,8 @@ def main(cfg: DictConfig) -> float:
 
     if not isinstance(cfg.rate_independent, bool):
         raise UserError(f"rate_independent is {cfg.rate_independent!r}; it must be true or false")
+    output = Path(cfg.output)
+    require_run_place(output)
     scene = scene_from_config(cfg)
     simulator = Simulator.load(
         cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes, rate_independent=cfg.rate_independent
@@ -283,9 +292,9 @@ def main(cfg: DictConfig) -> float:
     ignored = unlearned(simulator.scene, scene.to_dict(), simulator.context_keys)
     if ignored:
         log.warning("the network follows the tool's path only; it does not know of %s", ", ".join(ignored))
-    output = Path(cfg.output)
-    require_space(output.parent, run_cost(scene).size)
-    timing = rollout_scene(simulator, scene, output, seed=cfg.seed, checkpoint=cfg.checkpoint)
+    with only_here(output):
+        require_space(output.parent, run_cost(scene).size)
+        timing = rollout_scene(simulator, scene, output, seed=cfg.seed, checkpoint=cfg.checkpoint)
     log.info("rolled out %d frames (%.3g s) into %s", scene.frame_count, timing.simulated, output)
     log.info("wall seconds per simulated second: %.3g stepping with force", timing.stepping_rate)
     log.info(

@@ -91,6 +91,7 @@ def scene_stages(
             "particles_simulated": solver.particle_count,
         }
         | ({"continued": going_on.record} if going_on is not None else {}),
+        mesh=scene.mesh,
     ) as writer:
         for frame in going_on.frames() if going_on is not None else ():
             writer.append(*frame)

@@ -15,10 +15,12 @@ from tqdm import tqdm
 from mpm_warp import Scene
 from sgns.campaign import plan
 from sgns.campaign_runs import simulate_campaign
+from sgns.claim import only_here
 from sgns.continuation import continued
 from sgns.cost import require_space, run_cost
 from sgns.errors import UserError
 from sgns.runs import Run
+from sgns.runs.stopped import require_run_place
 from sgns.scene_effects import asked_effects, decided, decision_line, recorded
 from sgns.scene_run import Timing, simulate_scene
 from sgns.scenes import scene_from_config
@@ -103,15 +105,17 @@ def main(cfg: DictConfig) -> float | None:
 def _simulate_one(scene: Scene, cfg: DictConfig, **settings: Any) -> float:
     """Simulate a scene into `cfg.output` with a bar and a few words about it; see `scene_stages`."""
     output = Path(cfg.output)
-    require_space(output.parent, run_cost(scene).size)
-    with tqdm(total=scene.frame_count, unit="frame", desc=scene.name, disable=None) as bar:
-        timing = simulate_scene(
-            scene,
-            output,
-            device=cfg.device,
-            progress=bar.update,
-            **settings,
-        )
+    with only_here(output):
+        require_run_place(output)
+        require_space(output.parent, run_cost(scene).size)
+        with tqdm(total=scene.frame_count, unit="frame", desc=scene.name, disable=None) as bar:
+            timing = simulate_scene(
+                scene,
+                output,
+                device=cfg.device,
+                progress=bar.update,
+                **settings,
+            )
     with Run(output) as run:
         every = scene.bed.store_every
         kept = f" (one of every {every} recorded)" if every > 1 else ""

@@ -150,7 +150,8 @@ class Simulator:
 
     @property
     def scene(self) -> dict[str, Any]:
-        """Scene of one of the training runs, as plain data, a copy: its bed is the bed it knows."""
+        """Scene of one of the training runs, as plain data, a copy: its bed is the bed it knows. The mesh of a tool is
+        not in it, but in the run (`Run.mesh`)."""
         return copy.deepcopy(self._surrogate.card["scene"])
 
     @property

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sgns.leftovers import hidden_beside, hold, remove_leftovers
+from sgns.leftovers import give_name, hidden_beside, hold, remove_leftovers, require_replaceable
 
 __all__ = ["whole_file", "write_whole"]
 
@@ -17,8 +17,10 @@ def whole_file(path: Path) -> Iterator[Path]:
     """A hidden path beside `path` to write to; it gets its name at the end, or is removed after an exception.
 
     Raises:
+        UserError: `path` is a device, pipe, link or folder.
         OSError: The disk does not take it; the error names `path`.
     """
+    require_replaceable(path)
     temporary = hidden_beside(path)
     try:
         remove_leftovers(path)
@@ -26,7 +28,7 @@ def whole_file(path: Path) -> Iterator[Path]:
             hold(held)
             yield temporary
             os.fsync(held.fileno())
-        os.replace(temporary, path)
+        give_name(temporary, path)
     except OSError as error:
         if error.filename in (None, str(temporary)):  # a full disk is reported without a name
             error.filename = str(path)

@@ -119,3 +119,35 @@ def test_nodes_lie_on_the_bodies(tmp_path):
 def test_what_bodies_refuse(cls, values, words):
     with pytest.raises(SceneError, match=words):
         cls(**values)
+
+
+def test_a_known_mesh_opens_no_file(tmp_path):
+    file = write_obj(tmp_path / "box.obj", CORNERS, BOX_FACES)
+    body = MeshBody(file=str(file))
+    file.unlink()
+    again = MeshBody.of_mesh(*body.mesh[:2], file=str(file), digest=body.digest)
+    assert again == body
+    for one, other in zip(again.mesh, body.mesh, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda v, t: (v[:, :2], t), "vertices"),
+        (lambda v, t: (v, t[:0]), "no triangles"),
+        (lambda v, t: (v, t.astype(float)), "no triangles of whole numbers"),
+        (lambda v, t: (v, t - 1), "vertex that is not there"),
+        (lambda v, t: (v, t + 1), "vertex that is not there"),
+        (lambda v, t: (v * np.nan, t), "not finite"),
+        (lambda v, t: (v * 1e12, t), "beyond 1e\\+06 m"),
+        (lambda v, t: (v, t[1:]), "not closed"),
+        (lambda v, t: (v, t[:, ::-1]), "faces inwards"),
+        (lambda v, t: (v + 0.01, t), "not about its centre of mass"),
+        (lambda v, t: (v * [1, 1, 0], t), "encloses no volume"),
+    ],
+)
+def test_a_known_mesh_is_checked(tmp_path, change, words):
+    body = MeshBody(file=str(write_obj(tmp_path / "box.obj", CORNERS, BOX_FACES)))
+    with pytest.raises(SceneError, match=words):
+        MeshBody.of_mesh(*change(*body.mesh[:2]), file="box.obj")

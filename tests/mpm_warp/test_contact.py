@@ -92,3 +92,19 @@ def test_unknown_shapes(tool):
     data = Push(bed=BED, path=path(0.2, 0.1)).to_dict() | {"tool": tool}
     with pytest.raises(SceneError, match=r"scene.tool.shape is .*; allowed: box, cylinder, mesh"):
         Scene.from_dict(data)
+
+
+def test_a_mesh_scene_survives_plain_data_with_its_mesh(tmp_path):
+    """Data that a mesh was read for may come from any file, and open none."""
+    file = write_obj(tmp_path / "box.obj", box_corners((0.06, 0.1, 0.1)), BOX_FACES)
+    scene = Push(bed=BED, tool=MeshBody(file=str(file)), path=path(0.2, 0.1))
+    with pytest.raises(SceneError, match="does not come with these data"):
+        Scene.from_dict(scene.to_dict())
+    data = scene.to_dict()
+    data["tool"].pop("digest")
+    assert Scene.from_dict(data) == scene
+    file.unlink()
+    again = Scene.from_dict(scene.to_dict(), scene.mesh)
+    assert again == scene
+    np.testing.assert_array_equal(again.body_points(), scene.body_points())
+    assert Push(bed=BED, path=path(0.2, 0.1)).mesh is None

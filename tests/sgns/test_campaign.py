@@ -173,3 +173,21 @@ def test_where_picks_runs_by_their_scene(tmp_path) -> None:
         names({"depth": 1})
     with pytest.raises(UserError, match=r"leaves no run: load is \[7\]; .* it is 100\.0, 25\.0, 33"):
         names({"load": 7})
+
+
+def test_every_scene_reads_the_mesh_that_the_settings_name(tmp_path):
+    from meshes import BOX_FACES, box_corners, write_obj  # not above: other tests' processes do without
+
+    sizes = {"one": (0.08, 0.09, 0.10), "two": (0.08, 0.09, 0.11)}
+    files = [
+        str(write_obj(tmp_path / f"{name}.obj", box_corners(size), BOX_FACES)) for name, size in sizes.items()
+    ]
+    rows = [[0.0, 0.1, 0.1, 0.03, 0, 0, 0, 1], [1.0, 0.2, 0.1, 0.03, 0, 0, 0, 1]]
+    tool = {"shape": "mesh", "file": files[0]}
+    base = Scene.from_dict({"kind": "body", "bed": BASE["bed"], "duration": 0.05, "path": rows, "tool": tool})
+    draw = {"tool.file": files, "tool.friction": [0.1, 0.3]}
+    settings = {"name": "tiny", "path": tmp_path / "tiny", "draw": draw}
+    c = plan(settings, base.to_dict(), EFFECTS, "float32", 0)
+    assert {scene.tool.digest for scene in c.scenes.values()} > {base.tool.digest}
+    c.record()
+    c.record()  # the same settings go on

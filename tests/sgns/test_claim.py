@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import threading
 
 import pytest
 
 pytest.importorskip("fcntl", reason="this system has no file locks")
 
-from sgns.claim import claimed
+from sgns.claim import claimed, claimed_in_turn, only_here
+from sgns.errors import UserError
 
 # Claims the file named on the command line, says so and waits for a line.
 HOLD = """
@@ -68,3 +71,38 @@ def test_claims_exclude_each_other(tmp_path):
         process.stdout.close()
     assert path.read_text() == "600"
     assert [p.name for p in tmp_path.iterdir()] == ["count"]
+
+
+def test_who_asks_second_hears_who_is_at_it(tmp_path):
+    path = tmp_path / "a.h5"
+    with start(HOLD, path) as holder:
+        assert holder.stdout.readline() == "True\n"
+        with pytest.raises(UserError) as caught, only_here(path):
+            pass
+        assert str(caught.value).startswith(f"{path} is being made by process {holder.pid}; wait until")
+        holder.kill()
+    with only_here(path), pytest.raises(UserError, match=f"process {os.getpid()};"), only_here(path):
+        pass  # the killed one left its number in the lock file
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_claim_in_turn_waits(tmp_path):
+    path = tmp_path / "a"
+    with start(HOLD, path) as holder:
+        assert holder.stdout.readline() == "True\n"
+        threading.Timer(0.3, holder.stdin.close).start()
+        with claimed_in_turn(path):
+            assert holder.stdin.closed
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: os.symlink("file", path)])
+def test_what_is_no_lock_file_is_not_used_as_one(tmp_path, make):
+    (tmp_path / "file").write_text("mine")
+    make(tmp_path / ".a.lock")
+    with pytest.raises(UserError, match=r"\.a\.lock: it is a"), only_here(tmp_path / "a"):
+        pass
+    with pytest.raises(UserError, match="file: File exists; choose"), only_here(tmp_path / "file" / "a"):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".a.lock", "file"]
+    assert (tmp_path / "file").read_text() == "mine"

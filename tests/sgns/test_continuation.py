@@ -7,10 +7,26 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import yaml
+from meshes import BOX_FACES, box_corners, write_obj
 from omegaconf import OmegaConf
 from test_simulate import SMALL, sgns
 
-from mpm_warp import Bed, Effects, Excavation, Plate, Scene, Solver, SolverStopped, effects_for
+from mpm_warp import (
+    Bed,
+    Effects,
+    Excavation,
+    MeshBody,
+    Plate,
+    Push,
+    Scene,
+    SceneError,
+    Solver,
+    SolverStopped,
+    bodies,
+    effects_for,
+    mesh_file,
+)
 from mpm_warp.batch import all_together
 from sgns import campaign_runs
 from sgns.continuation import continued
@@ -145,7 +161,7 @@ def test_a_campaign_says_where_its_run_is_kept(stops, tmp_path, monkeypatch):
     monkeypatch.setattr(campaign_runs, "_frames_done", [0])
     output = tmp_path / "runs" / "1.h5"
     task = campaign_runs._make(
-        0, small().to_dict(), output, Effects(), Effects().described(), 0, "cpu", "float32"
+        0, (small().to_dict(), None), output, Effects(), Effects().described(), 0, "cpu", "float32"
     )
     ((_, (kind, words)),) = all_together([task], 1, "cpu")
     assert kind == "failed"
@@ -200,3 +216,78 @@ def test_a_bed_without_a_body_can_go_on(stops, tmp_path):
     with pytest.raises(SolverStopped, match="continue_from="):
         simulate_scene(scene, tmp_path / "bed.h5", effects=Effects())
     assert read_state(tmp_path / "bed.stopped.h5").frame == LAST
+
+
+def pushed(file) -> Push:
+    rows = tuple((t, 0.1 + 0.5 * t, 0.1, 0.03, 0.0, 0.0, 0.0, 1.0) for t in (0.0, 0.1))
+    bed = Bed(size=(0.4, 0.2, 0.16), spacing=0.04)
+    return Push(bed=bed, tool=MeshBody(file=str(file)), path=rows, duration=0.1)
+
+
+@pytest.fixture
+def stopped_mesh(stops, tmp_path):
+    """A stopped run of a mesh whose file is gone, and the content of that file."""
+    file = write_obj(tmp_path / "box.obj", box_corners((0.08, 0.09, 0.1)), BOX_FACES)
+    with pytest.raises(SolverStopped):
+        simulate_scene(pushed(file), tmp_path / "run.h5", effects=Effects())
+    content = file.read_text()
+    file.unlink()
+    return tmp_path / "run.stopped.h5", content
+
+
+def asked(kept, *overrides):
+    cfg = {"continue_from": str(kept), "scene": {"courant": 0.3}, "solver": {"precision": "float32"}}
+    found = OmegaConf.merge(cfg, OmegaConf.from_dotlist([o.lstrip("+") for o in overrides]))
+    return continued(found, ["scene.courant=0.3", *overrides])
+
+
+def test_a_run_brings_its_mesh(stopped_mesh, tmp_path, monkeypatch):
+    """Whatever lies where the run says that the mesh was, it is not looked at."""
+    kept, _ = stopped_mesh
+    (tmp_path / "box.obj").write_text("another's")
+
+    def never(*_):
+        raise AssertionError("a file is read because a run names it")
+
+    monkeypatch.setattr(bodies, "read_bytes", never)
+    monkeypatch.setattr(mesh_file, "read_bytes", never)
+    with pytest.raises(UserError, match=r"brings its own tool; leave out scene\.tool\.file"):
+        asked(kept, "+scene.tool.file=box.obj")
+    going_on = asked(kept)
+    simulate_scene(going_on.scene, tmp_path / "run.h5", effects=going_on.effects, going_on=going_on)
+    assert check_run(tmp_path / "run.h5") == []
+    with Run(tmp_path / "run.h5") as run:
+        assert run.frame_count == going_on.scene.frame_count
+        np.testing.assert_array_equal(run.mesh[0], going_on.scene.mesh[0])
+
+
+def test_a_run_without_its_mesh_reads_what_the_command_names(stopped_mesh, tmp_path):
+    kept, content = stopped_mesh
+    with Run(kept) as run:
+        whole = run.mesh
+    with h5py.File(kept, "r+") as file:
+        del file["parameters"]
+    (tmp_path / "box.obj").write_text(content)  # where the run says it was
+    with pytest.raises(UserError, match=r"not hold the mesh of its tool.*'\+scene\.tool\.file=") as caught:
+        asked(kept)
+    assert "\n" not in str(caught.value)
+    other = tmp_path / "other.obj"
+    (tmp_path / "box.obj").rename(other)
+    going_on = asked(kept, f"+scene.tool.file={other}")
+    np.testing.assert_array_equal(going_on.scene.mesh[0], whole[0])
+    assert going_on.scene.tool.file.endswith("box.obj")  # a campaign knows the run by it
+    other.write_text(content.replace("v 0.08", "v 0.07"))
+    with pytest.raises(SceneError, match="is not the file this scene was made with"):
+        asked(kept, f"+scene.tool.file={other}")
+
+
+def test_a_run_cannot_ask_for_a_file(stopped_mesh):
+    """A scene in a file without a digest would be one of a person, whose file is read."""
+    kept, _ = stopped_mesh
+    with h5py.File(kept, "r+") as file:
+        scene = yaml.safe_load(file.attrs["scene"])
+        scene["tool"].pop("digest")
+        del file["parameters"]
+        file.attrs["scene"] = yaml.safe_dump(scene)
+    with pytest.raises(UserError, match="without the digest"):
+        asked(kept)

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from meshes import box_corners, box_triangles
 from surrogates import FakeSimulator, fitted, small_dataset
 
 from sgns.errors import UserError
@@ -30,6 +31,7 @@ class FakeScene:
     """The parts of a scene that a rollout asks for."""
 
     frame_rate = 60.0
+    mesh = None
 
     def __init__(self, simulator, arrangement_hash=None, bed=None):
         self.poses = simulator.known[0][0]
@@ -164,3 +166,12 @@ def test_changes_that_the_network_cannot_feel_are_named():
     soil = {"friction_angle": 30.0, "material": {"static_friction": 0.577}}
     other = {"friction_angle": 37.0, "material": {"static_friction": 0.754}}
     assert len(unlearned(soil, other)) == 2 and unlearned(soil, other, ["friction_angle"]) == []
+
+
+def test_a_rollout_holds_the_mesh_of_its_tool(simulator, tmp_path):
+    scene = FakeScene(simulator)
+    scene.mesh = box_corners((0.2, 0.2, 0.2), (-0.1, -0.1, -0.1)), box_triangles()
+    rollout_scene(simulator, scene, tmp_path / "a.h5")
+    with Run(tmp_path / "a.h5") as run:
+        for found, known in zip(run.mesh, scene.mesh, strict=True):
+            np.testing.assert_array_equal(found, known)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
 
 import h5py
 import pytest
+from omegaconf import OmegaConf
 from test_campaign import campaign
 
-from mpm_warp import Effects, SolverStopped
+from mpm_warp import Bed, Effects, Excavation, SolverStopped
 from mpm_warp.batch import all_together
+from sgns import campaign_runs, simulate
+from sgns.claim import only_here
 from sgns.errors import UserError
 from sgns.runs import Run, check_run
 from sgns.scene_run import scene_stages, simulate_scene
@@ -118,3 +122,39 @@ def test_output_that_is_a_folder(tmp_path):
     scene = next(iter(campaign(tmp_path).scenes.values()))
     with pytest.raises(UserError, match="is a folder"):
         simulate_scene(scene, tmp_path, effects=Effects())
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_an_output_that_is_a_pipe_or_taken_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
+    monkeypatch.setattr(simulate, "simulate_scene", None)
+    cfg = OmegaConf.create({"output": str(tmp_path / "run.h5"), "device": "cpu"})
+    scene = Excavation()
+    with only_here(tmp_path / "run.h5"), pytest.raises(UserError, match=f"made by process {os.getpid()}"):
+        simulate._simulate_one(scene, cfg)
+    os.mkfifo(tmp_path / "run.stopped.h5")
+    with pytest.raises(UserError, match=r"run\.stopped\.h5: it is a pipe"):
+        simulate._simulate_one(scene, cfg)
+    os.mkfifo(tmp_path / "run.h5")
+    with pytest.raises(UserError, match=r"run\.h5: it is a pipe"):
+        simulate._simulate_one(scene, cfg)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_a_campaign_refuses_a_pipe_before_the_first_frame(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign_runs, "_frames_done", [0])
+    scene, place = Excavation(bed=Bed(size=(0.8, 0.6, 0.16), spacing=0.04)), tmp_path / "a.h5"
+    os.mkfifo(place)
+    described = scene.to_dict(), None
+    task = campaign_runs._make(0, described, place, Effects(), Effects().described(), 0, "cpu", "float32")
+    ((_, (kind, words)),) = all_together([task], 1, "cpu")
+    assert kind == "failed" and "it is a pipe" in words
+    assert campaign_runs._frames_done == [0]
+    assert place.is_fifo()
+
+
+def test_the_command_says_that_an_output_is_a_device(tmp_path):
+    (tmp_path / "run.h5").symlink_to("/dev/null")
+    done = sgns(tmp_path, "simulate", *SMALL, "output=run.h5")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "cannot write run.h5: it is a symbolic link" in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]

@@ -184,6 +184,11 @@ def test_bad_checkpoints_are_named(trained, tmp_path) -> None:
     with pytest.raises(UserError, match="newer"):
         Simulator.load(tmp_path / "future.ckpt")
     content["hyper_parameters"]["format_version"] = 1
+    card = content["hyper_parameters"]
+    mesh = card | {"scene": card["scene"] | {"tool": {"shape": "mesh", "file": "/etc/passwd"}}}
+    torch.save(content | {"hyper_parameters": mesh}, tmp_path / "asking.ckpt")
+    with pytest.raises(UserError, match="names a mesh file without the digest"):
+        Simulator.load(tmp_path / "asking.ckpt")
     del content["state_dict"]["surrogate.basis_modes"]
     torch.save(content, tmp_path / "incomplete.ckpt")
     with pytest.raises(UserError, match="fit together"):

@@ -33,7 +33,8 @@ def sinkage(scene: Mapping[str, Any], poses: np.ndarray) -> np.ndarray:
 def body_corners(run: Any, frame: int) -> np.ndarray:
     """Points [m] whose convex hull is the body at a frame, shape (k, 3), world frame.
 
-    The corners of the scene's blade, points along the rims of its wheel, else the recorded body points.
+    The corners of the scene's blade, points along the rims of its wheel, the vertices of the mesh that the run holds,
+    else the recorded body points.
     """
     scene = run.scene
     blade = scene.get("blade")
@@ -45,6 +46,8 @@ def body_corners(run: Any, frame: int) -> np.ndarray:
     elif isinstance(blade, Mapping):
         half = 0.5 * np.array([blade["thickness"], blade["width"], blade["length"]], dtype=np.float64)
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3) * half
+    elif run.mesh is not None:
+        corners = run.mesh[0]
     else:
         return np.asarray(run.body_points[frame])
     return in_world_frame(run.pose[[frame]], corners)[0]

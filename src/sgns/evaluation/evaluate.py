@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from sgns.claim import only_here
 from sgns.clock import elapsed
 from sgns.errors import UserError
 from sgns.evaluation.bodies import is_wheel
@@ -36,6 +37,7 @@ from sgns.evaluation.tables import write_tables
 from sgns.evaluation.training_curves import read_log
 from sgns.learning.kinds import model_settings
 from sgns.learning.model_settings import ModelSettings
+from sgns.leftovers import require_replaceable
 from sgns.poses import in_body_frame
 from sgns.reduction import Basis
 from sgns.reduction.reconstruction import reduction_curves
@@ -172,6 +174,11 @@ def evaluate(
             require_known_run(simulator, run, checkpoint)
     costs = network_costs(checkpoint, simulator.card)
     training_log = read_log(checkpoint.parent / "tensorboard")
+    require_replaceable(
+        *(output / name for name in ("metrics.csv", "examples.csv", "metrics.json", "report.html")),
+        *(output / "figures").glob("*.png"),
+        *(output / "rollouts").glob("*.h5"),
+    )
     try:
         (output / "rollouts").mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -198,6 +205,7 @@ def evaluate(
                 seed=truth.seed,
                 checkpoint=checkpoint,
                 given_frames=history,
+                mesh=truth.mesh,
             )
             prediction = stack.enter_context(Run(target))
             errors = position_errors(truth, prediction, simulator.basis, history, grid)
@@ -284,26 +292,27 @@ def main(cfg: DictConfig) -> float:
         raise UserError(f"timing_repeats is {cfg.timing_repeats!r}; it must be a whole number, at least 3")
     if not isinstance(cfg.full_space, bool):
         raise UserError(f"full_space is {cfg.full_space!r}; it must be true or false")
-    checkpoint = Path(cfg.checkpoint)
+    checkpoint, output = Path(cfg.checkpoint), Path(cfg.output)
     if cfg.dataset.get("format") == "published":
         from sgns.evaluation.published_scores import evaluate_published
 
         simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
-        return evaluate_published(simulator, cfg.dataset, cfg.split, Path(cfg.output), checkpoint)
+        with only_here(output / "metrics.json"):
+            return evaluate_published(simulator, cfg.dataset, cfg.split, output, checkpoint)
     dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
     simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
-    output = Path(cfg.output)
-    evaluation = evaluate(
-        simulator,
-        dataset,
-        output,
-        split=cfg.split,
-        checkpoint=checkpoint,
-        new_rollouts=[Path(str(path)) for path in new_rollouts],
-        repeats=cfg.timing_repeats,
-        full_space=cfg.full_space,
-        made=provenance(simulator, checkpoint),
-    )
-    report = write_report(evaluation, output)
+    with only_here(output / "metrics.json"):
+        evaluation = evaluate(
+            simulator,
+            dataset,
+            output,
+            split=cfg.split,
+            checkpoint=checkpoint,
+            new_rollouts=[Path(str(path)) for path in new_rollouts],
+            repeats=cfg.timing_repeats,
+            full_space=cfg.full_space,
+            made=provenance(simulator, checkpoint),
+        )
+        report = write_report(evaluation, output)
     log_summary(evaluation, Path(os.path.relpath(report)))
     return evaluation.total.skill("frozen")

@@ -19,6 +19,7 @@ from sgns.evaluation.metrics import PositionErrors
 from sgns.evaluation.provenance import provenance
 from sgns.evaluation.scores import Scores, aggregate, run_scores
 from sgns.evaluation.tables import write_csv, write_json
+from sgns.leftovers import require_replaceable
 from sgns.poses import in_body_frame
 from sgns.published_dataset import PARTICLES, fingerprint, published_runs
 from sgns.reduction.reduced import ReducedRun
@@ -70,6 +71,7 @@ def evaluate_published(
             )
         log.warning("%s was trained on all of these runs: errors on new runs will be larger", checkpoint)
         runs = everything
+    require_replaceable(output / "metrics.csv", output / "metrics.json")
     mean_force = simulator.mean_force
     with single_thread():
         scores = [scored(simulator, run, mean_force) for run in runs]

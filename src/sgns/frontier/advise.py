@@ -229,10 +229,11 @@ def positive(key: str, value: Any) -> float:
 
 def shipped(study: str, scene: str) -> dict[str, Any]:
     """Settings of a scene of a study that ships with the package; empty for others."""
-    for file in files("sgns.conf").joinpath("study").iterdir():  # a table may name anything
-        if file.name == f"{study}.yaml":
-            return yaml.safe_load(file.read_text(encoding="utf-8"))["scenes"].get(scene, {})
-    return {}
+    # Looked up among the names that there are: a table may say anything, and must not name a file to be read.
+    found = (file for file in files("sgns.conf").joinpath("study").iterdir() if file.name == f"{study}.yaml")
+    if (file := next(found, None)) is None:
+        return {}
+    return yaml.safe_load(file.read_text(encoding="utf-8"))["scenes"].get(scene, {})
 
 
 def bands(study: str, scene: str) -> dict[str, float]:

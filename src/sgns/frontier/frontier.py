@@ -8,10 +8,12 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from sgns.claim import claimed_in_turn
 from sgns.errors import UserError
 from sgns.frontier.gather import gathered
-from sgns.frontier.page import write_study
+from sgns.frontier.page import PAGE, write_study
 from sgns.frontier.study import AXES, Study
+from sgns.leftovers import require_replaceable
 
 __all__ = ["main"]
 
@@ -29,8 +31,16 @@ def main(cfg: DictConfig) -> None:
     """The command."""
     study = Study.from_settings(OmegaConf.to_container(cfg.study, resolve=True), Path(cfg.output))
     axes = axes_of(cfg.axis)
+    folder = study.folder
+    measured = (*(folder / "points").glob("*.json"), *(folder / "observations").glob("*.npz"))
+    require_replaceable(
+        *(folder / name for name in ("study.yaml", "points.csv", PAGE)),
+        *(folder / "figures").glob("*.png"),
+        *(file for file in measured if not file.is_file()),  # those that are there are read only
+    )
     if axes:
-        study.record()
+        with claimed_in_turn(folder / "study.yaml"):  # what it says is read and added to
+            study.record()
     for axis in axes:
         module, function = MEASURES[axis]
         getattr(importlib.import_module(module), function)(study)
@@ -38,7 +48,8 @@ def main(cfg: DictConfig) -> None:
         # Another process is still at it; what was measured here is kept.
         log.info("no reference is there yet, so nothing can be judged; later: sgns frontier axis=none")
         return
-    page = write_study(study, gathered(study))
+    with claimed_in_turn(folder / PAGE):  # of several that gather at once the last sees all points
+        page = write_study(study, gathered(study))
     log.info("%s and the table and figures beside it", page)
 
 

@@ -22,7 +22,9 @@ from sgns.frontier.point import Point, write_points
 from sgns.frontier.study import Study, StudyScene
 from sgns.wholefile import whole_file, write_whole
 
-__all__ = ["write_study"]
+__all__ = ["PAGE", "write_study"]
+
+PAGE = "frontier.html"
 
 WIDE = """
 .wide figure { min-width: 56rem; }
@@ -70,7 +72,7 @@ def write_study(study: Study, points: Sequence[Point]) -> Path:
                 temporary.write_bytes(figure.png)
         parts.append((scene.name, f"Scene: {scene.name}", scene_content(scene, chosen, figures)))
     parts.append(("made", "How this was made", made(study, points)))
-    page = study.folder / "frontier.html"
+    page = study.folder / PAGE
     write_whole(page, rendered(study, parts))
     return page
 

@@ -23,6 +23,7 @@ from sgns.learning.kinds import dynamics_of
 from sgns.learning.stepping import Dynamics
 from sgns.learning.training_range import TrainingRange
 from sgns.reduction.basis import Basis
+from sgns.runs.runlayout import require_mesh_was_read
 from sgns.wholefile import whole_file
 
 __all__ = ["Surrogate", "load_surrogate", "read_checkpoint", "write_checkpoint"]
@@ -282,6 +283,7 @@ def _require_described(state: dict[str, Any], card: dict[str, Any]) -> None:
     model, scene = card["model"], card["scene"]
     if not isinstance(scene, dict) or not isinstance(scene.get("bed", {}), dict):
         raise ValueError("its card does not say what the scene is")
+    require_mesh_was_read(scene)
     if model.get("kind", "network") == "polynomial":
         inputs, terms = len(card["used"]), state["dynamics.weights"].shape[0]
         groups = len(state["dynamics.inputs.mean"]) // (3 * int(card["num_modes"]))

@@ -27,6 +27,7 @@ from lightning.pytorch.plugins import TorchCheckpointIO
 from omegaconf import OmegaConf
 
 import sgns
+from sgns.claim import only_here
 from sgns.clock import elapsed
 from sgns.errors import UserError
 from sgns.learning.context import varying_context
@@ -45,6 +46,7 @@ from sgns.learning.trainee import SurrogateTraining, TrainingSettings
 from sgns.learning.training_range import TrainingRange
 from sgns.learning.travel import slowest_travel
 from sgns.learning.validation import ValidationRollouts
+from sgns.leftovers import require_replaceable
 from sgns.poses import in_body_frame
 from sgns.reduction.reduced import ReducedDataset, ReducedRun, reduce_dataset
 from sgns.settings import differences, flattened
@@ -72,6 +74,9 @@ def main(cfg: DictConfig) -> float:
     _, settings = checked_settings(plain["model"], plain["training"])
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)  # for the reduction, too
+    output = Path(cfg.output)
+    with only_here(output / "best.ckpt"):
+        pass  # who cannot have it shall not wait for the reduction to hear so
     if cfg.dataset.get("format") == "published":
         reduced = published_dataset(plain["dataset"], cfg.reduction.num_modes)
     else:
@@ -82,7 +87,7 @@ def main(cfg: DictConfig) -> float:
         num_modes=reduced.num_modes,
         model=plain["model"],
         training=plain["training"],
-        output=Path(cfg.output),
+        output=output,
         seed=cfg.seed,
         device=cfg.device,
         start_from=cfg.checkpoint,
@@ -120,7 +125,7 @@ def train(
         Skill of the best checkpoint's rollouts on the validation runs.
 
     Raises:
-        UserError: Bad settings, a loss that is not finite, or an `output` of another training.
+        UserError: Bad settings, a loss that is not finite, or an `output` of another training, there or under way.
     """
     model_settings, settings = checked_settings(model, training)
     if settings.threads is not None:
@@ -141,74 +146,80 @@ def train(
         "scene": reduced.runs("train")[0].scene,
         "package_version": sgns.__version__,
     }
-    resumed = what_is_there(output, card["settings"], settings.resume)
-    if resumed == "complete":
-        summary = read_summary(output)
-        log.info("%s is complete: validation skill %.3f", output, summary["skill"])
-        return float(summary["skill"])
+    with only_here(output / "best.ckpt"):
+        resumed = what_is_there(output, card["settings"], settings.resume)
+        if resumed == "complete":
+            summary = read_summary(output)
+            log.info("%s is complete: validation skill %.3f", output, summary["skill"])
+            return float(summary["skill"])
 
-    torch.manual_seed(seed)
-    logger = TensorBoardLogger(output, name="", version="tensorboard", default_hp_metric=False)
-    if isinstance(settings, FitSettings):
-        check_start(start_from, device)
-        runs = reduced.runs("train")
-        began = time.perf_counter()
-        fitted = fit_polynomial(
-            runs, validation_runs, num_modes, model_settings, settings, moves_freely(runs), seed
-        )
-        seconds = elapsed(began, time.perf_counter())
-        surrogate, score, about = surrogate_of(fitted.dynamics, reduced, card), fitted.score, fitted.about()
-        make_folder(output)
-        surrogate.save(output / "best.ckpt")
-    else:
-        surrogate, data = prepared(reduced, num_modes, model_settings, settings, seed, card, start_from)
-        rollouts = ValidationRollouts(
-            validation_runs,
-            num_modes,
-            model_settings.history,
-            model_settings.body_nodes,
-            surrogate.dynamics.context_keys,
-        )
-        callbacks = [RolloutValidation(rollouts, output, settings), StepProgress(settings.max_steps)]
-        module = SurrogateTraining(surrogate, settings)
-        with quiet_lightning():
-            trainer = make_trainer(output, settings, device, callbacks, logger)
+        torch.manual_seed(seed)
+        logger = TensorBoardLogger(output, name="", version="tensorboard", default_hp_metric=False)
+        if isinstance(settings, FitSettings):
+            check_start(start_from, device)
+            runs = reduced.runs("train")
             began = time.perf_counter()
-            last = output / "last.ckpt" if resumed else None
-            if last is not None:
-                require_resumable(last, trainer, module, settings)
-            try:
-                fit(trainer, module, data, last)
-            except UserError as error:
-                if not (output / "best.ckpt").exists():
-                    raise
-                raise UserError(
-                    f"{error}; the best checkpoint of before is kept, to go on from into another output: "
-                    f"checkpoint={output / 'best.ckpt'}"
-                ) from error
+            fitted = fit_polynomial(
+                runs, validation_runs, num_modes, model_settings, settings, moves_freely(runs), seed
+            )
             seconds = elapsed(began, time.perf_counter())
-        score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
-        about = {"steps": settings.max_steps}
+            surrogate = surrogate_of(fitted.dynamics, reduced, card)
+            score, about = fitted.score, fitted.about()
+            make_folder(output)
+            surrogate.save(output / "best.ckpt")
+        else:
+            surrogate, data = prepared(reduced, num_modes, model_settings, settings, seed, card, start_from)
+            rollouts = ValidationRollouts(
+                validation_runs,
+                num_modes,
+                model_settings.history,
+                model_settings.body_nodes,
+                surrogate.dynamics.context_keys,
+            )
+            callbacks = [RolloutValidation(rollouts, output, settings), StepProgress(settings.max_steps)]
+            module = SurrogateTraining(surrogate, settings)
+            with quiet_lightning():
+                trainer = make_trainer(output, settings, device, callbacks, logger)
+                began = time.perf_counter()
+                last = output / "last.ckpt" if resumed else None
+                if last is not None:
+                    require_resumable(last, trainer, module, settings)
+                try:
+                    fit(trainer, module, data, last)
+                except UserError as error:
+                    if not (output / "best.ckpt").exists():
+                        raise
+                    raise UserError(
+                        f"{error}; the best checkpoint of before is kept, to go on from into another output: "
+                        f"checkpoint={output / 'best.ckpt'}"
+                    ) from error
+                seconds = elapsed(began, time.perf_counter())
+            score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
+            about = {"steps": settings.max_steps}
 
-    metrics = {"skill": score.skill, "skill_at_rest": score.skill_at_rest, "force_nrmse": score.force_nrmse}
-    if surrogate.dynamics.predicts_body:
-        metrics["body_rmse"] = score.body_rmse
-    logger.log_hyperparams(
-        hyperparameters(card["settings"]), {f"final/{key}": value for key, value in metrics.items()}
-    )
-    logger.finalize("success")
-    summary = {**about, **metrics, "seconds": round(seconds, 1)}
-    write_whole(output / SUMMARY, json.dumps(summary, indent=2) + "\n")
-    log.info(
-        "trained in %.0f s; %d validation runs: skill %.3f (from rest %.3f), force NRMSE %.3f; %s",
-        seconds,
-        len(validation_runs),
-        score.skill,
-        score.skill_at_rest,
-        score.force_nrmse,
-        output / "best.ckpt",
-    )
-    return score.skill
+        metrics = {
+            "skill": score.skill,
+            "skill_at_rest": score.skill_at_rest,
+            "force_nrmse": score.force_nrmse,
+        }
+        if surrogate.dynamics.predicts_body:
+            metrics["body_rmse"] = score.body_rmse
+        logger.log_hyperparams(
+            hyperparameters(card["settings"]), {f"final/{key}": value for key, value in metrics.items()}
+        )
+        logger.finalize("success")
+        summary = {**about, **metrics, "seconds": round(seconds, 1)}
+        write_whole(output / SUMMARY, json.dumps(summary, indent=2) + "\n")
+        log.info(
+            "trained in %.0f s; %d validation runs: skill %.3f (from rest %.3f), force NRMSE %.3f; %s",
+            seconds,
+            len(validation_runs),
+            score.skill,
+            score.skill_at_rest,
+            score.force_nrmse,
+            output / "best.ckpt",
+        )
+        return score.skill
 
 
 def hyperparameters(settings: Mapping[str, Any]) -> dict[str, bool | int | float | str]:
@@ -308,10 +319,12 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
     Raises:
         UserError: A training with other settings is there.
     """
-    names = ("best.ckpt", "last.ckpt", SUMMARY)
+    files = [output / name for name in ("best.ckpt", "last.ckpt", SUMMARY)]
+    # A link to a result that is there may be read; whoever writes finds out before the first step.
+    require_replaceable(*(file for file in files if resume is False or not file.is_file()))
     if resume is False:
-        for name in names:
-            (output / name).unlink(missing_ok=True)
+        for file in files:
+            file.unlink(missing_ok=True)
         shutil.rmtree(output / "tensorboard", ignore_errors=True)
         return ""
     found = [output / name for name in ("last.ckpt", "best.ckpt") if (output / name).exists()]
@@ -321,14 +334,15 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
     if isinstance(there.get("training"), dict) and not there["training"].get("slower"):
         there["training"].pop("slower", None)  # a key of before that did nothing at 0
     if different := differences(there, asked):
-        key, (old, new) = next(iter(different.items()))
-        more = f" (and {len(different) - 1} more)" if len(different) > 1 else ""
+        named = [f"{key} is {old!r} there and {new!r} here" for key, (old, new) in different.items()]
+        more = f" and {len(named) - 4} more" if len(named) > 4 else ""
         raise UserError(
-            f"{output} holds a training with other settings: {key} is {old!r} there and {new!r} here{more}; "
-            "use another output, or training.resume=false to overwrite it"
+            f"{output} holds a training with other settings: {', '.join(named[:4])}{more}; use another output, remove "
+            "it, or training.resume=false to overwrite it"
         )
     if (output / "best.ckpt").exists() and (output / SUMMARY).exists():
         return "complete"
+    require_replaceable(*files)
     return "partial" if (output / "last.ckpt").exists() else ""
 
 

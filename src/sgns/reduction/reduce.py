@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sgns.claim import only_here
 from sgns.reduction.reconstruction import ReductionCurves, reduction_curves
 from sgns.reduction.reduced import reduce_dataset
 from sgns.wholefile import whole_file
@@ -25,12 +26,13 @@ def main(cfg: DictConfig) -> float:
     from sgns.campaign import Dataset
 
     dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
-    reduced = reduce_dataset(dataset, cfg.reduction, device=cfg.device)
-    basis, used = reduced.basis, reduced.num_modes
-    validation = dataset.runs("validation")
-    curves = reduction_curves(basis, validation)
     table = Path(cfg.output) / "energy.csv"
-    write_energy_table(curves, table)
+    with only_here(table):
+        reduced = reduce_dataset(dataset, cfg.reduction, device=cfg.device)
+        basis, used = reduced.basis, reduced.num_modes
+        validation = dataset.runs("validation")
+        curves = reduction_curves(basis, validation)
+        write_energy_table(curves, table)
     log.info("%s", "\n".join(energy_lines(curves, used)))
     log.info("errors on %d training and %d validation runs", len(basis.fitted_on or []), len(validation))
     log.info("every number of modes: %s; basis and reduced runs: %s", table, reduced.folder)

@@ -28,6 +28,7 @@ from tqdm import tqdm
 from sgns.campaign import SPLITS, Dataset
 from sgns.errors import UserError
 from sgns.hdf5 import BROKEN, open_hdf5, own_attribute, own_dataset
+from sgns.leftovers import require_replaceable
 from sgns.reduction.basis import CENTRINGS, Basis
 from sgns.reduction.choice import MEASURES, choose_modes
 from sgns.reduction.fitting import fit_runs, require_positions
@@ -141,6 +142,8 @@ def reduce_dataset(
     bar = {"disable": not (progress and sys.stderr.isatty()), "unit": "run", "leave": False}
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        cached = [folder / "basis.h5", *(folder / f"{one}.h5" for one in content.values())]
+        require_replaceable(*(file for file in cached if not file.is_file()))
         basis = fitted_basis(folder / "basis.h5", paths["train"], settings, bar, device)
         projector = basis.to(device)
         num_modes = modes_to_use(projector, settings, paths["validation"])

@@ -17,7 +17,7 @@ from typing import TypeVar
 import h5py
 
 from sgns.errors import UserError
-from sgns.leftovers import hidden_beside, hold, remove_leftovers
+from sgns.leftovers import give_name, hidden_beside, hold, remove_leftovers, require_replaceable
 
 __all__ = ["NewFile", "new_hdf5"]
 
@@ -34,12 +34,11 @@ class NewFile:
         path: where the file goes; missing folders are made.
 
     Raises:
-        UserError: the folder cannot be made or written.
+        UserError: the folder cannot be made or written, or `path` is a device, pipe, link or folder.
     """
 
     def __init__(self, path: Path) -> None:
-        if os.path.isdir(path):  # unlike Path.is_dir, takes any name
-            raise UserError(f"{path} is a folder; give the name of a file, such as {path / 'run.h5'}")
+        require_replaceable(path)
         self.path = path
         self._error: BaseException | None = None
         self._temp = hidden_beside(path)
@@ -71,7 +70,7 @@ class NewFile:
             self.check()
             os.fsync(self._file.fileno())
             self._file.close()
-            os.replace(self._temp, path or self.path)
+            give_name(self._temp, path or self.path)
             # Again: when this file was begun, a process just killed may still have been seen.
             with contextlib.suppress(OSError):
                 remove_leftovers(self.path)

@@ -19,6 +19,8 @@ from sgns.runs.runlayout import (
     one_line,
     open_run,
     read_attributes,
+    read_mesh,
+    require_mesh_was_read,
     scene_problems,
     structure_problems,
 )
@@ -52,7 +54,7 @@ def check_run(path: str | os.PathLike[str]) -> list[str]:
             return [f"the file is damaged ({one_line(error)})"]
         checks = [_check_h5md, _check_attributes]
         if not problems:  # the rest relies on complete datasets of the right shapes
-            checks += [_check_stopped, _check_times, _check_body, _check_view, _check_frames]
+            checks += [_check_stopped, _check_times, _check_body, _check_mesh, _check_view, _check_frames]
         for check in checks:
             try:
                 problems += check(file)
@@ -95,6 +97,10 @@ def _check_attributes(file: h5py.File) -> list[str]:
             problems.append(f"root attribute {name!r} is not a group of keys")
         elif name == "scene":
             problems += scene_problems(data)
+            try:
+                require_mesh_was_read(data)
+            except ValueError as error:
+                problems.append(f"root attribute 'scene': {one_line(error)}")
         elif name == "effects":
             problems += [
                 f"effect {key!r} does not say whether it is on and why"
@@ -172,6 +178,26 @@ def _check_body(file: h5py.File) -> list[str]:
             f"(allowed {RIGID_TOLERANCE:g} m)"
         )
     return problems
+
+
+def _check_mesh(file: h5py.File) -> list[str]:
+    """That the tool's mesh is one, and that the body points are vertices of it."""
+    try:
+        mesh = read_mesh(file)
+    except BROKEN as error:
+        return [f"the tool's mesh is damaged ({one_line(error)})"]
+    if mesh is None:
+        return []
+    pose, points = (file[f"{ELEMENTS[name].path}/value"][0].astype(float) for name in ("pose", "body_points"))
+    nodes = (points - pose[:3]) @ rotation_matrices(pose[None, 3:])[0]
+    for number, node in enumerate(nodes):
+        away = float(np.linalg.norm(mesh[0] - node, axis=1).min())
+        if not away <= RIGID_TOLERANCE:
+            return [
+                f"body point {number} is {away:.3g} m from the nearest vertex of the tool's mesh (allowed "
+                f"{RIGID_TOLERANCE:g} m): the mesh is of another tool"
+            ]
+    return []
 
 
 def _check_view(file: h5py.File) -> list[str]:

@@ -16,7 +16,15 @@ import numpy as np
 
 from sgns.errors import UserError
 from sgns.hdf5 import BROKEN
-from sgns.runs.runlayout import ELEMENTS, one_line, open_run, read_attributes, structure_problems
+from sgns.runs.runlayout import (
+    ELEMENTS,
+    one_line,
+    open_run,
+    read_attributes,
+    read_mesh,
+    require_mesh_was_read,
+    structure_problems,
+)
 from sgns.yaml_text import parse_yaml
 
 __all__ = ["Run"]
@@ -62,8 +70,21 @@ class Run:
 
     @property
     def scene(self) -> dict[str, Any]:
-        """The complete scene as plain nested data."""
+        """The complete scene as plain nested data; a tool that is a mesh is in `mesh`."""
         return self._yaml("scene")
+
+    @property
+    def mesh(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Of a tool that is a mesh: vertices (V, 3) about its centre of mass [m], float64, and triangles (F, 3), both
+        read-only; None for other tools, and in runs from before it was kept."""
+        if "mesh" not in self._cache:
+            try:
+                self._cache["mesh"] = read_mesh(self._file)
+            except BROKEN as error:
+                raise self._damaged("the tool's mesh", error) from error
+            for array in self._cache["mesh"] or ():
+                array.flags.writeable = False
+        return self._cache["mesh"]
 
     @property
     def effects(self) -> dict[str, dict[str, Any]]:
@@ -206,6 +227,11 @@ class Run:
                 raise self._damaged(name, error) from error
             if not isinstance(data, dict):
                 raise self._damaged(name, "it is not a group of keys")
+            if name == "scene":
+                try:
+                    require_mesh_was_read(data)
+                except ValueError as error:
+                    raise self._damaged(name, error) from error
             self._cache[name] = data
         return copy.deepcopy(self._cache[name])
 

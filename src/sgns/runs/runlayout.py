@@ -17,20 +17,26 @@ from typing import Any
 import h5py
 import numpy as np
 
+from mpm_warp import SceneError
+from mpm_warp.inputs import MOST_BYTES
+from mpm_warp.mesh_file import checked_mesh
 from sgns.errors import UserError
-from sgns.hdf5 import BROKEN, own_attribute, own_dataset
+from sgns.hdf5 import BROKEN, own_attribute, own_dataset, own_object
 
 __all__ = [
     "ATTRIBUTES",
     "ELEMENTS",
     "FORMAT",
     "FORMAT_VERSION",
+    "MESH",
     "PRODUCERS",
     "Element",
     "one_line",
     "open_run",
     "package_version",
     "read_attributes",
+    "read_mesh",
+    "require_mesh_was_read",
     "scene_problems",
     "structure_problems",
     "write_text",
@@ -75,6 +81,8 @@ _SCENE_NUMBERS = (
     "gravity",
 )
 _SCENE_GROUPS = {"blade": ("thickness", "width", "length")}
+MESH = {"vertices": ("parameters/tool/vertices", "<f8"), "triangles": ("parameters/tool/triangles", "<i4")}
+"""Path and type of the datasets that a run has whose tool is a mesh, shape (V, 3) [m] and (F, 3)."""
 
 
 @dataclass(frozen=True)
@@ -220,6 +228,57 @@ def structure_problems(file: h5py.File) -> list[str]:
     counts: dict[str, int] = {}
     for element in ELEMENTS.values():
         problems += _element_problems(file, element, counts)
+    return problems + _mesh_problems(file)
+
+
+def read_mesh(file: h5py.File) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices (V, 3) about the centre of mass [m] and triangles (F, 3) of a run whose tool is a mesh, checked; None if
+    there is none.
+
+    Raises:
+        One of sgns.hdf5.BROKEN: It is damaged.
+    """
+    if own_object(file, MESH["vertices"][0]) is None:
+        return None
+    try:
+        return checked_mesh(*(own_dataset(file, path)[...] for path, _ in MESH.values()))
+    except SceneError as error:
+        raise ValueError(str(error)) from error
+
+
+def require_mesh_was_read(scene: object) -> None:
+    """Refuses a scene out of a file whose tool is a mesh without a digest: such a scene is a person's wish to read the
+    file it names, and no file may have wishes.
+
+    Raises:
+        ValueError: It is one.
+    """
+    tool = scene.get("tool") if isinstance(scene, dict) else None
+    if isinstance(tool, dict) and tool.get("shape") == "mesh":
+        if not isinstance(tool.get("digest"), str) or not tool["digest"]:
+            raise ValueError("its scene names a mesh file without the digest of what was read from it")
+
+
+def _mesh_problems(file: h5py.File) -> list[str]:
+    found = {}
+    problems = []
+    for name, (path, dtype) in MESH.items():
+        try:
+            if own_object(file, path) is not None:
+                found[name] = own_dataset(file, path)
+        except (KeyError, ValueError) as error:
+            problems.append(one_line(error).strip("'"))
+            continue
+        if name in found and (found[name].ndim != 2 or found[name].shape[1] != 3 or not len(found[name])):
+            problems.append(f"dataset /{path} has shape {found[name].shape}, expected (at least 1, 3)")
+        elif name in found and found[name].dtype != np.dtype(dtype):
+            problems.append(f"dataset /{path} has the wrong type {found[name].dtype}")
+        elif name in found and found[name].size * found[name].dtype.itemsize > MOST_BYTES:
+            problems.append(f"dataset /{path} is larger than {MOST_BYTES / 1e6:.0f} MB")
+    if not problems and len(found) == 1:
+        (there,) = found
+        missing = next(path for name, (path, _) in MESH.items() if name != there)
+        problems.append(f"dataset /{missing} is missing")
     return problems
 
 

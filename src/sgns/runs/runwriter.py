@@ -20,8 +20,16 @@ import yaml
 from mpm_warp import State
 from sgns.errors import UserError
 from sgns.runs.newfile import NewFile
-from sgns.runs.runlayout import ELEMENTS, FORMAT, FORMAT_VERSION, PRODUCERS, package_version, write_text
-from sgns.runs.stopped import stopped_path, write_state
+from sgns.runs.runlayout import (
+    ELEMENTS,
+    FORMAT,
+    FORMAT_VERSION,
+    MESH,
+    PRODUCERS,
+    package_version,
+    write_text,
+)
+from sgns.runs.stopped import remove_stopped, require_run_place, stopped_path, write_state
 from sgns.runs.vtkhdf import write_view
 
 __all__ = ["ContentHash", "RunWriter"]
@@ -66,9 +74,11 @@ class RunWriter:
         seed: of the run.
         producer: "mpm" or "rollout".
         extra: more provenance as plain nested data; "author" also becomes H5MD's author name.
+        mesh: of a tool that is one: vertices (V, 3) about its centre of mass [m] and triangles (F, 3).
 
     Raises:
-        UserError: the folder cannot be written, the disk is full, or a frame is not finite.
+        UserError: the folder cannot be written, the disk is full, something else than a run of before would be
+            destroyed, or a frame is not finite.
         ValueError: an argument or frame has the wrong shape or value.
     """
 
@@ -85,6 +95,7 @@ class RunWriter:
         seed: int,
         producer: str,
         extra: dict[str, Any] | None = None,
+        mesh: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
         if producer not in PRODUCERS:
             raise ValueError(f"producer is {producer!r}; allowed: {', '.join(PRODUCERS)}")
@@ -111,10 +122,13 @@ class RunWriter:
             "effects": _yaml_text(effects),
             "extra": _yaml_text(extra),
         }
+        require_run_place(self.path)
         self._disk = NewFile(self.path)
         self._file: h5py.File | None = None
         try:
             self._create(attributes, str(extra.get("author", "unknown")))
+            if mesh is not None:
+                _write_mesh(self._file, *mesh)
             self._disk.check()
         except BaseException:
             self._discard()
@@ -199,7 +213,7 @@ class RunWriter:
         if self.frame_count == 0:
             raise ValueError("no frame was appended")
         self._complete(wall_time_s, self.path)
-        stopped_path(self.path).unlink(missing_ok=True)  # of an earlier attempt
+        remove_stopped(self.path)
 
     def stop(self, wall_time_s: float, reason: str, state: State | None = None) -> Path:
         """Complete the file with the frames so far, as a stopped run beside the one it was to be (stopped.py).
@@ -302,6 +316,15 @@ class RunWriter:
 def _describe(dataset: h5py.Dataset, name: str) -> None:
     write_text(dataset, "si_unit", ELEMENTS[name].si_unit)
     write_text(dataset, "description", ELEMENTS[name].description)
+
+
+def _write_mesh(file: h5py.File, vertices: np.ndarray, triangles: np.ndarray) -> None:
+    """Checksummed: no content hash guards it."""
+    for values, (path, dtype) in zip((vertices, triangles), MESH.values(), strict=True):
+        file.create_dataset(path, data=np.asarray(values, dtype=dtype), chunks=True, fletcher32=True)
+    write_text(file[MESH["vertices"][0]], "si_unit", "m")
+    write_text(file[MESH["vertices"][0]], "description", "of the tool, about its centre of mass, body frame")
+    write_text(file[MESH["triangles"][0]], "description", "vertices of each triangle, facing outwards")
 
 
 def _write_h5md(file: h5py.File, author: str) -> None:

@@ -41,5 +41,11 @@ def test_corners_of_a_blade_are_those_of_its_box(tmp_path):
 
 def test_other_bodies_are_their_recorded_points():
     points = np.random.default_rng(0).normal(size=(2, 8, 3))
-    run = SimpleNamespace(scene={"kind": "body"}, body_points=points, pose=REST)
+    run = SimpleNamespace(scene={"kind": "body"}, body_points=points, pose=REST, mesh=None)
     assert np.array_equal(body_corners(run, 1), points[1])
+
+
+def test_corners_of_a_mesh_are_its_vertices():
+    vertices = np.random.default_rng(0).normal(size=(20, 3))
+    run = SimpleNamespace(scene={"kind": "body"}, pose=REST, mesh=(vertices, None))
+    assert body_corners(run, 0) == pytest.approx(vertices + REST[0, :3])

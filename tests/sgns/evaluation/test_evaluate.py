@@ -227,3 +227,15 @@ def test_summary_names_the_baselines(dataset, basis, tmp_path, caplog):
         evaluate_module.log_summary(result, tmp_path / "report.html")
     text = caplog.text
     assert "frozen" in text and "mean force of the training split" in text and "report.html" in text
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+@pytest.mark.parametrize("name", ["metrics.csv", "report.html", "figures/side.png", "rollouts/a.h5"])
+def test_nothing_but_plain_files_is_replaced(dataset, basis, tmp_path, monkeypatch, name):
+    place = tmp_path / name
+    place.parent.mkdir(exist_ok=True)
+    os.mkfifo(place)
+    monkeypatch.setattr(evaluate_module, "write_rollout", None)  # it is found before
+    with pytest.raises(UserError, match=f"{place.name}: it is a pipe"):
+        evaluate(simulator(dataset, basis), dataset, tmp_path)
+    assert place.is_fifo()

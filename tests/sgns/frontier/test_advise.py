@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns.errors import UserError
-from sgns.frontier.advise import advice, main, shipped, table, wished
+from sgns.frontier.advise import advice, bands, main, shipped, table, wished
 from sgns.frontier.point import Point, read_points, write_points
 
 POINTS = [
@@ -139,3 +139,9 @@ def test_the_table_that_ships_answers() -> None:
 @pytest.mark.parametrize("study", ["../train", "x" * 300, "a/b", "$"])
 def test_tables_of_studies_that_do_not_ship(study: str) -> None:
     assert shipped(study, "cut") == {}
+
+
+def test_a_table_names_no_file_to_be_read(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("scenes: {cut: {bands: {force_nrmse: 0.5}}}")
+    assert bands("full", "cut")
+    assert bands(str(tmp_path / "mine"), "cut") == {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -296,3 +297,37 @@ def test_weights_that_are_not_finite_are_not_saved(data, tmp_path, monkeypatch) 
 def test_a_resumed_training_knows_its_first_loss(data, tmp_path) -> None:
     run(data, tmp_path)
     assert torch.load(tmp_path / "last.ckpt", weights_only=True)["first_loss"] > 0
+
+
+def test_all_settings_that_differ_are_named(data, tmp_path) -> None:
+    run(data, tmp_path, max_steps=1, validate_every=1)
+    with pytest.raises(UserError) as caught:
+        run(data, tmp_path, max_steps=2, batch_size=4, noise=0.3)
+    for words in ("max_steps is 1 there and 2 here", "batch_size is 8 there", "noise is 0.1 there"):
+        assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_one_training_at_a_time_in_a_folder(data, tmp_path, monkeypatch) -> None:
+    """The second one's settings do not matter: neither result would be whole."""
+    before = module.fit
+
+    def fit(*args) -> None:
+        with pytest.raises(UserError, match=r"best\.ckpt is being made by process"):
+            run(data, tmp_path, learning_rate=2e-3)
+        before(*args)
+
+    monkeypatch.setattr(module, "fit", fit)
+    run(data, tmp_path, max_steps=1, validate_every=1)
+    names = sorted(p.name for p in tmp_path.iterdir())
+    assert names == ["best.ckpt", "last.ckpt", "tensorboard", "training.json"]
+
+
+@pytest.mark.parametrize("resume", ["auto", False])
+@pytest.mark.parametrize("name", ["best.ckpt", "last.ckpt", "training.json"])
+def test_a_pipe_stays_a_pipe(data, tmp_path, monkeypatch, name, resume) -> None:
+    os.mkfifo(tmp_path / name)
+    monkeypatch.setattr(module, "fit", None)  # it is found before
+    with pytest.raises(UserError, match=f"{name}: it is a pipe"):
+        run(data, tmp_path, resume=resume)
+    assert (tmp_path / name).is_fifo()

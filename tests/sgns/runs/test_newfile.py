@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from synthetic import make_run, make_writer
+from synthetic import make_run, make_writer, random_frame
 
 from sgns.errors import UserError
 
@@ -70,3 +70,27 @@ def test_leftovers_of_killed_processes_go_and_those_of_living_ones_stay(tmp_path
             leftover.write_bytes(b"x")
         make_run(tmp_path / "a.h5", frames=2, n=3)
         assert {p.name for p in tmp_path.iterdir()} == {"a.h5", alive.name, elsewhere.name}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_a_run_replaces_runs_only(tmp_path):
+    """Neither a pipe under its own name, nor what is no stopped run under the name of one."""
+    os.mkfifo(tmp_path / "a.h5")
+    os.mkfifo(tmp_path / "b.stopped.h5")
+    (tmp_path / "c.stopped.h5").write_text("mine")
+    make_run(tmp_path / "d.stopped.h5", frames=2, n=3)
+    for name, words in (("a", "a pipe"), ("b", "a pipe"), ("c", "no stopped run"), ("d", "no stopped run")):
+        with pytest.raises(UserError, match=words):
+            make_writer(tmp_path / f"{name}.h5")
+    with make_writer(tmp_path / "e.h5") as writer:
+        writer.append(**random_frame(0))
+        os.mkfifo(tmp_path / "e.h5")
+        with pytest.raises(UserError, match=r"e\.h5: it is a pipe"):
+            writer.finish(1.0)
+    with make_writer(tmp_path / "f.h5") as writer:
+        writer.append(**random_frame(0))
+        (tmp_path / "f.stopped.h5").write_text("mine")
+        writer.finish(1.0)
+    assert (tmp_path / "f.stopped.h5").read_text() == "mine"
+    names = "a.h5 b.stopped.h5 c.stopped.h5 d.stopped.h5 e.h5 f.h5 f.stopped.h5".split()
+    assert sorted(path.name for path in tmp_path.iterdir()) == names

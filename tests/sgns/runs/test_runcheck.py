@@ -7,7 +7,7 @@ import re
 import h5py
 import numpy as np
 import pytest
-from synthetic import make_run
+from synthetic import make_run, make_writer, random_frame
 
 from sgns.errors import UserError
 from sgns.runs import Run, check_run
@@ -157,3 +157,63 @@ def test_random_damage_never_surprises(tmp_path, seed):
         except UserError as error:
             assert problems and "\n" not in str(error)
     assert noticed > 0
+
+
+CORNERS = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
+FACES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+BOX = CORNERS, np.array([[f[0], f[k], f[k + 1]] for f in FACES for k in (1, 2)])
+TOOL = {"tool": {"shape": "mesh", "file": "/etc/passwd", "digest": "0123"}}
+
+
+def mesh_run(path, mesh=BOX, scene=TOOL):
+    """A run of two frames whose tool is a box."""
+    with make_writer(path, n=3, m=2, scene=scene, mesh=mesh) as writer:
+        for i in range(2):
+            frame = random_frame(i, n=3, m=2)
+            writer.append(**frame | {"body_points": frame["body_pose"][:3] + CORNERS[[0, 5]]})
+        writer.finish(1.0)
+    return path
+
+
+def test_a_run_holds_the_mesh_of_its_tool(tmp_path):
+    path = mesh_run(tmp_path / "a.h5")
+    assert check_run(path) == []
+    with Run(path) as run, h5py.File(path) as file:
+        for found, kept in zip(run.mesh, BOX, strict=True):
+            np.testing.assert_array_equal(found, kept)
+        assert file["parameters/tool/vertices"].dtype == "<f8"
+        assert file["parameters/tool/triangles"].dtype == "<i4"
+    with Run(make_run(tmp_path / "b.h5")) as run:
+        assert run.mesh is None
+
+
+VERTICES, TRIANGLES = "parameters/tool/vertices", "parameters/tool/triangles"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (put(VERTICES, (0, 0), np.nan), "not finite"),
+        (put(VERTICES, (0, 0), 0.2), "centre of mass"),
+        (put(VERTICES, ..., 1.01 * CORNERS), "the mesh is of another tool"),
+        (put(TRIANGLES, (0, 0), 8), "vertex that is not there"),
+        (put(TRIANGLES, (0, 0), -1), "vertex that is not there"),
+        (put(TRIANGLES, ..., BOX[1][:, ::-1]), "faces inwards"),
+        (replace(TRIANGLES, BOX[1].astype("f8")), "wrong type float64"),
+        (replace(VERTICES, CORNERS.ravel()), "has shape (24,)"),
+        (replace(TRIANGLES, h5py.SoftLink("/particles")), "is a link to elsewhere"),
+        (replace(VERTICES, h5py.ExternalLink("other.h5", "/x")), "is a link to elsewhere"),
+        (lambda file: file.__delitem__(VERTICES), f"dataset /{VERTICES} is missing"),
+        (lambda file: file.__delitem__(TRIANGLES), f"dataset /{TRIANGLES} is missing"),
+        (attribute("scene", "tool: {shape: mesh, file: /etc/passwd}"), "without the digest"),
+    ],
+)
+def test_damage_to_a_mesh_is_found(tmp_path, change, words):
+    path = mesh_run(tmp_path / "a.h5")
+    with h5py.File(path, "r+") as file:
+        change(file)
+    (problem,) = check_run(path)
+    assert words in problem and "\n" not in problem
+    if "another tool" not in words:
+        with pytest.raises(UserError, match=re.escape(words)), Run(path) as run:
+            _ = run.scene, run.mesh
