@@ -260,10 +260,8 @@ Examples:
 
 
 def _split(arguments: list[str]) -> tuple[str, list[str]]:
-    """The command and what follows it; also as `--config-name <command>`, as Lightning's processes get it."""
+    """The command and what follows it."""
     command, *rest = arguments
-    if command == "--config-name" and rest:
-        command, *rest = rest
     if command not in COMMANDS:
         raise UserError(f"unknown command {command!r}; commands: {', '.join(COMMANDS)}; see sgns --help")
     return command, rest
