@@ -79,7 +79,7 @@ def require_own_objects(cfg: DictConfig, typed: Sequence[str]) -> None:
     parsed = OverridesParser.create().parse_overrides([text for text in typed if "hydra" in text])
     for group in ("launcher", "sweeper"):
         _check_plugin(cfg.hydra, group, parsed)
-    for key in ("env_set", "env_copy"):
+    for key in ("env_copy", "env_set"):
         if hydra["job"][key]:
             raise UserError(
                 f"hydra.job.{key} is {hydra['job'][key]!r}; settings cannot set environment variables; "
@@ -102,7 +102,8 @@ def _check_logging(settings: Any, where: Keys) -> None:
     for path, value in _leaves(settings, where):
         below = path[len(where) :]
         if not _is_plain_logging(below, value):
-            allowed = _NAMED.get(below[-1]) if below else None
+            known = len(below) == 3 and below[2] in _SECTIONS.get(below[0], ())
+            allowed = _NAMED.get(below[2]) if known else None
             hint = f"allowed: {', '.join(allowed)}; " if allowed else ""
             if "FileHandler" in str(value):
                 hint += "to keep the lines in a file: sgns ... > run.log; "
