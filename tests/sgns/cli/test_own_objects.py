@@ -18,7 +18,7 @@ from sgns.cli import main
 
 CALL = "{_target_: joblib.load, filename: hostile.pickle}"
 MADE = "${oc.create:'{_target_: joblib.load, filename: hostile.pickle}'}"
-HANDLER = "hydra: {job_logging: {handlers: {console: {%s}}}}"
+HANDLER = "hydra: {job_logging: {handlers: {x: {%s}}, root: {handlers: [x]}}}"
 
 FILES = {
     "callback": f"hydra: {{callbacks: {{x: {CALL}}}}}",
