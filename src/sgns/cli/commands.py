@@ -7,16 +7,17 @@ its traceback.
 
 from __future__ import annotations
 
+import argparse
 import errno
 import importlib
 import logging
 import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from sgns import __version__
+from sgns.cli.console import open_closed_streams, write_error, write_output
 from sgns.errors import UserError
 
 if TYPE_CHECKING:
@@ -98,38 +99,46 @@ class _Stopped(BaseException):
 
 def main() -> int:
     """Run the command named in `sys.argv`; returns the exit status."""
-    arguments = sys.argv[1:]
+    open_closed_streams()
+    status = _run(sys.argv[1:])
+    try:
+        write_output("")  # what is still in the stream's buffer
+    except UserError as error:
+        write_error(f"sgns: {error}")
+        status = status or 2
+    return status
+
+
+def _run(arguments: list[str]) -> int:
     name = "sgns"
     try:
         if not arguments or arguments[0] in ("--help", "-h", "help"):
-            sys.stdout.write(_help())
+            write_output(_help())
             return 0
         if arguments[0] == "--version":
-            sys.stdout.write(f"sgns {__version__}\n")
+            write_output(f"sgns {__version__}\n")
             return 0
         command, rest = _split(arguments)
         name = f"sgns {command}"
         if "--help" in rest or "-h" in rest:
             from sgns.cli.command_help import command_help
 
-            sys.stdout.write(command_help(command))
+            write_output(command_help(command))
             return 0
-        # In place, and not only for Hydra: Lightning starts its other processes with this list.
-        sys.argv[1:] = ["--config-name", command, *_hydra_arguments(command, rest)]
-        _run_hydra()
+        _run_hydra(command, _parsed(command, rest))
         return 0
     except _Stopped as stop:
-        sys.stderr.write(f"{name}: {stop.line}\n")
+        write_error(f"{name}: {stop.line}")
         return stop.status
     except KeyboardInterrupt:
-        sys.stderr.write(f"{name}: interrupted\n")
+        write_error(f"{name}: interrupted")
         return 130
     except Exception as error:
         line = _line_of(error)
         if line is None:
             raise
         _show_traceback()
-        sys.stderr.write(f"{name}: {line}\n")
+        write_error(f"{name}: {line}")
         return 2
 
 
@@ -142,7 +151,7 @@ def run_command(cfg: DictConfig) -> float | None:
     hydra_cfg = HydraConfig.get()
     name = hydra_cfg.job.config_name
     in_sweep = hydra_cfg.mode.name == "MULTIRUN"
-    label = f"job {hydra_cfg.job.num} ({hydra_cfg.job.override_dirname}): " if in_sweep else ""
+    label = f"job {hydra_cfg.job.num} ({_one_line(hydra_cfg.job.override_dirname)}): " if in_sweep else ""
     interrupted = False
     try:
         _place_output(cfg, hydra_cfg, COMMANDS[name], in_sweep)
@@ -169,39 +178,65 @@ def run_command(cfg: DictConfig) -> float | None:
     raise _Stopped(label + _interruption(cfg, name, kept), 130) from None
 
 
-def _run_hydra() -> None:
+def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
     logging.raiseExceptions = False  # a line that a full disk does not take is no reason for a traceback
     # With this variable Hydra passes errors on as they are, in place of its own block of text and status 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    import hydra
-    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+    from hydra import initialize_config_module
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.plugins import Plugins
+    from hydra.types import RunMode
 
-    from sgns.cli.own_objects import require_own_objects
+    from sgns.cli.settings_loader import CheckedLoader, ConfigDir
 
-    compose = ConfigLoaderImpl.load_configuration
+    if arguments.config_dir is not None and not os.path.isdir(arguments.config_dir):
+        raise UserError(f"--config-dir: folder '{arguments.config_dir}' not found")
+    Plugins.instance().register(ConfigDir)
+    ConfigDir.folder = None if arguments.config_dir is None else os.path.abspath(arguments.config_dir)
+    settings = arguments.settings
+    with initialize_config_module("sgns.conf", job_name="sgns", version_base="1.3"):
+        hydra = GlobalHydra.instance().hydra
+        assert hydra is not None
+        # Not `hydra.main`: it takes no loader, and has flags of its own that run what they find in a file.
+        hydra.config_loader = CheckedLoader(hydra.config_loader, settings)
+        if arguments.cfg is not None:
+            _show_settings(hydra, command, arguments)
+        elif arguments.info is not None:
+            hydra.show_info(arguments.info, config_name=command, overrides=settings)
+        else:
+            mode = hydra.get_mode(config_name=command, overrides=settings)
+            sweep = arguments.multirun or (mode == RunMode.MULTIRUN and not arguments.run)
+            run = hydra.multirun if sweep else hydra.run
+            mode = RunMode.MULTIRUN if sweep else RunMode.RUN
+            run(
+                config_name=command,
+                task_function=run_command,
+                overrides=[*settings, f"hydra.mode={mode.name}"],
+            )
 
-    def checked(self: ConfigLoaderImpl, *args: Any, **settings: Any) -> DictConfig:
-        try:
-            cfg = compose(self, *args, **settings)
-        except Exception as error:
-            if _line_of(error) is not None:
-                raise
-            # Composing runs nothing of ours: what goes wrong there is in the settings.
+
+def _show_settings(hydra: Any, command: str, arguments: argparse.Namespace) -> None:
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+    from omegaconf import OmegaConf
+
+    cfg = hydra.compose_config(
+        config_name=command, overrides=arguments.settings, run_mode=RunMode.RUN, with_log_configuration=False
+    )
+    HydraConfig.instance().set_config(cfg)
+    OmegaConf.set_readonly(cfg.hydra, None)
+    if arguments.resolve:
+        OmegaConf.resolve(cfg)  # all of it: Hydra's own settings name the command's, and the other way round
+    shown = hydra.get_sanitized_cfg(cfg, arguments.cfg)
+    package = arguments.package
+    if package not in (None, "_global_"):
+        shown = OmegaConf.select(shown, package)
+        if shown is None:
             raise UserError(
-                f"the settings cannot be put together: {type(error).__name__}: {error}"
-            ) from error
-        require_own_objects(cfg)
-        verbose = cfg.hydra.verbose
-        if not isinstance(verbose, (bool, str, Sequence)):
-            raise UserError(f"hydra.verbose is {verbose!r}; it must be true, false, or names of loggers")
-        return cfg
-
-    # Hydra makes objects right after it has composed the settings, and calls nobody in between.
-    ConfigLoaderImpl.load_configuration = checked
-    try:
-        hydra.main(version_base="1.3", config_path="pkg://sgns.conf")(run_command)()
-    finally:
-        ConfigLoaderImpl.load_configuration = compose
+                f"--package {package}: no such key, or null; see sgns {command} --cfg {arguments.cfg}"
+            )
+        write_output(f"# @package {package}\n" if OmegaConf.is_config(shown) else "")
+    write_output(OmegaConf.to_yaml(shown) if OmegaConf.is_config(shown) else f"{shown}\n")
 
 
 def _help() -> str:
@@ -225,44 +260,50 @@ Examples:
 
 
 def _split(arguments: list[str]) -> tuple[str, list[str]]:
-    """The command and what follows it; also as `--config-name <command>`, as Lightning's processes get it."""
+    """The command and what follows it."""
     command, *rest = arguments
-    if command == "--config-name" and rest:
-        command, *rest = rest
     if command not in COMMANDS:
         raise UserError(f"unknown command {command!r}; commands: {', '.join(COMMANDS)}; see sgns --help")
     return command, rest
 
 
-def _hydra_arguments(command: str, arguments: list[str]) -> list[str]:
-    """Arguments in the order that Hydra wants (flags first), the paths of `sgns check` as its key `files`."""
-    from hydra._internal.utils import get_args_parser
+def _parsed(command: str, arguments: list[str]) -> argparse.Namespace:
+    """Flags and `settings` of a command; the paths of `sgns check` as its key `files`.
 
-    parser = get_args_parser()
+    The flags are those of Hydra that read nothing but settings.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("settings", nargs="*")
+    parser.add_argument("--cfg", "-c", choices=("job", "hydra", "all"))
+    parser.add_argument("--resolve", action="store_true")
+    parser.add_argument("--package", "-p")
+    parser.add_argument("--run", "-r", action="store_true")
+    parser.add_argument("--multirun", "-m", action="store_true")
+    parser.add_argument("--config-dir", "-cd")
+    kinds = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+    parser.add_argument("--info", "-i", nargs="?", const="all", choices=kinds)
 
     def refuse(message: str) -> NoReturn:
-        raise UserError(f"{message}; settings are written key=value; see sgns {command} --help")
+        raise UserError(
+            f"{message}; flags: --multirun (-m), --run, --config-dir, --cfg, --package, --resolve, --info; "
+            f"settings are written key=value; see sgns {command} --help"
+        )
 
     parser.error = refuse  # type: ignore[method-assign]
     if "--version" in arguments:
         refuse("--version stands alone: sgns --version")
     parsed = parser.parse_intermixed_args(arguments)
-    if parsed.config_name is not None or parsed.config_path is not None:
-        refuse(
-            "--config-name and --config-path are given by the command; --config-dir adds a folder of your own"
-        )
-    if parsed.resolve and parsed.cfg is None:
-        refuse("--resolve goes with --cfg job")
-    if sum(map(bool, (parsed.run, parsed.cfg, parsed.multirun, parsed.shell_completion, parsed.info))) > 1:
-        refuse("only one of --run, --multirun (-m), --cfg, --info, --shell-completion can be given")
-    settings = list(parsed.overrides)
-    flags = [argument for argument in arguments if argument not in settings]
+    if (parsed.resolve or parsed.package is not None) and parsed.cfg is None:
+        refuse("--resolve and --package go with --cfg job")
+    if sum((parsed.run, parsed.cfg is not None, parsed.multirun, parsed.info is not None)) > 1:
+        refuse("only one of --run, --multirun (-m), --cfg, --info can be given")
     if command == "check":
+        settings = parsed.settings
         paths = [setting for setting in settings if "=" not in setting or os.path.exists(setting)]
         if paths:
-            settings = [setting for setting in settings if setting not in paths]
-            settings.append(f"files=[{','.join(map(_quoted, paths))}]")
-    return [*flags, *settings]
+            parsed.settings = [setting for setting in settings if setting not in paths]
+            parsed.settings.append(f"files=[{','.join(map(_quoted, paths))}]")
+    return parsed
 
 
 def _quoted(text: str) -> str:

@@ -28,6 +28,10 @@ __all__ = ["describe"]
 # OmegaConf's errors that come from what a person wrote, even when they appear inside a command; its other
 # errors there (an unknown attribute, a wrong type) are mistakes of the command.
 _WRITTEN = (MissingMandatoryValue, InterpolationResolutionError, GrammarParseError)
+# What a value holds without quotes; quotes, brackets and `${` have a meaning of their own.
+_UNQUOTED = re.compile(r"[\w \t\\/%+.$*@?|:,=()\[\]{}'\"-]", re.ASCII)
+# How Python's logging begins what it says of its settings.
+_LOGGING = ("Unable to ", "Unsupported version", "dictionary doesn't specify a version")
 
 
 def describe(error: Exception) -> str | None:
@@ -42,6 +46,9 @@ def describe(error: Exception) -> str | None:
         return (
             "a group is null or a number; groups take one of their options, as in dataset=quick; see --help"
         )
+    if isinstance(error, ValueError) and str(error).startswith(_LOGGING):
+        cause = "" if error.__cause__ is None else f": {error.__cause__}"
+        return _flat(f"the settings of the logging are wrong: {error}{cause}")
     if isinstance(error, (HydraException, ConfigLoadError, yaml.YAMLError, *_WRITTEN)):
         return _flat(str(error))
     return None
@@ -50,6 +57,13 @@ def describe(error: Exception) -> str | None:
 def _unreadable(error: OverrideParseException) -> str:
     if "=" not in error.override and not error.override.startswith("~"):
         return f"cannot read {error.override!r}; settings are written key=value"
+    key, _, value = error.override.partition("=")
+    odd = next((sign for sign in value if not _UNQUOTED.match(sign)), None)
+    if odd is not None and not set(value) & {"'", '"', "\\"} and "${" not in value:
+        if not odd.isprintable():
+            return f"cannot read {error.override!r}: {odd!r} cannot be part of a value"
+        quoted = f'["{odd}"]' if set(value) & set("[]{}()") else f'"{value}"'
+        return f"cannot read {error.override!r}: {odd!r} needs quotes, as in '{key}={quoted}'"
     reason = _flat(error.message.split("\nSee ")[0])
     return (
         f"cannot read {error.override!r} ({reason}); settings are written key=value;"

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from hydra._internal.utils import get_args_parser
 from tiny import make_dataset
 
 from sgns import __version__
@@ -149,6 +148,16 @@ def test_settings_can_be_shown(empty_folder: Path) -> None:
         (["train", "--cfg", "job", "-m"], ["only one of"]),
         (["train", "--config-name", "simulate"], ["--config-dir"]),
         (["train", "--config-dir", "nope"], ["nope' not found"]),
+        (["train", "--config-path", "."], ["unrecognized arguments: --config-path"]),
+        (["train", "--experimental-rerun", "a.pickle"], ["unrecognized arguments: --experimental-rerun"]),
+        (["train", "--exp", "a.pickle"], ["unrecognized arguments: --exp"]),
+        (["train", "-sc", "install=bash"], ["unrecognized arguments: -sc"]),
+        (["train", "--hydra-help"], ["unrecognized arguments: --hydra-help"]),
+        (["train", "--cfg", "job", "--package", "nope"], ["--package nope: no such key"]),
+        (["train", "--package", "seed"], ["go with --cfg job"]),
+        (["train", "output=größe"], ["'ö' needs quotes, as in 'output=\"größe\"'"]),
+        (["train", "output=a~b"], ["'~' needs quotes, as in 'output=\"a~b\"'"]),
+        (["train", "output=[a&b]"], ["'&' needs quotes, as in 'output=[\"&\"]'"]),
         (["rollout"], ["missing for checkpoint", "checkpoint=..."]),
         (["evaluate"], ["missing for checkpoint", "checkpoint=..."]),
         (["rollout", "checkpoint=null"], ["checkpoint is null"]),
@@ -289,9 +298,11 @@ def test_settings_before_and_after_flags(empty_folder: Path) -> None:
 
 
 def test_the_arguments_of_a_process_that_lightning_starts(empty_folder: Path) -> None:
-    result = call_fake("import sys; print(sys.argv[1:4])", "seed=3")
-    assert result.stdout == "['--config-name', 'train', 'seed=3']\n"
-    child = call("--config-name", "train", "--cfg", "job", 'hydra.run.dir="a/b"', "hydra.output_subdir=null")
+    """It takes this one's arguments and adds settings of Hydra's."""
+    result = call_fake("import sys; print(sys.argv[1:])", "seed=3")
+    assert result.stdout == "['train', 'seed=3']\n"
+    added = ['hydra.run.dir="a/b"', "hydra.job.name=train_ddp_process_1", "hydra.output_subdir=null"]
+    child = call("train", "--cfg", "job", *added)
     assert child.returncode == 0 and "num_modes:" in child.stdout
 
 
@@ -334,7 +345,17 @@ def test_an_exit_that_lightning_makes_of_an_interruption(empty_folder: Path) -> 
     assert result.returncode == 130 and "interrupted" in result.stderr
 
 
-def test_hydras_flags_are_the_ones_that_are_checked() -> None:
-    parsed = get_args_parser().parse_args([])
-    for name in ("overrides", "cfg", "resolve", "run", "multirun", "shell_completion", "info", "config_name"):
-        assert hasattr(parsed, name)
+@pytest.mark.parametrize("streams", ["2>&-", ">&-", "<&- >&- 2>&-", "2>&1 | true", "> /dev/full"])
+def test_standard_streams_that_lead_nowhere(streams: str, empty_folder: Path) -> None:
+    """Neither a traceback nor another exit status."""
+    command = f"{sys.executable} -m sgns check nope.h5 {streams}; exit ${{PIPESTATUS[0]}}"
+    result = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=100)
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr and "Exception" not in result.stderr
+    assert ("no such file" in result.stderr) == (streams in (">&-", "> /dev/full"))
+
+
+def test_settings_that_nobody_reads(empty_folder: Path) -> None:
+    command = f"{sys.executable} -m sgns train --cfg all | true; exit ${{PIPESTATUS[0]}}"
+    result = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=100)
+    assert (result.returncode, result.stderr) == (0, "")
