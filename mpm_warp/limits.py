@@ -10,7 +10,7 @@ MOST_STEPS = 1_000_000_000
 """Substeps of a whole run."""
 
 # What numbers can mean, lowest and highest.
-YOUNGS_MODULUS = (1.0, 1.0e12)  # [Pa]
+YOUNGS_MODULUS = (1.0e-9, 1.0e12)  # [Pa]
 MOST_POISSONS_RATIO = 0.499
 LEAST_PACKING = 0.05
 MOST_GRAVITY = 1.0e5  # [m/s^2], ten thousand times the earth's
