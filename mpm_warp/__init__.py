@@ -1,23 +1,17 @@
 """A 3D material point method for granular soil, in NVIDIA Warp. Usable alone; needs warp and numpy only."""
 
-from .arrangement import arrange
+from .auto_effects import Decision, Tolerances, effects_for
 from .batch import frames_together
+from .bed import Bed, Walls, arrange
 from .bodies import Box, Cylinder, MeshBody, Plate
-from .column import Column
+from .discretisation import asymmetry
 from .effects import Effects
-from .effects_for import Decision, Tolerances, effects_for
-from .errors import SceneError, SolverStopped
-from .excavation import Excavation
-from .incline import Incline
+from .limits import substeps_per_frame
 from .material import Material
-from .push import Push
-from .scene import Bed, Scene
+from .scene import Scene
+from .scenes import Column, Excavation, Incline, Push, Wheel
 from .solver import Frame, Solver
-from .state import State
-from .symmetry import asymmetry
-from .time_step import substeps_per_frame
-from .walls import Walls
-from .wheel import Wheel
+from .state import SceneError, SolverStopped, State
 
 __all__ = [
     "Bed",

@@ -7,13 +7,10 @@ from itertools import islice, repeat
 from typing import Any
 
 from .effects import Effects
-from .errors import SceneError, SolverStopped
+from .launch import Work, Worker, find_device
 from .scene import Scene
 from .solver import Frame, Solver
-from .start import find_device
-from .work import Work, Worker
-
-__all__ = ["all_together", "frames_together"]
+from .state import SceneError, SolverStopped
 
 
 def frames_together(

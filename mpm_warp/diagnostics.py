@@ -7,10 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from .bodies import Body
-from .rotation import rotate
+from .poses import rotate
 from .solver import Frame
-
-__all__ = ["leakage", "leaked"]
 
 
 def leaked(frames: Iterable[Frame], body: Body, edge: float = 0.0) -> np.ndarray:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from .errors import SceneError
-
-__all__ = ["Effects"]
+from .state import SceneError
 
 _REASONS = {
     "yielding": ("soil flows when shear exceeds friction", "purely elastic soil was asked for"),

@@ -7,8 +7,6 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["open_file", "read_bytes", "read_text"]
-
 MOST_BYTES = 1 << 30
 """Of a file that is read whole."""
 

@@ -1,20 +1,278 @@
-"""How large a scene may be: far beyond what has been computed, and short of what ends in an error or never ends."""
+"""How long a step may be, what a scene may ask for, and where the solver has to stop."""
 
-MOST_PARTICLES = 20_000_000
-MOST_NODES = 200_000_000
-"""Of the grid."""
-MOST_FRAMES = 1_000_000
-MOST_SUBSTEPS = 1_000_000
-"""Between two frames."""
-MOST_STEPS = 1_000_000_000
-"""Substeps of a whole run."""
+from __future__ import annotations
 
-# What numbers can mean, lowest and highest.
-YOUNGS_MODULUS = (1.0e-9, 1.0e12)  # [Pa]
-MOST_POISSONS_RATIO = 0.499
-LEAST_PACKING = 0.05
-MOST_GRAVITY = 1.0e5  # [m/s^2], ten thousand times the earth's
-FRAME_RATE = (1.0e-3, 1.0e6)  # [Hz]
-MOST_DURATION = 1.0e6  # [s]
-LEAST_COURANT = 1.0e-4
-BODY_MASS = (1.0e-9, 1.0e9)  # [kg], of a body whose height is free
+import math
+import os
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from .bed import Bed
+from .launch import find_device
+from .material import Material
+from .ranges import MOST_STEPS, MOST_SUBSTEPS
+from .rigid_body import longest_step
+from .scene import Scene
+from .state import SceneError
+
+# --- How long a step may be, and how many of them pass between two remaps -------------------------------
+
+
+def substeps_per_frame(scene: Scene) -> int:
+    """Equal steps in a frame: as many as elastic waves, the body's motion and a free body's mass ask for.
+
+    Raises:
+        SceneError: more than limits.py allows in a frame or in all.
+    """
+    limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + top_body_speed(scene))
+    limit *= damped_share(scene)
+    limit = min(limit, longest_step(scene))
+    count = 1.0 / scene.frame_rate / limit - 1e-9 if limit > 0.0 else math.inf
+    total = count * (scene.frame_count - 1)
+    if not count <= MOST_SUBSTEPS:
+        raise SceneError(
+            f"a frame would take {count:.3g} substeps of {limit:.3g} s; at most {MOST_SUBSTEPS:g} are allowed: "
+            f"{_way_out(scene)}"
+        )
+    if not total <= MOST_STEPS:
+        raise SceneError(
+            f"the run would take {total:.3g} substeps, {count:.3g} in each of {scene.frame_count - 1} frames; at most "
+            f"{MOST_STEPS:g} are allowed: lower scene.duration ({scene.duration:g} s), or {_way_out(scene)}"
+        )
+    return max(1, math.ceil(count))
+
+
+def _way_out(scene: Scene) -> str:
+    """What to change for fewer substeps: the key that asks for most of them beyond what the defaults would."""
+    mass, speed, waves = longest_step(scene), top_body_speed(scene), scene.material.wave_speed
+    if mass < damped_share(scene) * scene.courant * scene.bed.spacing / (waves + speed):
+        kilograms = scene.axle.mass
+        return (
+            f"the body's mass of {kilograms:.3g} kg is too small for contact this stiff: raise scene.load or lower "
+            "scene.gravity"
+        )
+    if speed > waves:
+        return (
+            f"the body moves at up to {speed:.3g} m/s: make its path or scene.speed, scene.rim_speed slower"
+        )
+    soil, usual = scene.material, Material()
+    more = {  # key → by what it multiplies the number of steps
+        "raise scene.bed.spacing": Bed.spacing / scene.bed.spacing,
+        "raise scene.courant": Scene.courant / scene.courant,
+        "raise scene.frame_rate": Scene.frame_rate / scene.frame_rate,
+        "lower material.youngs_modulus": math.sqrt(soil.youngs_modulus / usual.youngs_modulus),
+        "lower material.poissons_ratio": Material(poissons_ratio=soil.poissons_ratio).wave_speed
+        / usual.wave_speed,
+        "raise material.grain_density": math.sqrt(usual.grain_density / soil.grain_density),
+        "raise material.packing": math.sqrt(usual.packing / soil.packing),
+    }
+    return max(more, key=lambda key: more[key])
+
+
+def damped_share(scene: Scene) -> float:
+    """Longest stable step of a damped oscillator over that of a free one [-]."""
+    return math.sqrt(1.0 + scene.elastic_damping**2) - scene.elastic_damping
+
+
+def top_body_speed(scene: Scene, step: float | None = None) -> float:
+    """Fastest motion of any point of the body between frames and, with `step` [s], along its path within such a time
+    [m/s]; a free height moves on top of it."""
+    if scene.body is None:
+        return 0.0
+    times = scene.times()
+    top = float(np.max(scene.ways(times), initial=0.0) * scene.frame_rate)
+    rows = scene.path_times()
+    if step is None or not len(rows):
+        return top
+    # Where a path is fastest, such a time begins or ends at one of its rows.
+    begin = np.clip(np.concatenate([rows, rows - step]), 0.0, times[-1])
+    every = np.unique(np.concatenate([[0.0], begin, begin + step]))
+    travelled = np.concatenate([[0.0], np.cumsum(scene.ways(every))])
+    way = np.interp(begin + step, every, travelled) - np.interp(begin, every, travelled)
+    return max(top, float(way.max()) / step)
+
+
+def steps_to_remap(scene: Scene, time_step: float, speed: float) -> int:
+    """Number of steps of `time_step` [s] until momentum is carried to a fresh grid: 2^n or 3 2^n.
+
+    Soil of at most `speed` [m/s] must not travel far from the place that its weights belong to: at most
+    `scene.remap_distance` grid spacings, free fall included, and never longer than `scene.remap_time`.
+    """
+    room, limit = scene.remap_distance * scene.bed.spacing, scene.remap_time
+    if speed * limit + scene.gravity * limit**2 > room:
+        limit = 2.0 * room / (speed + math.sqrt(speed**2 + 4.0 * scene.gravity * room))
+    most = max(1, int(limit / time_step * (1.0 + 1e-9)))
+    # Few different numbers, because on a GPU each is recorded once.
+    power = 1 << (most.bit_length() - 1)
+    return power + power // 2 if most >= power + power // 2 else power
+
+
+# --- How much a scene is, before anything of it is there ------------------------------------------------
+
+# Numbers in a solver's precision: positions, velocities, strains, stress and contact of a particle and what is kept of
+# them from the frame before; four fields on the grid and 1 / mass; poses and speeds of the body in a substep.
+_REALS_PER_PARTICLE, _REALS_PER_NODE, _REALS_PER_SUBSTEP = 75, 17, 13
+# Double precision besides, while these are made, and one frame.
+_BYTES_PER_PARTICLE, _BYTES_PER_SUBSTEP = 220, 400
+
+
+@dataclass(frozen=True)
+class SceneSize:
+    """What a solver of a scene holds and does."""
+
+    particles: int
+    """About: random points and round beds are counted by their volume."""
+    nodes: int
+    """Of the grid."""
+    substeps: int
+    """Between two frames."""
+    steps: int
+    """Substeps of the whole run."""
+    memory: int
+    """About [bytes]; half of it where mirror symmetry is made use of."""
+
+
+def scene_size(scene: Scene, precision: str = "float32") -> SceneSize:
+    """The size of a scene in `precision`; takes no memory itself.
+
+    Raises:
+        SceneError: it is beyond limits.py; beds and numbers of frames beyond it are refused when they are made.
+    """
+    real = 8 if precision == "float64" else 4
+    particles = round(scene.soil_volume / scene.bed.particle_volume)
+    nodes, substeps = math.prod(scene.bed.node_counts), substeps_per_frame(scene)
+    memory = particles * (_REALS_PER_PARTICLE * real + _BYTES_PER_PARTICLE) + nodes * _REALS_PER_NODE * real
+    if scene.body is not None:
+        memory += substeps * (_REALS_PER_SUBSTEP * real + _BYTES_PER_SUBSTEP)
+    return SceneSize(particles, nodes, substeps, substeps * (scene.frame_count - 1), memory)
+
+
+def require_memory(scene: Scene, precision: str, device: str, symmetry: bool) -> None:
+    """Refuse a scene that the device has no memory for.
+
+    Args:
+        scene: what will be computed.
+        precision: float32 or float64.
+        device: cpu, cuda, cuda:0, ...
+        symmetry: whether only half of it is computed.
+
+    Raises:
+        SceneError: the scene is too large, or there is no such device.
+    """
+    size, there = scene_size(scene, precision), _memory(find_device(device))
+    needed = size.memory * (0.5 if symmetry else 1.0)
+    if needed > there:
+        raise SceneError(
+            f"the scene needs about {needed / 1e9:.3g} GB of memory and {device} has {there / 1e9:.3g} GB: "
+            f"{size.particles:.3g} particles, {size.nodes:.3g} grid nodes, {size.substeps:.3g} substeps in a frame; "
+            "use a larger bed.spacing, fewer bed.particles_per_cell or a lower bed.headroom"
+        )
+
+
+def _memory(device: wp.Device) -> float:
+    """Of a device [bytes]; infinite where the system does not say."""
+    if device.is_cuda:
+        return device.total_memory
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return math.inf
+
+
+# --- Where a solver has to stop: values that are not finite, or that soil cannot have -------------------
+
+LARGEST_STRAIN = 1.0
+"""Of the elastic log strain: soil at 37 % of its volume. The elastic law means nothing there."""
+STABLE_COURANT = 0.84
+"""Longest step that was found stable, over what theory gives for waves along one axis [-]; `MOST_COURANT` of scene.py
+leaves soil room to become stiffer."""
+
+
+def speed_bound(scene: Scene, time_step: float) -> float:
+    """Speed [m/s] that no soil of a scene can reach, computed in steps of `time_step` [s].
+
+    Four times the sum of what it has at the start, of the fastest point of the body and of a fall through the whole
+    grid (or, down an endless slope, of a fall for as long as the scene lasts), and half the speed of its waves for what
+    elastic strain can give back.
+    """
+    bed = scene.bed
+    start = float(np.linalg.norm(scene.initial_velocities(), axis=1).max(initial=0.0))
+    height = bed.size[2] + bed.headroom + abs(math.sin(math.radians(scene.tilt))) * bed.size[0]
+    fall = math.sqrt(2.0 * scene.gravity * height)
+    if bed.walls.kinds[0] == "periodic" and scene.tilt:
+        fall = max(fall, scene.gravity * scene.duration)
+    return 4.0 * (start + top_body_speed(scene, time_step) + fall) + 0.5 * scene.material.wave_speed
+
+
+class Guard:
+    """Knows what soil cannot do, and what is to blame when it does.
+
+    Args:
+        scene: what is computed.
+        time_step: substep [s].
+    """
+
+    def __init__(self, scene: Scene, time_step: float) -> None:
+        self._time_step = time_step
+        self.speed_bound = speed_bound(scene, time_step)
+        # Compressed soil is stiffer: its waves are faster by sqrt(1 - ln J).
+        stable = damped_share(scene) * scene.bed.spacing / scene.material.wave_speed
+        self._most_compression = min(LARGEST_STRAIN, (STABLE_COURANT * stable / time_step) ** 2 - 1.0)
+
+    def too_fast(self, speed: float) -> str:
+        """The cause for soil faster than the bound."""
+        return (
+            f"it moves at {speed:.3g} m/s, which nothing here can cause ({self.speed_bound:.3g} m/s at most): lower "
+            "scene.courant"
+        )
+
+    def strayed(self, near: bool) -> str:
+        """The cause for a particle that the kernels left where it was; `near` its place at the last remap or not."""
+        if near:
+            return "it left the grid: soil was thrown or pushed beyond it, raise scene.bed.headroom"
+        return (
+            "its speed is not finite or carried it further than a cell between two remaps: lower scene.courant or the "
+            "body's speed"
+        )
+
+    def too_strained(self, ln_j: np.ndarray, strain: np.ndarray) -> tuple[int, str] | None:
+        """The first particle whose elastic strain cannot be, and why; None if there is none.
+
+        Args:
+            ln_j: log of the volume (n,).
+            strain: deviatoric part (n, 6) [-].
+        """
+        lowest, largest = ln_j.min(), max(strain.max(), -strain.min())  # a NaN makes both comparisons false
+        if lowest > -self._most_compression and largest < LARGEST_STRAIN:
+            return None
+        sheared = np.abs(strain).max(axis=1)
+        particle = int(np.argmax(~((ln_j > -self._most_compression) & (sheared < LARGEST_STRAIN))))
+        volume, shear = ln_j[particle], sheared[particle]
+        if not np.isfinite(volume + shear):
+            return particle, "its strain is not finite: lower scene.courant"
+        left = f"{100.0 * math.exp(volume):.3g} % of its volume"
+        if volume > -LARGEST_STRAIN and shear < LARGEST_STRAIN:
+            return particle, (
+                f"it is compressed to {left}, where waves are too fast for steps of {self._time_step:.3g} s: lower "
+                "scene.courant or raise material.youngs_modulus"
+            )
+        return particle, (
+            f"it is strained to {left} and by {shear:.2g} in shear, more than elastic soil can be: raise "
+            "material.youngs_modulus or lower the body's speed"
+        )
+
+    def lost_fluidity(self, excess: np.ndarray) -> tuple[int, str] | None:
+        """The first particle to which cooperative flow gave a fluidity that is no number, and why; None if there is
+        none. Its stress does not show it: without a fluidity soil is elastic.
+
+        Args:
+            excess: what the grid gave the particles (n,) [1/s].
+        """
+        lost = ~np.isfinite(excess)
+        if not lost.any():
+            return None
+        return int(
+            np.argmax(lost)
+        ), "its fluidity is not finite: lower scene.courant or set effects.nonlocality=false"

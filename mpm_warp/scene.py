@@ -2,177 +2,30 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
-from functools import cached_property
 from types import UnionType
 from typing import Any, ClassVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from .arrangement import ARRANGEMENTS, arrange, particle_volume
-from .axle import Axle
-from .bodies import Body, MeshBody
-from .errors import SceneError
-from .limits import (
+from .bed import Bed
+from .bodies import Axle, Body, MeshBody
+from .material import Material
+from .poses import angular_velocity, rotate
+from .ranges import (
     FRAME_RATE,
     LEAST_COURANT,
     MOST_DURATION,
     MOST_FRAMES,
     MOST_GRAVITY,
-    MOST_NODES,
-    MOST_PARTICLES,
 )
-from .material import Material
-from .rotation import angular_velocity, rotate
-from .walls import Walls
-
-__all__ = ["Bed", "Scene"]
-
-PADDING = 3
-"""Grid cells outside the bin, so that the nodes around a particle at a wall exist."""
-
-INITIAL_STRESSES = ("geostatic", "k0", "none")
+from .state import SceneError
 
 MOST_COURANT = 0.8
 """Largest `courant`. From 0.86 on a cut's forces come out too small, with nothing else to see
 (experiments/stability/step.csv)."""
-
-
-@dataclass(frozen=True)
-class Bed:
-    """The soil bin and how it is filled. z = 0 is the undisturbed surface."""
-
-    size: tuple[float, float, float] = (0.80, 0.60, 0.15)
-    """Lx, Ly, Lz [m]."""
-    spacing: float = 0.8 / 60
-    """Grid spacing dx [m]."""
-    particles_per_cell: float = 1.0
-    """Particles per grid cell of a full bed."""
-    arrangement: str = "lattice"
-    """lattice | jittered | poisson (arrangement.py)."""
-    seed: int = 0
-    """Of the random arrangements."""
-    mirrored: bool = False
-    """A random arrangement is its own mirror image about y = Ly / 2, which mirror symmetry needs."""
-    initial_stress: str = "geostatic"
-    """geostatic: isotropic pressure rho g depth; k0: the horizontal stress is nu / (1 - nu) times the vertical one;
-    none: stress-free, settles in the first frames."""
-    headroom: float = 0.25
-    """Height above the surface up to which soil may be thrown or piled [m]."""
-    store_every: int = 1
-    """Particles per particle that is recorded; the solver computes all of them."""
-    walls: Walls = field(default_factory=Walls)
-    """What soil may do at walls and floor."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "size", tuple(float(s) for s in self.size))
-        if len(self.size) != 3 or not all(math.isfinite(s) and s > 0 for s in self.size):
-            raise SceneError(f"bed.size is {self.size}; it needs three lengths above 0 m")
-        if not (math.isfinite(self.spacing) and 0 < self.spacing <= min(self.size) / 2):
-            raise SceneError(
-                f"bed.spacing is {self.spacing} m; allowed: above 0, at most half the bin's smallest side"
-            )
-        if not 0 < self.particles_per_cell <= 64:
-            raise SceneError(
-                f"bed.particles_per_cell is {self.particles_per_cell}; allowed: above 0, at most 64"
-            )
-        particles = math.prod(s / self.spacing for s in self.size) * self.particles_per_cell
-        if not particles <= MOST_PARTICLES:
-            raise SceneError(
-                f"the bed would hold {particles:.2g} particles; at most {MOST_PARTICLES:g} are allowed: use a larger "
-                "bed.spacing, a smaller bed.size or fewer bed.particles_per_cell"
-            )
-        if self.arrangement not in ARRANGEMENTS:
-            raise SceneError(f"bed.arrangement is {self.arrangement!r}; allowed: {', '.join(ARRANGEMENTS)}")
-        if self.initial_stress not in INITIAL_STRESSES:
-            raise SceneError(
-                f"bed.initial_stress is {self.initial_stress!r}; allowed: {', '.join(INITIAL_STRESSES)}"
-            )
-        if not (math.isfinite(self.headroom) and self.headroom > 0):
-            raise SceneError(f"bed.headroom is {self.headroom} m; it must be above 0")
-        height, margin = self.size[2] + self.headroom, 2.0 * PADDING + 2.0
-        floor = math.prod(s / self.spacing + margin for s in self.size[:2])
-        nodes = floor * (height / self.spacing + margin)
-        if not nodes <= MOST_NODES:
-            fits = floor * (self.size[2] / self.spacing + margin) <= 0.5 * MOST_NODES
-            key = "lower bed.headroom" if fits else "use a larger bed.spacing"
-            raise SceneError(
-                f"bed.headroom is {self.headroom} m and bed.spacing {self.spacing} m: the grid would have {nodes:.3g} "
-                f"nodes; at most {MOST_NODES:g} are allowed: {key}"
-            )
-        if not (self.store_every >= 1 and self.store_every == int(self.store_every)):
-            raise SceneError(f"bed.store_every is {self.store_every}; it must be a whole number, 1 or more")
-        if not isinstance(self.mirrored, bool):
-            raise SceneError(f"bed.mirrored is {self.mirrored!r}; allowed: true, false")
-        for name, kind, length in zip("xy", self.walls.kinds, self.size, strict=False):
-            if kind == "periodic" and abs(length / self.spacing - round(length / self.spacing)) > 1e-6:
-                raise SceneError(
-                    f"bed.walls.{name} is periodic but the bin's {length} m are {length / self.spacing:.3f} grid "
-                    "spacings; it must be a whole number of them: change bed.size or bed.spacing"
-                )
-
-    @property
-    def particle_spacing(self) -> float:
-        """Nominal distance between particles [m]."""
-        return self.spacing / self.particles_per_cell ** (1.0 / 3.0)
-
-    @property
-    def particle_volume(self) -> float:
-        """Volume of a particle [m^3], as in `filled`."""
-        return particle_volume(self.arrangement, self.size, self.particle_spacing)
-
-    @property
-    def node_counts(self) -> tuple[int, int, int]:
-        """Nodes of the grid along x, y and z, with those outside the bin and up to the headroom."""
-        h = self.spacing
-        x, y = (math.ceil(s / h - 1e-6) + 2 * PADDING + 1 for s in self.size[:2])
-        return x, y, math.ceil((self.size[2] + self.headroom) / h) + 2 * PADDING + 1
-
-    @cached_property
-    def filled(self) -> tuple[np.ndarray, float]:
-        """Particle positions (n, 3) [m] and the volume of one [m^3]."""
-        return self._arranged
-
-    @property
-    def filling(self) -> float:
-        """Share of the bin below the surface that its particles fill [-]: 1, but for random points that keep apart."""
-        positions, volume = self._arranged
-        return len(positions) * volume / float(np.prod(self.size))
-
-    @property
-    def _arranged(self) -> tuple[np.ndarray, float]:
-        return arrange(self.arrangement, self.size, self.particle_spacing, self.seed, self.mirrored)
-
-    @cached_property
-    def stored(self) -> np.ndarray:
-        """Indices of the particles of a full bed that are recorded; see `stored_of`."""
-        return self.stored_of(len(self.filled[0]))
-
-    def stored_of(self, count: int) -> np.ndarray:
-        """Indices of those of `count` particles that are recorded, increasing: one of every `store_every` that follow
-        each other.
-
-        Which one is drawn at random, always the same way: at fixed steps a lattice would be recorded in some of
-        its layers only.
-        """
-        first = np.arange(0, count, self.store_every)
-        left = np.minimum(self.store_every, count - first)
-        return first + np.random.default_rng(0).integers(left)
-
-    @property
-    def arrangement_hash(self) -> str:
-        """Same for every run whose recorded particles start at the same places in the same order."""
-        key = [self.size, self.spacing, self.particles_per_cell, self.arrangement]
-        if self.arrangement != "lattice":
-            key.append(self.seed)
-            if self.mirrored:
-                key.append("mirrored")
-        if self.store_every != 1:
-            key.append(f"one of {self.store_every}")
-        return hashlib.blake2b(json.dumps(key).encode(), digest_size=8).hexdigest()
 
 
 @dataclass(frozen=True)

@@ -11,29 +11,20 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .contact import ContactLaw, body_struct
+from .discretisation import half, initial_stress, lay_grid, require_symmetry
 from .effects import Effects
-from .errors import SceneError, SolverStopped
-from .grid import grid_step
-from .grid_layout import lay_grid
-from .guard import Guard
-from .images import Images, images
-from .initial_stress import initial_stress
-from .launches import Launch, SceneKernel
-from .nonlocal_fluidity import NonlocalFluidity, wall_sink
+from .kernels.contact import ContactLaw, body_struct
+from .kernels.fluidity import soil_parameters
+from .kernels.ghost_nodes import Images, images
+from .kernels.grid import grid_step
+from .kernels.nonlocal_fluidity import NonlocalFluidity, wall_sink
+from .kernels.transfer import transfer
+from .launch import Launch, Program, SceneKernel, Work, Worker, find_device
+from .limits import Guard, require_memory, steps_to_remap, substeps_per_frame, top_body_speed
+from .poses import rotate
 from .rigid_body import RigidBody
-from .rotation import rotate
 from .scene import Scene
-from .size import require_memory
-from .soil import soil_parameters
-from .start import find_device
-from .state import Memory, State
-from .symmetry import half, require_symmetry
-from .time_step import steps_to_remap, substeps_per_frame, top_body_speed
-from .transfer import transfer
-from .work import Program, Work, Worker
-
-__all__ = ["PRECISIONS", "Frame", "Solver"]
+from .state import Memory, SceneError, SolverStopped, State
 
 PRECISIONS = {"float32": wp.float32, "float64": wp.float64}
 

@@ -1,4 +1,4 @@
-"""All that a solver needs to go on from a recorded frame."""
+"""The state to go on from, and the errors of the solver."""
 
 from __future__ import annotations
 
@@ -8,9 +8,22 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
-from .errors import SceneError
+# --- What can go wrong, said to the user in one line ----------------------------------------------------
 
-__all__ = ["Memory", "State"]
+
+class SceneError(ValueError):
+    """A scene that cannot be simulated: what, where, what is allowed."""
+
+
+class SolverStopped(RuntimeError):
+    """The solver met a non-finite or unphysical value and stopped; frames already yielded are good."""
+
+    state: State | None = None
+    """At the last good frame; `Solver(..., start=state)` goes on from there, with a smaller step if its scene has
+    one."""
+
+
+# --- All that a solver needs to go on from a recorded frame ---------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

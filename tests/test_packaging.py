@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import sgns
-from sgns.cli import COMMANDS
+from sgns.cli.commands import COMMANDS
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = {"sgns": ROOT / "src/sgns", "sgns.conf": ROOT / "conf", "mpm_warp": ROOT / "mpm_warp"}

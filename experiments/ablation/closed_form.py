@@ -23,18 +23,17 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from sgns.campaign import Dataset
-from sgns.learning.context import varying_context
-from sgns.learning.data import TrainingWindows
-from sgns.learning.polynomial_fit import candidates, choose, moments, unfitted
-from sgns.learning.polynomial_settings import FitSettings, PolynomialSettings
-from sgns.learning.polynomial_training import fit_polynomial
-from sgns.learning.stepping import Dynamics
-from sgns.learning.surrogate import load_surrogate
-from sgns.learning.training import moves_freely
-from sgns.learning.validation import RolloutScore, ValidationRollouts
-from sgns.published_dataset import PARTICLES, published_dataset
-from sgns.reduction.reduced import ReducedRun, reduce_dataset
+from sgns.data.dataset import Dataset
+from sgns.data.published import PARTICLES, published_dataset
+from sgns.model.checkpoint import load_surrogate
+from sgns.model.dynamics import Dynamics
+from sgns.model.features import varying_context
+from sgns.model.settings import FitSettings, PolynomialSettings
+from sgns.reduction.reduce import ReducedRun, reduce_dataset
+from sgns.train.callbacks import RolloutScore, ValidationRollouts
+from sgns.train.command import moves_freely
+from sgns.train.polynomial import candidates, choose, fit_polynomial, moments, unfitted
+from sgns.train.windows import TrainingWindows
 
 HERE = Path(__file__).parent
 HISTORY = 3  # d, as in conf/model

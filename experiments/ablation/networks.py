@@ -28,13 +28,13 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from sgns.campaign import Dataset
-from sgns.learning import training as learning
-from sgns.learning.data import Batch
-from sgns.learning.surrogate import load_surrogate
-from sgns.learning.trainee import SurrogateTraining
-from sgns.learning.validation import RolloutScore, ValidationRollouts
-from sgns.reduction.reduced import ReducedDataset, ReducedRun, reduce_dataset
+from sgns.data.dataset import Dataset
+from sgns.model.checkpoint import load_surrogate
+from sgns.reduction.reduce import ReducedDataset, ReducedRun, reduce_dataset
+from sgns.train import command as learning
+from sgns.train.callbacks import RolloutScore, ValidationRollouts
+from sgns.train.lightning_module import SurrogateTraining
+from sgns.train.windows import Batch
 
 HERE = Path(__file__).parent
 DATASETS = {"blade": "quick", "wheel": "quick_wheel"}

@@ -22,7 +22,7 @@ import numpy as np
 from hydra import compose, initialize_config_module
 
 from mpm_warp import Decision, Effects, Scene, Solver, Tolerances, asymmetry, effects_for
-from sgns.scenes import scene_from_config
+from sgns.simulate.scene import scene_from_config
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -29,20 +29,18 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from sgns.campaign import Dataset
-from sgns.evaluation.metrics import VectorErrors, mean_prediction, skill
-from sgns.full_space.body_surface import box_surface
-from sgns.full_space.dynamics import FullSpaceDynamics
-from sgns.full_space.training import fit_normalisation, train
-from sgns.full_space.windows import FullSpaceRun, FullSpaceWindows
-from sgns.learning.body import BodyTrack
-from sgns.learning.dynamics import ModelSettings
-from sgns.learning.trainee import SurrogateTraining, TrainingSettings
-from sgns.learning.training import prepared
-from sgns.learning.training import train as train_subspace
-from sgns.reduction.reduced import reduce_dataset
-from sgns.runs import Run
+from sgns.data.dataset import Dataset
+from sgns.data.run import Run
+from sgns.evaluate.metrics import VectorErrors, mean_prediction, skill
+from sgns.model.features import BodyTrack
+from sgns.model.full_space import FullSpaceDynamics, box_surface
+from sgns.model.network_dynamics import ModelSettings
+from sgns.reduction.reduce import reduce_dataset
 from sgns.simulator import Simulator
+from sgns.train.command import prepared
+from sgns.train.command import train as train_subspace
+from sgns.train.full_space import FullSpaceRun, FullSpaceWindows, fit_normalisation, train
+from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

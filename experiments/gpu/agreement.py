@@ -29,10 +29,9 @@ from hydra import compose, initialize_config_module
 from scenes import FARTHEST, FORCE, Case, cases, outcome, write_rows
 
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
-from mpm_warp.start import find_device
-from sgns.evaluation.provenance import cpu_model
-from sgns.scene_effects import asked_effects, decided
-from sgns.scenes import scene_from_config
+from mpm_warp.launch import find_device
+from sgns.evaluate.costs import cpu_model
+from sgns.simulate.scene import asked_effects, decided, scene_from_config
 
 HERE = Path(__file__).resolve().parent
 SCENES = ("quick_excavation", "paper_excavation", "paper_wheel")

@@ -36,7 +36,9 @@ from unittest import mock
 import numpy as np
 import warp as wp
 
-from mpm_warp import nonlocal_fluidity, solver, work
+from mpm_warp import launch as work
+from mpm_warp import solver
+from mpm_warp.kernels import nonlocal_fluidity
 
 __all__ = ["Checked", "Report", "Threads", "compiler", "on_stand_in", "with_graphs"]
 

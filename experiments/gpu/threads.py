@@ -21,9 +21,7 @@ import warp as wp
 from scenes import FARTHEST, FORCE, Case, cases, outcome, write_rows
 from stand_in import Checked, Report, Threads, compiler, on_stand_in, with_graphs
 
-from mpm_warp.launches import Launch, scene_kernel
-from mpm_warp.start import find_device
-from mpm_warp.work import Program, Work, Worker
+from mpm_warp.launch import Launch, Program, Work, Worker, find_device, scene_kernel
 
 HERE = Path(__file__).resolve().parent
 FRAMES = 2  # checked; every launch of every step in them

@@ -26,13 +26,13 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from sgns.evaluation.published_scores import scored
-from sgns.evaluation.scores import aggregate
-from sgns.learning.training import train
-from sgns.published_dataset import published_dataset
-from sgns.reduction.reduced import ReducedRun
+from sgns.data.published import published_dataset
+from sgns.evaluate.published import scored
+from sgns.evaluate.results import aggregate
+from sgns.reduction.reduce import ReducedRun
 from sgns.rollout import single_thread
 from sgns.simulator import Simulator
+from sgns.train.command import train
 
 HERE = Path(__file__).parent
 FOLDS = 4

@@ -19,8 +19,8 @@ from numpy.polynomial.chebyshev import chebvander
 from run import FIRST, HERE, first_third, plt, smoothed
 
 from mpm_warp import Scene
-from sgns.published import excavation_case, read_published
-from sgns.runs import Run
+from sgns.data.published import excavation_case, read_published
+from sgns.data.run import Run
 
 HARMONICS = 3  # of the passage of a grid cell
 SLOW = 8  # degree of the polynomial that stands for slow changes beside them

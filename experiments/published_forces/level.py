@@ -22,11 +22,11 @@ import numpy as np
 from run import HERE, campaign_of, compared, first_third, smoothed
 
 from mpm_warp import Excavation
-from mpm_warp.push import Push
-from mpm_warp.rotation import rotate
-from sgns.published import excavation_case
-from sgns.runs import Run
-from sgns.simulate import simulate_campaign
+from mpm_warp.poses import rotate
+from mpm_warp.scenes import Push
+from sgns.data.published import excavation_case
+from sgns.data.run import Run
+from sgns.simulate.command import simulate_campaign
 
 sys.path.append(str(HERE.parent / "verification"))
 from mckyes import ANGLE, level_blade, wedge

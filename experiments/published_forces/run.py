@@ -20,12 +20,11 @@ import numpy as np
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from sgns.campaign import Campaign
-from sgns.published import PublishedRun, excavation_case, read_published
-from sgns.runs import Run
-from sgns.scene_effects import asked_effects
-from sgns.scenes import scene_from_config
-from sgns.simulate import simulate_campaign
+from sgns.data.published import PublishedRun, excavation_case, read_published
+from sgns.data.run import Run
+from sgns.simulate.campaign import Campaign
+from sgns.simulate.command import simulate_campaign
+from sgns.simulate.scene import asked_effects, scene_from_config
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

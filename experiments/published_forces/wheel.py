@@ -18,9 +18,9 @@ import numpy as np
 from run import FIRST, HERE, WINDOW, campaign_of, compared, plt, smoothed
 
 from mpm_warp import Wheel
-from sgns.published import wheel_case
-from sgns.runs import Run
-from sgns.simulate import simulate_campaign
+from sgns.data.published import wheel_case
+from sgns.data.run import Run
+from sgns.simulate.command import simulate_campaign
 
 SERIES = (("pull", "drawbar pull", "C0"), ("vertical", "vertical force", "C1"), ("sinkage", "sinkage", "C2"))
 PUBLISHED_DAMPING = 500.0  # of the published wheels' height [1/s]

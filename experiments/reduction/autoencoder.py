@@ -19,9 +19,9 @@ import torch
 from hydra import compose, initialize_config_module
 from torch import Tensor, nn
 
-from sgns.campaign import SPLITS, Dataset
-from sgns.reduction.reconstruction import reconstruction_curve
-from sgns.reduction.reduced import reduce_dataset
+from sgns.data.dataset import SPLITS, Dataset
+from sgns.reduction.basis import reconstruction_curve
+from sgns.reduction.reduce import reduce_dataset
 
 HERE = Path(__file__).parent
 SIZES = (2, 4, 8)

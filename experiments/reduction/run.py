@@ -16,11 +16,10 @@ import matplotlib
 import numpy as np
 import torch
 
-from sgns.campaign import SPLITS, Dataset
-from sgns.evaluation.provenance import cpu_model
-from sgns.reduction import CENTRINGS
-from sgns.reduction.fitting import fit_runs
-from sgns.reduction.reconstruction import ReductionCurves, reduction_curves
+from sgns.data.dataset import SPLITS, Dataset
+from sgns.evaluate.costs import cpu_model
+from sgns.reduction.basis import CENTRINGS, ReductionCurves, reduction_curves
+from sgns.reduction.reduce import fit_runs
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -25,10 +25,10 @@ os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 import numpy as np
 import torch
 
-from sgns.campaign import Dataset
-from sgns.evaluation.provenance import cpu_model
-from sgns.reduction import IncrementalPCA
-from sgns.runs import Run
+from sgns.data.dataset import Dataset
+from sgns.data.run import Run
+from sgns.evaluate.costs import cpu_model
+from sgns.reduction.pca import IncrementalPCA
 
 HERE = Path(__file__).parent
 PARTICLES, MODES, BATCH = 27_000, 256, 96

@@ -23,7 +23,7 @@ from hydra import compose, initialize_config_module
 from scipy.spatial import cKDTree
 
 from mpm_warp import Effects, Solver
-from sgns.scenes import scene_from_config
+from sgns.simulate.scene import scene_from_config
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

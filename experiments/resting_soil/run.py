@@ -16,7 +16,7 @@ import numpy as np
 from hydra import compose, initialize_config_module
 
 from mpm_warp import Effects, Solver
-from sgns.scenes import scene_from_config
+from sgns.simulate.scene import scene_from_config
 
 HERE = Path(__file__).parent
 TOLERANCES = (1e-4, 3e-4, 1e-3, 3e-3)  # [m/s]

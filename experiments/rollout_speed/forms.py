@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from sgns.learning import affine
-from sgns.learning.network import EncodeProcessDecode
-from sgns.learning.pairs import IndexedPairs, Pairs, pairs_of
+from sgns.model import algebra as affine
+from sgns.model.algebra import IndexedPairs, Pairs, pairs_of
+from sgns.model.network import EncodeProcessDecode
 
 __all__ = ["Form", "forms_of", "multiplications", "onednn"]
 
@@ -33,7 +33,7 @@ def forms_of(network: EncodeProcessDecode, edge_index: Tensor, node_count: int) 
 def rearranged(
     network: EncodeProcessDecode, nodes: Tensor, edges: Tensor, pairs: Pairs, commuted: bool, merged: bool
 ) -> Tensor:
-    """One message-passing step with some of the algebra of `sgns.learning.network`."""
+    """One message-passing step with some of the algebra of `sgns.model.network`."""
     step = network.process[0]
     first = step.edge_mlp.first
     own_weight, receiver_weight, sender_weight = first.weight.split(step.width, 1)

@@ -24,12 +24,12 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from sgns.evaluation.provenance import cpu_model
-from sgns.learning.affine import product
-from sgns.learning.body import BodyTrack
-from sgns.learning.dynamics import LatentDynamics
-from sgns.learning.graph_stepper import GraphStepper
-from sgns.learning.model_settings import ModelSettings
+from sgns.evaluate.costs import cpu_model
+from sgns.model.algebra import product
+from sgns.model.fast_step import GraphStepper
+from sgns.model.features import BodyTrack
+from sgns.model.network_dynamics import LatentDynamics
+from sgns.model.settings import ModelSettings
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

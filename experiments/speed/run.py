@@ -22,15 +22,15 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from sgns.campaign import Dataset, plan
-from sgns.evaluation.provenance import cpu_model
-from sgns.learning.training import train
-from sgns.reduction.reduced import reduce_dataset
+from sgns.data.dataset import Dataset
+from sgns.evaluate.costs import cpu_model
+from sgns.reduction.reduce import reduce_dataset
 from sgns.rollout import rollout_scene
-from sgns.scene_effects import asked_effects, decided
-from sgns.scenes import scene_from_config
-from sgns.simulate import simulate_campaign, simulate_scene
+from sgns.simulate.campaign import plan
+from sgns.simulate.command import simulate_campaign, simulate_scene
+from sgns.simulate.scene import asked_effects, decided, scene_from_config
 from sgns.simulator import Simulator
+from sgns.train.command import train
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -13,7 +13,7 @@ import numpy as np
 from hydra import compose, initialize_config_module
 
 from mpm_warp import Effects, Scene, Solver
-from sgns.scenes import scene_from_config
+from sgns.simulate.scene import scene_from_config
 
 SETTINGS = ["scene=quick_excavation", "scene.duration=1", "scene.bed.headroom=0.8"]
 EVERY = 6  # frames

@@ -41,11 +41,12 @@ import numpy as np
 import torch
 
 from sgns import cli
-from sgns.errors import UserError
-from sgns.learning.surrogate import load_surrogate, read_checkpoint
-from sgns.reduction import Basis
-from sgns.reduction.reduced import read_reduced
-from sgns.runs import Run, check_run
+from sgns.config import UserError
+from sgns.data.check import check_run
+from sgns.data.run import Run
+from sgns.model.checkpoint import load_surrogate, read_checkpoint
+from sgns.reduction.basis import Basis
+from sgns.reduction.reduce import read_reduced
 
 log = logging.getLogger(__name__)
 

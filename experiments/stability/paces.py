@@ -23,7 +23,7 @@ for folder in ("stability", "sgns"):
 from rollout_cases import moved, slowed  # noqa: E402
 from trained import quick_data, quick_network  # noqa: E402
 
-from sgns.reduction.reduced import ReducedRun  # noqa: E402
+from sgns.reduction.reduce import ReducedRun  # noqa: E402
 from sgns.simulator import Simulator  # noqa: E402
 
 TIMES = (1, 2, 3, 5, 10, 30)

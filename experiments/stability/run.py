@@ -30,7 +30,7 @@ from areas import AREAS, cases  # noqa: E402
 from case import Case, Row  # noqa: E402
 from margins import draw  # noqa: E402
 
-from sgns.wholefile import write_whole  # noqa: E402
+from sgns.data.files import write_whole  # noqa: E402
 
 log = logging.getLogger(__name__)
 LONGEST = 1800.0  # seconds that a case may take

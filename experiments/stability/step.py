@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-import mpm_warp.guard
+import mpm_warp.limits
 from mpm_warp import Material, Solver, SolverStopped
 
 HERE = Path(__file__).resolve().parent
@@ -42,7 +42,7 @@ def mean_force(courant: float, particles_per_cell: float, youngs_modulus: float)
 
 def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    mpm_warp.guard.STABLE_COURANT = math.inf  # past the guard, which would stop all runs from 0.86 on
+    mpm_warp.limits.STABLE_COURANT = math.inf  # past the guard, which would stop all runs from 0.86 on
     with (HERE / "step.csv").open("w", newline="") as stream:
         writer = csv.writer(stream)
         writer.writerow(["youngs_modulus", "particles_per_cell", "courant", "draft", "vertical", "stopped"])

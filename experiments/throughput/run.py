@@ -22,7 +22,7 @@ from pathlib import Path
 import matplotlib
 import ours
 
-from sgns.evaluation.provenance import cpu_model
+from sgns.evaluate.costs import cpu_model
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

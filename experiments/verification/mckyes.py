@@ -12,7 +12,7 @@ import numpy as np
 
 from mpm_warp import Bed, Effects, Material, MeshBody, Plate, Scene, Solver, Walls
 from mpm_warp.bodies import Body
-from mpm_warp.rotation import about_y, rotate
+from mpm_warp.poses import about_y, rotate
 
 ANGLE = math.degrees(math.atan(0.76))  # of friction, of the paper's sand [degrees]
 WALL_ANGLE = math.atan(0.3)  # of friction between soil and blade [rad]

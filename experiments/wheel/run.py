@@ -14,11 +14,10 @@ from hydra import compose, initialize_config_module
 
 matplotlib.use("Agg")
 
-from sgns.evaluation.sideview import side_views
-from sgns.runs import Run
-from sgns.scene_effects import asked_effects, decided
-from sgns.scene_run import simulate_scene
-from sgns.scenes import scene_from_config
+from sgns.data.run import Run
+from sgns.evaluate.side_view import side_views
+from sgns.simulate.run import simulate_scene
+from sgns.simulate.scene import asked_effects, decided, scene_from_config
 
 HERE, DATA = Path(__file__).parent, Path("data/wheel")
 SLIPS = (0.2, 0.7)

@@ -9,9 +9,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sgns.errors import UserError
-    from sgns.reduction import Basis, IncrementalPCA
-    from sgns.runs import Run
+    from sgns.config import UserError
+    from sgns.data.run import Run
+    from sgns.reduction.basis import Basis
+    from sgns.reduction.pca import IncrementalPCA
     from sgns.simulator import Simulator
 
 __all__ = ["Basis", "IncrementalPCA", "Run", "Simulator", "UserError", "__version__"]
@@ -23,7 +24,7 @@ _HOME = {
     "IncrementalPCA": "sgns.reduction",
     "Run": "sgns.runs",
     "Simulator": "sgns.simulator",
-    "UserError": "sgns.errors",
+    "UserError": "sgns.config",
 }
 
 

@@ -2,6 +2,6 @@
 
 import sys
 
-from sgns.cli import main
+from sgns.cli.commands import main
 
 sys.exit(main())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["elapsed"]
-
 LEAST_TIME = 1.0e-9
 """[s]; the clocks count in such steps."""
 

@@ -8,8 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-__all__ = ["main"]
-
 OUTPUT = Path("outputs/demo")
 CHECKPOINT = OUTPUT / "best.ckpt"
 NEW_PATH = OUTPUT / "new_path.h5"

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from sgns.claim import only_here
 from sgns.clock import elapsed
-from sgns.errors import UserError
-from sgns.runs import RunWriter, frame_chunks
-from sgns.runs.stopped import require_run_place
-from sgns.settings import differences
+from sgns.config import UserError, differences
+from sgns.data.files import only_here
+from sgns.data.run import frame_chunks, require_run_place
+from sgns.data.writer import RunWriter
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -27,15 +26,6 @@ if TYPE_CHECKING:
     from sgns.simulator import Simulator
     from sgns.states import Rollout
 
-__all__ = [
-    "RolloutTiming",
-    "main",
-    "require_known_bed",
-    "require_same_freedom",
-    "rollout_scene",
-    "single_thread",
-    "write_rollout",
-]
 
 log = logging.getLogger(__name__)
 
@@ -275,8 +265,8 @@ def rollout_scene(
 
 def main(cfg: DictConfig) -> float:
     """The `sgns rollout` command; returns wall seconds per simulated second (steps with force)."""
-    from sgns.cost import require_space, run_cost
-    from sgns.scenes import scene_from_config
+    from sgns.simulate.campaign import require_space, run_cost
+    from sgns.simulate.scene import scene_from_config
     from sgns.simulator import Simulator
 
     if not isinstance(cfg.rate_independent, bool):

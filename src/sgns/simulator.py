@@ -19,19 +19,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mpm_warp.poses import fitted_poses, in_world_frame
+from sgns.arrays import check_pose, check_poses, finite_array, first_pose, is_whole, real_array
 from sgns.clock import elapsed
-from sgns.errors import UserError
-from sgns.given import finite_array, is_whole, real_array
-from sgns.learning.body import BodyTrack, body_track
-from sgns.learning.context import context_of
-from sgns.learning.prediction import Step
-from sgns.learning.surrogate import Surrogate, load_surrogate
-from sgns.learning.training_range import Excess, TrainingRange
-from sgns.learning.travel import Travel, markers, stepped_frames
-from sgns.poses import check_pose, check_poses, first_pose, fitted_poses, in_world_frame
+from sgns.config import UserError
+from sgns.model.checkpoint import Surrogate, load_surrogate
+from sgns.model.dynamics import Step
+from sgns.model.features import BodyTrack, Travel, body_track, context_of, markers, stepped_frames
+from sgns.model.training_range import Excess, TrainingRange
 from sgns.states import Rollout, Rollouts, State
-
-__all__ = ["Simulator"]
 
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then its travel [s].
 _SETTLING = 0.5
@@ -49,7 +45,7 @@ class Simulator:
         device: "cpu" or "cuda".
         num_modes: Of the soil, the first of those it was trained with; None: all.
         rate_independent: Whether the soil follows the travel of a prescribed tool, not the clock, where the tool is
-            slower than in all training runs (see `sgns.learning.travel`).
+            slower than in all training runs (see `sgns.model.features`).
 
     Attributes:
         start_positions: Of all particles at rest [m], shape (n, 3).

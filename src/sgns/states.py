@@ -11,10 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from sgns.learning.training_range import Excess
+from sgns.model.training_range import Excess
 from sgns.reduction.basis import Basis
-
-__all__ = ["Rollout", "Rollouts", "State"]
 
 
 @dataclass(frozen=True, eq=False)

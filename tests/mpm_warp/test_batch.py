@@ -24,10 +24,9 @@ from mpm_warp import (
     Wheel,
     frames_together,
 )
-from mpm_warp import work as work_module
+from mpm_warp import launch as work_module
 from mpm_warp.batch import all_together
-from mpm_warp.launches import Launch, Together
-from mpm_warp.work import Program, Work
+from mpm_warp.launch import Launch, Program, Together, Work
 
 needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
 

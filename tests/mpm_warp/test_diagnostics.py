@@ -8,7 +8,7 @@ from beds import cut
 
 from mpm_warp import Frame, Plate, Solver
 from mpm_warp.diagnostics import leakage, leaked
-from mpm_warp.rotation import about_y
+from mpm_warp.poses import about_y
 
 PLATE = Plate(thickness=0.02, width=0.2, length=0.1)
 

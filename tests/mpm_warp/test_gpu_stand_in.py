@@ -9,9 +9,7 @@ from stand_in import Checked, Threads, compiler, on_stand_in
 from threads import beyond_the_end, from_neighbour, one_more
 
 from mpm_warp import Bed, Plate, Solver
-from mpm_warp.launches import Launch
-from mpm_warp.start import find_device
-from mpm_warp.work import Program, Work, Worker
+from mpm_warp.launch import Launch, Program, Work, Worker, find_device
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="needs g++ on Linux")
 

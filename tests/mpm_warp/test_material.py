@@ -8,7 +8,7 @@ import pytest
 from beds import cut
 
 from mpm_warp import Material, Scene, SceneError
-from mpm_warp.friction import FRICTION_MAPS, static_friction
+from mpm_warp.material import FRICTION_MAPS, static_friction
 
 
 def cone_ratio(stress):

@@ -10,20 +10,10 @@ import pytest
 import warp as wp
 from beds import cut
 
-from mpm_warp import (
-    Bed,
-    Excavation,
-    Material,
-    Plate,
-    Scene,
-    SceneError,
-    Solver,
-    Wheel,
-    effects_for,
-)
-from mpm_warp import size as size_module
-from mpm_warp.rotation import rotate
-from mpm_warp.size import scene_size
+from mpm_warp import Bed, Excavation, Material, Plate, Scene, SceneError, Solver, Wheel, effects_for
+from mpm_warp import limits as size_module
+from mpm_warp.limits import scene_size
+from mpm_warp.poses import rotate
 
 
 def test_a_scene_survives_json():

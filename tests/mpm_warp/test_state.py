@@ -9,20 +9,9 @@ import numpy as np
 import pytest
 from beds import block, cut
 
-from mpm_warp import (
-    Bed,
-    Effects,
-    Incline,
-    Material,
-    SceneError,
-    Solver,
-    SolverStopped,
-    State,
-    Walls,
-    Wheel,
-)
+from mpm_warp import Bed, Effects, Incline, Material, SceneError, Solver, SolverStopped, State, Walls, Wheel
 from mpm_warp.batch import all_together
-from mpm_warp.guard import Guard
+from mpm_warp.limits import Guard
 
 
 def wheel() -> Wheel:

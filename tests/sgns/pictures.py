@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib import image
 from matplotlib.figure import Figure
 
-from sgns.evaluation import figures
+from sgns.evaluate import figures
 
 __all__ = ["pixels"]
 

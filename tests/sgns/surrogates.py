@@ -10,12 +10,13 @@ from typing import Any, ClassVar
 import numpy as np
 from synthetic import make_run
 
-from sgns.evaluation.metrics import VectorErrors
-from sgns.evaluation.scores import Scores
-from sgns.learning.training_range import Excess
-from sgns.poses import in_world_frame
-from sgns.reduction import Basis, IncrementalPCA
-from sgns.runs import Run
+from mpm_warp.poses import in_world_frame
+from sgns.data.run import Run
+from sgns.evaluate.metrics import VectorErrors
+from sgns.evaluate.results import Scores
+from sgns.model.training_range import Excess
+from sgns.reduction.basis import Basis
+from sgns.reduction.pca import IncrementalPCA
 
 
 @dataclass

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sgns.runs import RunWriter
+from sgns.data.writer import RunWriter
 
 __all__ = ["BED", "PLATE", "make_run", "make_writer", "random_frame", "random_poses", "start_positions"]
 

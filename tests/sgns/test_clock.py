@@ -10,12 +10,12 @@ import torch
 from test_campaign import campaign
 
 from mpm_warp import Effects
-from sgns import campaign_runs
 from sgns.clock import elapsed
-from sgns.cost import run_cost
-from sgns.evaluation import full_space_cost
-from sgns.runs import Run
-from sgns.scene_run import simulate_scene
+from sgns.data.run import Run
+from sgns.evaluate import costs as full_space_cost
+from sgns.simulate import workers as campaign_runs
+from sgns.simulate.campaign import run_cost
+from sgns.simulate.run import simulate_scene
 
 
 @pytest.fixture(params=[0.0, -7.0], ids=["still", "back"])

@@ -10,9 +10,9 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns import demo
-from sgns.campaign import plan
-from sgns.cli import COMMANDS
-from sgns.scenes import scene_from_config
+from sgns.cli.commands import COMMANDS
+from sgns.simulate.campaign import plan
+from sgns.simulate.scene import scene_from_config
 
 
 @pytest.fixture

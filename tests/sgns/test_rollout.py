@@ -5,16 +5,12 @@ import pytest
 from meshes import box_corners, box_triangles
 from surrogates import FakeSimulator, fitted, small_dataset
 
-from sgns.errors import UserError
-from sgns.learning.training_range import Excess
-from sgns.rollout import (
-    RolloutTiming,
-    bed_differences,
-    require_known_bed,
-    rollout_scene,
-    unlearned,
-)
-from sgns.runs import Run, check_run, chunks
+from sgns.config import UserError
+from sgns.data import run as chunks
+from sgns.data.check import check_run
+from sgns.data.run import Run
+from sgns.model.training_range import Excess
+from sgns.rollout import RolloutTiming, bed_differences, require_known_bed, rollout_scene, unlearned
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ import pytest
 import torch
 from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, reduced
 
-from sgns.errors import UserError
-from sgns.learning.surrogate import load_surrogate
-from sgns.learning.training import train
+from sgns.config import UserError
+from sgns.model.checkpoint import load_surrogate
 from sgns.simulator import Simulator
+from sgns.train.command import train
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import torch
 import yaml
 from synthetic import make_run
 
-from sgns.campaign import Dataset
-from sgns.reduction.reduced import ReducedDataset, reduce_dataset
+from sgns.data.dataset import Dataset
+from sgns.reduction.reduce import ReducedDataset, reduce_dataset
 
 # Matrices this small are slower on several threads, and results must not depend on the number of cores.
 torch.set_num_threads(1)

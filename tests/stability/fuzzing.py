@@ -17,7 +17,7 @@ from typing import Any
 from hypothesis import HealthCheck, Phase, settings
 
 from mpm_warp import SceneError
-from sgns.errors import UserError
+from sgns.config import UserError
 
 __all__ = ["OUTCOMES", "bounded", "cases", "refused_or_read"]
 

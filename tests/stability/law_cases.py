@@ -13,9 +13,9 @@ from case import Case
 from measures import frames_of
 
 from mpm_warp import Effects, Material, Solver
-from mpm_warp.constitutive import constitutive
-from mpm_warp.soil import soil_parameters, soil_struct
-from mpm_warp.start import start_warp
+from mpm_warp.kernels.constitutive import constitutive
+from mpm_warp.kernels.fluidity import soil_parameters, soil_struct
+from mpm_warp.launch import start_warp
 
 SAND = Material()
 LAWS = {

@@ -8,7 +8,7 @@ import numpy as np
 
 from mpm_warp import Frame, Scene, SceneError, Solver, SolverStopped
 from mpm_warp.diagnostics import leakage
-from mpm_warp.rotation import rotate
+from mpm_warp.poses import rotate
 
 __all__ = [
     "blade_force",

@@ -17,9 +17,10 @@ from case import Case
 from refusals import unsaid
 from tiny import REDUCTION, make_dataset
 
-from sgns.campaign import Dataset
-from sgns.reduction import Basis, IncrementalPCA
-from sgns.reduction.reduced import reduce_dataset
+from sgns.data.dataset import Dataset
+from sgns.reduction.basis import Basis
+from sgns.reduction.pca import IncrementalPCA
+from sgns.reduction.reduce import reduce_dataset
 
 __all__ = ["CASES"]
 

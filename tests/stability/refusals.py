@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from sgns.errors import UserError
+from sgns.config import UserError
 
 __all__ = ["unsaid"]
 

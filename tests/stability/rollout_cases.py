@@ -16,10 +16,11 @@ from case import Case
 from refusals import unsaid
 from trained import quick_data, quick_network, simulator_of, synthetic_data, synthetic_network
 
-from sgns.learning.training_range import NOTEWORTHY
-from sgns.reduction.reduced import ReducedDataset, ReducedRun
+from sgns.data.check import check_run
+from sgns.data.run import Run
+from sgns.model.training_range import NOTEWORTHY
+from sgns.reduction.reduce import ReducedDataset, ReducedRun
 from sgns.rollout import write_rollout
-from sgns.runs import Run, check_run
 from sgns.simulator import Simulator
 from sgns.states import Rollout
 

@@ -11,8 +11,8 @@ from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from tiny import make_dataset
 
-from sgns.cli import main
-from sgns.scenes import scene_from_config
+from sgns.cli.commands import main
+from sgns.simulate.scene import scene_from_config
 
 __all__ = ["REDUCED", "SMALL", "TRAIN", "call", "small_dataset"]
 

@@ -18,17 +18,17 @@ from kills import broken, same
 from small import SMALL, TRAIN
 from tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
 
-from sgns.evaluation.training_curves import read_log
-from sgns.learning.training import train
-from sgns.reduction.reduced import reduce_dataset
-from sgns.wholefile import whole_file, write_whole
+from sgns.data.files import whole_file, write_whole
+from sgns.evaluate.figures import read_log
+from sgns.reduction.reduce import reduce_dataset
+from sgns.train.command import train
 
 resource = pytest.importorskip("resource", reason="needs limits on a process")
 
 LIMITED = """
 import resource, sys
 limit = int(sys.argv.pop(1))
-import sgns.cli, sgns.simulate, sgns.learning.training, sgns.rollout, sgns.reduction.reduce
+import sgns.cli, sgns.simulate.command, sgns.train.command, sgns.rollout, sgns.reduction.command
 sys.argv[0] = "sgns"
 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 sys.exit(sgns.cli.main())
@@ -101,7 +101,7 @@ def test_a_training_whose_disk_fills_up_goes_on_when_there_is_space(tmp_path, mo
         return whole_file(path)
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
-        patch.setattr("sgns.learning.surrogate.whole_file", full)
+        patch.setattr("sgns.model.checkpoint.whole_file", full)
         run(tmp_path / "parts")
     assert broken(tmp_path / "parts") == []
     run(tmp_path / "parts")
@@ -174,7 +174,7 @@ def test_a_clock_that_is_set(days, tmp_path, monkeypatch) -> None:
 
     run(tmp_path / "whole")
     with monkeypatch.context() as patch, pytest.raises(Interrupted):
-        patch.setattr("sgns.learning.training.StepProgress.on_train_batch_end", stop)
+        patch.setattr("sgns.train.command.StepProgress.on_train_batch_end", stop)
         run(tmp_path / "parts")
     now = time.time
     monkeypatch.setattr(time, "time", lambda: now() + 86400.0 * days)
@@ -191,7 +191,7 @@ def test_leftovers_of_a_killed_process_do_not_stay(collected, tmp_path) -> None:
     """Also not while its number is still taken because nobody has asked for its status."""
     if not collected and not Path("/proc/self/stat").exists():
         pytest.skip("this system does not show the states of processes as files")
-    code = "import os, sys; from pathlib import Path; from sgns.wholefile import whole_file\n"
+    code = "import os, sys; from pathlib import Path; from sgns.data.files import whole_file\n"
     code += "with whole_file(Path(sys.argv[1])) as hidden: hidden.write_text('half'); os.kill(os.getpid(), 9)"
     process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "a")])
     os.waitid(os.P_PID, process.pid, os.WEXITED | (0 if collected else os.WNOWAIT))
@@ -205,7 +205,7 @@ def test_a_disk_that_is_full_for_the_basis_leaves_the_earlier_one(tmp_path) -> N
     folder = reduced(tmp_path).folder
     before = files(folder)
     code = "import resource, sys, torch; from sgns.reduction import Basis\n"
-    code += "from sgns.errors import UserError\nbasis = Basis.load(sys.argv[1])\n"
+    code += "from sgns.config import UserError\nbasis = Basis.load(sys.argv[1])\n"
     code += "resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))\n"
     code += "try: basis.save(sys.argv[1])\nexcept UserError as error: sys.exit(str(error))"
     done = subprocess.run(

@@ -29,24 +29,24 @@ from synthetic import make_run
 from tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
 
 from mpm_warp import SceneError
-from mpm_warp.mesh_file import read_mesh
-from sgns.campaign import Dataset
-from sgns.cli import main
-from sgns.errors import UserError
-from sgns.evaluation.costs import network_costs
-from sgns.evaluation.training_curves import read_log
+from mpm_warp.mesh import read_mesh
+from sgns.cli.commands import main
+from sgns.config import UserError, parse_yaml
+from sgns.data.check import check_run
+from sgns.data.dataset import Dataset
+from sgns.data.published import read_published
+from sgns.data.run import Run
+from sgns.evaluate.costs import network_costs
+from sgns.evaluate.figures import read_log
 from sgns.frontier.observation import read_observation
 from sgns.frontier.point import read_points
-from sgns.frontier.store import Store
-from sgns.frontier.timed_training import read_record
-from sgns.learning.surrogate import load_surrogate, read_checkpoint
-from sgns.learning.training import train
-from sgns.published import read_published
-from sgns.reduction import Basis
-from sgns.reduction.reduced import ReducedDataset, read_reduced, reduce_dataset
-from sgns.runs import Run, check_run
-from sgns.scenes import read_path
-from sgns.yaml_text import parse_yaml
+from sgns.frontier.study import Store
+from sgns.frontier.surrogate_points import read_record
+from sgns.model.checkpoint import load_surrogate, read_checkpoint
+from sgns.reduction.basis import Basis
+from sgns.reduction.reduce import ReducedDataset, read_reduced, reduce_dataset
+from sgns.simulate.scene import read_path
+from sgns.train.command import train
 
 SECRET = "canary-in-another-file"
 FEW = TRAINING | {"max_steps": 2, "validate_every": 2}
@@ -384,7 +384,7 @@ def experiments(empty_folder, canary) -> Path:
     ],
 )
 def test_targets_in_sweeps_before_the_first_job(experiments, canary, overrides, capsys, monkeypatch) -> None:
-    monkeypatch.setattr("sgns.simulate.main", lambda cfg: canary.touch())
+    monkeypatch.setattr("sgns.simulate.command.main", lambda cfg: canary.touch())
     arguments = [override.replace("CANARY", str(canary)) for override in overrides]
     said = refused(capsys, monkeypatch, "simulate", "-m", "--config-dir", str(experiments), *arguments)
     assert "cannot name Python objects" in said
@@ -393,7 +393,7 @@ def test_targets_in_sweeps_before_the_first_job(experiments, canary, overrides, 
 
 def test_targets_in_a_later_batch_of_a_sweep(experiments, canary, capsys, monkeypatch) -> None:
     seeds = []
-    monkeypatch.setattr("sgns.simulate.main", lambda cfg: seeds.append(cfg.seed))
+    monkeypatch.setattr("sgns.simulate.command.main", lambda cfg: seeds.append(cfg.seed))
     batches = "hydra.sweeper.max_batch_size=1"  # each is put together when its turn comes
     sweep = ["-m", "--config-dir", str(experiments), "experiment=good,bad", batches]
     assert "cannot name Python objects" in refused(capsys, monkeypatch, "simulate", *sweep).splitlines()[-1]

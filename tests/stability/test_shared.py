@@ -13,9 +13,9 @@ from kills import broken, same
 from test_campaign import campaign
 from test_disk import with_path
 
-from sgns.campaign_runs import simulate_campaign
-from sgns.claim import claimed
-from sgns.errors import UserError
+from sgns.config import UserError
+from sgns.data.files import claimed
+from sgns.simulate.workers import simulate_campaign
 
 pytest.importorskip("fcntl", reason="this system has no file locks")
 
@@ -24,7 +24,7 @@ CLAIM = """
 import sys
 from pathlib import Path
 from ordinary import become_ordinary
-from sgns.claim import claimed
+from sgns.data.files import claimed
 become_ordinary()
 with claimed(Path(sys.argv[1])) as ours:
     print(ours)
@@ -33,7 +33,7 @@ DRAW = {"depth": [0.02, 0.03, 0.04, 0.05], "duration": [0.5]}
 MAKE = f"""
 import sys, pathlib
 from test_campaign import campaign
-from sgns.campaign_runs import simulate_campaign
+from sgns.simulate.command.workers import simulate_campaign
 if __name__ == "__main__":
     made = campaign(pathlib.Path(sys.argv[1]), runs=4, draw={DRAW})
     simulate_campaign(made, device="cpu", workers=1)
@@ -42,7 +42,7 @@ RECORD = """
 import os, sys
 from pathlib import Path
 from test_campaign import campaign
-from sgns.errors import UserError
+from sgns.config import UserError
 made = campaign(Path(sys.argv[1]), seed=int(sys.argv[2]), runs=4)
 print("ready", flush=True)
 sys.stdin.readline()
@@ -137,6 +137,6 @@ def test_a_folder_of_another_user_is_named(tmp_path, monkeypatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied", str(made.path))
 
-    monkeypatch.setattr("sgns.claim.os.open", refuse)
+    monkeypatch.setattr("sgns.data.files.os.open", refuse)
     with pytest.raises(UserError, match=r"cannot write .*dataset\.yaml: Permission denied"):
         simulate_campaign(made, device="cpu", workers=1)

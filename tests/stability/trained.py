@@ -13,11 +13,11 @@ import numpy as np
 import tiny
 from omegaconf import OmegaConf
 
-from sgns.campaign import Dataset
-from sgns.errors import UserError
-from sgns.learning.training import train
-from sgns.reduction.reduced import ReducedDataset, reduce_dataset
+from sgns.config import UserError
+from sgns.data.dataset import Dataset
+from sgns.reduction.reduce import ReducedDataset, reduce_dataset
 from sgns.simulator import Simulator
+from sgns.train.command import train
 
 __all__ = [
     "fresh_data",

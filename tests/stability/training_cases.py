@@ -19,11 +19,11 @@ from refusals import unsaid
 from torch import nn
 from trained import fresh_data, poisoned, synthetic_data, synthetic_network, train_synthetic
 
-from sgns.learning.data import TrainingWindows
-from sgns.learning.dynamics import LatentDynamics
-from sgns.learning.monitoring import StepProgress
-from sgns.learning.trainee import SurrogateTraining, TrainingSettings
+from sgns.model.network_dynamics import LatentDynamics
 from sgns.simulator import Simulator
+from sgns.train.callbacks import StepProgress
+from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
+from sgns.train.windows import TrainingWindows
 
 __all__ = ["CASES"]
 

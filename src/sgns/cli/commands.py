@@ -17,13 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from sgns import __version__
-from sgns.cli.console import open_closed_streams, write_error, write_output
-from sgns.errors import UserError
+from sgns.cli.help import open_closed_streams, write_error, write_output
+from sgns.config import UserError
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
-
-__all__ = ["COMMANDS", "main", "run_command"]
 
 
 class Command(NamedTuple):
@@ -44,31 +42,32 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "simulate": Command(
-        "sgns.simulate", "simulate a scene or a dataset with the material point method", "file", ("output",)
+        "sgns.simulate.command",
+        "simulate a scene or a dataset with the material point method",
+        "file",
+        ("output",),
     ),
     "reduce": Command(
-        "sgns.reduction.reduce",
+        "sgns.reduction.command",
         "fit the basis (PCA) on a dataset and reduce its runs",
         "folder",
         ("dataset.path",),
     ),
-    "train": Command(
-        "sgns.learning.training", "learn a simulator from a dataset", "folder", ("dataset.path",)
-    ),
+    "train": Command("sgns.train.command", "learn a simulator from a dataset", "folder", ("dataset.path",)),
     "rollout": Command(
         "sgns.rollout", "let a trained network play a scene", "file", ("checkpoint", "output")
     ),
     "evaluate": Command(
-        "sgns.evaluation.evaluate",
+        "sgns.evaluate.command",
         "compare a trained network with true runs; write the report",
         "folder",
         ("dataset.path", "checkpoint"),
     ),
     "frontier": Command(
-        "sgns.frontier.frontier", "measure what accuracy costs in time; table, figures and page", "folder"
+        "sgns.frontier.command", "measure what accuracy costs in time; table, figures and page", "folder"
     ),
-    "advise": Command("sgns.frontier.advise", "name the setting that is good and fast enough", None),
-    "check": Command("sgns.check", "read run files through and list what is wrong with them", None),
+    "advise": Command("sgns.advise", "name the setting that is good and fast enough", None),
+    "check": Command("sgns.data.check", "read run files through and list what is wrong with them", None),
 }
 
 
@@ -121,7 +120,7 @@ def _run(arguments: list[str]) -> int:
         command, rest = _split(arguments)
         name = f"sgns {command}"
         if "--help" in rest or "-h" in rest:
-            from sgns.cli.command_help import command_help
+            from sgns.cli.help import command_help
 
             write_output(command_help(command))
             return 0
@@ -146,7 +145,7 @@ def run_command(cfg: DictConfig) -> float | None:
     """Hydra's task: run one job; its value is the command's main metric, for sweepers to optimise."""
     from hydra.core.hydra_config import HydraConfig
 
-    from sgns.cli.shared_settings import check_shared
+    from sgns.cli.settings import check_shared
 
     hydra_cfg = HydraConfig.get()
     name = hydra_cfg.job.config_name
@@ -187,7 +186,7 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
     from hydra.core.plugins import Plugins
     from hydra.types import RunMode
 
-    from sgns.cli.settings_loader import CheckedLoader, ConfigDir
+    from sgns.cli.settings import CheckedLoader, ConfigDir
 
     if arguments.config_dir is not None and not os.path.isdir(arguments.config_dir):
         raise UserError(f"--config-dir: folder '{arguments.config_dir}' not found")

@@ -23,8 +23,6 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-__all__ = ["describe"]
-
 # OmegaConf's errors that come from what a person wrote, even when they appear inside a command; its other
 # errors there (an unknown attribute, a wrong type) are mistakes of the command.
 _WRITTEN = (MissingMandatoryValue, InterpolationResolutionError, GrammarParseError)

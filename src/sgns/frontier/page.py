@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 
-from sgns.evaluation.report import CSS, html_page, note, picture
-from sgns.evaluation.report_figures import ReportFigure
+from sgns.data.files import whole_file, write_whole
+from sgns.evaluate.report import CSS, html_page, note, picture
+from sgns.evaluate.report_figures import ReportFigure
 from sgns.frontier.figures import (
     COLUMNS,
     known,
@@ -17,12 +18,8 @@ from sgns.frontier.figures import (
     through_time_figure,
     training_figure,
 )
-from sgns.frontier.gather import front
-from sgns.frontier.point import Point, write_points
+from sgns.frontier.point import Point, front, write_points
 from sgns.frontier.study import Study, StudyScene
-from sgns.wholefile import whole_file, write_whole
-
-__all__ = ["PAGE", "write_study"]
 
 PAGE = "frontier.html"
 

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import csv
+import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from sgns.errors import UserError
-from sgns.smallfile import read_table
-from sgns.wholefile import whole_file
+from sgns.config import UserError
+from sgns.data.files import whole_file
+from sgns.data.small_files import read_table
 
-__all__ = ["KINDS", "Point", "read_points", "write_points"]
+log = logging.getLogger(__name__)
+
+
+# --- One operating point: a way to get the motion of the soil, what it costs and how wrong it is. One row o
 
 SHARED = 1.1  # wall time over processor time from which a core counts as shared
 KINDS = ("solver", "reduction", "surrogate", "full space")
@@ -220,3 +224,30 @@ def read_points(file: Path) -> list[Point]:
         return [Point.from_row(row) for row in rows]
     except UserError as error:
         raise UserError(f"{file} is no table of operating points: {error}") from None
+
+
+# --- Errors of the points that are there, and which of them nobody beats --------------------------------
+
+
+def usable(point: Point) -> bool:
+    """Whether a point can stand in for a simulation: it finished, and needs no run of the solver as its input."""
+    return point.kind != "reduction" and not math.isnan(point.cost)
+
+
+def effective_error(point: Point, column: str, bands: Mapping[str, float]) -> float:
+    """An error, but never less than what the reference itself may be wrong by; NaN if it is not known."""
+    band = bands.get(column, 0.0)
+    if point.axis == "reference":
+        return band if column in bands else math.nan
+    return max(getattr(point, column), band) if not math.isnan(getattr(point, column)) else math.nan
+
+
+def front(points: Iterable[Point], column: str, bands: Mapping[str, float]) -> list[Point]:
+    """The points that no faster point equals in an error, fastest first (Pareto)."""
+    best, found = math.inf, []
+    for point in sorted(filter(usable, points), key=lambda point: point.cost):
+        error = effective_error(point, column, bands)
+        if error < best:
+            best = error
+            found.append(point)
+    return found

@@ -1,29 +1,218 @@
-"""What a study measures: its scenes, the cases each scene is judged on, and the points of its axes."""
+"""A study: which points of which scenes are measured, how they are timed, and where they are kept."""
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Mapping
+import re
+import shlex
+import statistics
+import subprocess
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
 
-from mpm_warp import Scene
-from sgns.errors import UserError
-from sgns.frontier.store import Store
-from sgns.frontier.timing import composed_scene
-from sgns.smallfile import read_text
-from sgns.wholefile import write_whole
-from sgns.yaml_text import parse_yaml
+from mpm_warp import Frame, Scene, Solver, effects_for
+from sgns import __version__
+from sgns.clock import elapsed
+from sgns.config import UserError, parse_yaml
+from sgns.data.files import write_whole
+from sgns.data.small_files import read_json, read_text
+from sgns.evaluate.costs import command_line, cpu_model
+from sgns.frontier.observation import Observation, read_observation
+from sgns.frontier.point import SHARED, Point
+from sgns.simulate.scene import scene_from_config
 
-__all__ = ["AXES", "PointSettings", "Study", "StudyScene"]
+# --- Wall times that can be compared: one core, warm, medians, beside a workload that is always the same
+# The reference workload is the default scene of `sgns simulate` (the paper's bin at 20 mm, 4 particles per
+# cell, half of
+# it computed) while the plate cuts. Its time is taken just before and just after what is measured, on the
+# same core, so
+# that ratios to it hold on a machine whose speed changes.
+
+FRAMES = 8  # of one measurement of the workload
+STRETCHES = 2  # of which the median is taken, before and after each
+
+
+@contextmanager
+def one_core(last: bool = False) -> Iterator[None]:
+    """This process on the first (or last) core it may use, and torch on one thread; as before afterwards."""
+    threads = torch.get_num_threads()
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
+    try:
+        torch.set_num_threads(1)
+        if cores:
+            os.sched_setaffinity(0, {max(cores) if last else min(cores)})
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        if cores:
+            os.sched_setaffinity(0, cores)
+
+
+def composed_scene(overrides: Sequence[str]) -> tuple[Scene, Any]:
+    """The scene and all settings of `sgns simulate` with these overrides."""
+    if GlobalHydra.instance().is_initialized():
+        cfg = compose("simulate", list(overrides))
+    else:
+        with initialize_config_module("sgns.conf", version_base="1.3"):
+            cfg = compose("simulate", list(overrides))
+    return scene_from_config(cfg), cfg
+
+
+class Workload:
+    """The reference workload, warm."""
+
+    def __init__(self) -> None:
+        self._scene, _ = composed_scene(["scene=excavation"])
+        self._frames: Iterator[Frame] = iter(())
+
+    def measure(self) -> list[float]:
+        """Wall seconds per simulated second of each of a few stretches; processor seconds where the core was shared."""
+        found = []
+        for _ in range(STRETCHES):
+            if next(self._frames, None) is None:
+                self._frames = Solver(self._scene, effects_for(self._scene)[0]).frames()
+                for _ in range(2):  # the first frame loads kernels, the second is the first that computes
+                    next(self._frames)
+            began, processor = time.perf_counter(), time.process_time()
+            done = sum(1 for _ in zip(range(FRAMES), self._frames, strict=False))
+            if done == FRAMES:
+                wall, processor = elapsed(began, time.perf_counter()), elapsed(processor, time.process_time())
+                seconds = processor if wall > SHARED * processor else wall
+                found.append(seconds * self._scene.frame_rate / FRAMES)
+        return found or self.measure()
+
+
+def cost_fields(
+    rates: Sequence[float], workload: Sequence[float], processor_rate: float = float("nan")
+) -> dict[str, Any]:
+    """The columns of `Point` that say what it costs, for the CPU.
+
+    Args:
+        rates: wall seconds per simulated second, of each repeat.
+        workload: those of the reference workload before and after.
+        processor_rate: processor seconds per simulated second.
+    """
+    median, reference = statistics.median(rates), statistics.median(workload)
+    cost = processor_rate if median > SHARED * processor_rate else median
+    return {
+        "wall_s_per_simulated_s": median,
+        "wall_s_per_simulated_s_low": min(rates),
+        "wall_s_per_simulated_s_high": max(rates),
+        "processor_s_per_simulated_s": processor_rate,
+        "repeats": float(len(rates)),
+        "workload_wall_s_per_simulated_s": reference,
+        "ratio": cost / reference,
+        "processor": cpu_model(),
+        "threads": 1.0,
+        "device": "cpu",
+    }
+
+
+def made_here() -> dict[str, str]:
+    """The columns of `Point` that say how and where it is measured; the command without its output folder."""
+    words = shlex.split(command_line())
+    return {
+        "command": shlex.join(word for word in words if not word.startswith("output=")),
+        "machine": cpu_model(),
+        "version": __version__,
+        "commit": commit(),
+    }
+
+
+@cache
+def commit() -> str:
+    """Short name of the commit this package runs from; empty if it is no checkout."""
+    try:
+        asked = subprocess.run(
+            ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=10,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return asked.stdout.strip() if asked.returncode == 0 else ""
+
+
+# --- Points in a folder, one file each, so that a study goes on where it stopped ------------------------
+# <output>/points/<scene>_<kind>_<label>.json                 one point without its errors; written last, whole
+# <output>/observations/<scene>_<kind>_<label>_<case>.npz     its runs
+
+
+@dataclass(frozen=True)
+class Store:
+    """The folder of a study."""
+
+    folder: Path
+
+    def file(self, scene: str, kind: str, label: str) -> Path:
+        """Where a point is; it is there when it is complete."""
+        return self.folder / "points" / f"{name_of(scene, kind, label)}.json"
+
+    def has(self, scene: str, kind: str, label: str) -> bool:
+        """Whether a point has been measured."""
+        return self.file(scene, kind, label).exists()
+
+    def save(self, point: Point, observations: Mapping[str, Observation]) -> None:
+        """Keep a point with its run of every case; none for a point that left the range (say so in its note)."""
+        name = name_of(point.scene, point.kind, point.label)
+        for case, observation in observations.items():
+            observation.save(self._observation(name, case))
+        content = {"point": point.row(), "cases": list(observations)}
+        file = self.file(point.scene, point.kind, point.label)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(file, json.dumps(content, indent=1, ensure_ascii=False))
+
+    def points(self) -> list[tuple[Point, list[str]]]:
+        """All points with the names of their cases, in the order of their files' names.
+
+        Raises:
+            UserError: a file is damaged.
+        """
+        found = []
+        for file in sorted((self.folder / "points").glob("*.json")):
+            advice = "remove it to make it again"
+            content = read_json(file, "no operating point", advice)
+            try:
+                point, cases = content["point"], content["cases"]
+                if not isinstance(point, dict) or not isinstance(cases, list):
+                    raise TypeError("its point is no group of keys, or its cases are no list")
+                if wrong := [c for c in cases if not isinstance(c, str) or set(c) & {"/", os.sep, "\0"}]:
+                    raise ValueError(f"{wrong[0]!r:.40} is no name of a case")
+                found.append((Point.from_row(point), cases))
+            except (ValueError, KeyError, TypeError, UserError) as error:
+                raise UserError(f"{file} is no operating point ({error}); {advice}") from None
+        return found
+
+    def observation(self, point: Point, case: str) -> Observation:
+        """The run of a case of a point."""
+        return read_observation(self._observation(name_of(point.scene, point.kind, point.label), case))
+
+    def _observation(self, name: str, case: str) -> Path:
+        return self.folder / "observations" / f"{name}_{case}.npz"
+
+
+def name_of(scene: str, kind: str, label: str) -> str:
+    """A file name for a point."""
+    return "_".join(re.sub(r"([^\w.+-]|_)+", "-", part) for part in (scene, kind, label))
+
+
+# --- What a study measures: its scenes, the cases each scene is judged on, and the points of its axes ---
 
 AXES = ("solver", "reduction", "surrogate")
 """Groups of points that one command, or one process of several, measures."""
-
 BANDS = ("force_nrmse", "position_rmse_mm", "surface_rmse_mm", "sinkage_error_mm")
 
 

@@ -1,24 +1,16 @@
-"""Operating points of surrogates: trained for a given time, rolled out from rest on the cases, timed.
-
-An entry of `study.scenes.<scene>.surrogate` has axis, label and overrides of `sgns train`, and these keys, which may
-also be given for all entries of a scene under `training`:
-
-    seconds          processor time of the training's steps [s]
-    runs             training runs, of which the basis is made, too; null: all
-    every            frames of the dataset in one of the surrogate's
-    seed             of weights, noise and order of the samples
-    table, case      an entry that was measured elsewhere: the line `case` of a table of experiments/full_space
-"""
+"""Points of surrogates."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 import math
 import shlex
 import statistics
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,28 +21,331 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from mpm_warp import Scene
-from sgns.campaign import Dataset
-from sgns.claim import claimed
 from sgns.clock import elapsed
-from sgns.errors import UserError
-from sgns.evaluation.costs import network_costs
-from sgns.evaluation.scores import Scores
+from sgns.config import UserError
+from sgns.data.dataset import SPLITS, Dataset
+from sgns.data.files import claimed, write_whole
+from sgns.data.run import Run
+from sgns.data.small_files import read_json, read_table
+from sgns.evaluate.command import roll_out, training_means
+from sgns.evaluate.costs import network_costs
+from sgns.evaluate.metrics import body_errors, position_errors, surface_grid
+from sgns.evaluate.results import Scores, aggregate, run_scores
 from sgns.frontier.observation import Observation, observe_arrays, observed_frames
-from sgns.frontier.own_errors import own_errors
 from sgns.frontier.point import Point
-from sgns.frontier.study import PointSettings, Study, StudyScene
-from sgns.frontier.timed_training import TimedTraining, train_for
-from sgns.frontier.timing import Workload, composed_scene, cost_fields, made_here, one_core
-from sgns.frontier.training_sets import every_nth_frame, with_training_runs
-from sgns.reduction.reduced import reduce_dataset
-from sgns.rollout import finite_frames
+from sgns.frontier.study import (
+    PointSettings,
+    Study,
+    StudyScene,
+    Workload,
+    composed_scene,
+    cost_fields,
+    made_here,
+    one_core,
+)
+from sgns.model.settings import ModelSettings, model_settings
+from sgns.reduction.reduce import ReducedDataset, ReducedRun, reduce_dataset
+from sgns.rollout import finite_frames, single_thread
 from sgns.simulator import Simulator
-from sgns.smallfile import read_table
 from sgns.states import Rollout
-
-__all__ = ["TrainingPlan", "measure_surrogates"]
+from sgns.train.command import prepared, train
+from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
 
 log = logging.getLogger(__name__)
+
+
+# --- What a surrogate is trained on, made smaller: fewer runs, fewer frames a second --------------------
+
+
+def with_training_runs(dataset: Dataset, count: int | None, seed: int = 0) -> Dataset:
+    """The dataset with some of its training runs; a smaller number's runs are among a larger one's.
+
+    Args:
+        dataset: With all its runs.
+        count: Of training runs; None: all.
+        seed: Of the order in which they are taken.
+
+    Raises:
+        UserError: It has fewer.
+    """
+    names = dataset.split["train"]
+    if count is None:
+        return dataset
+    if not 1 <= count <= len(names):
+        raise UserError(f"training_runs is {count}; {dataset.path} has {len(names)}: give 1 to {len(names)}")
+    chosen = set(np.random.default_rng(seed).permutation(len(names))[:count].tolist())
+    kept = [name for number, name in enumerate(names) if number in chosen]
+    return replace(dataset, split=dataset.split | {"train": kept})
+
+
+def every_nth_frame(reduced: ReducedDataset, n: int) -> ReducedDataset:
+    """The dataset at 1/n of its frame rate: every nth frame, forces as means over the n frames that end there."""
+    if n == 1:
+        return reduced
+    runs: Mapping[str, list[ReducedRun]] = {
+        split: [_thinned(run, n) for run in reduced.runs(split)] for split in SPLITS
+    }
+    return replace(reduced, frame_rate=reduced.frame_rate / n, _runs=runs)
+
+
+def _thinned(run: ReducedRun, n: int) -> ReducedRun:
+    kept = {name: getattr(run, name)[::n] for name in ("latent", "time", "pose", "body_points")}
+    return replace(run, **kept, force=frame_means(run.force, n), torque=frame_means(run.torque, n))
+
+
+def frame_means(values: np.ndarray, n: int) -> np.ndarray:
+    """Means over the n frames that end with every nth one.
+
+    Args:
+        values: Forces or torques, means over a recorded frame each, shape (T, 3).
+        n: Frames in one of the result.
+
+    Returns:
+        Shape (1 + (T - 1) // n, 3); frame 0 has none before it and stays.
+    """
+    count = (len(values) - 1) // n
+    return np.concatenate([values[:1], values[1 : 1 + count * n].reshape(count, n, 3).mean(axis=1)])
+
+
+class EveryNthFrame:
+    """A run at 1/n of its frame rate, as far as `sgns.evaluate.metrics` reads runs.
+
+    Args:
+        run: The `Run`.
+        n: 1 leaves it as it is.
+    """
+
+    def __init__(self, run, n: int) -> None:
+        self._run, self._frames = run, np.arange(run.frame_count)[::n]
+        self.path: Path = run.path
+        self.frame_count = len(self._frames)
+        self.particle_count: int = run.particle_count
+        self.arrangement_hash: str = run.arrangement_hash
+        self.frame_rate: float = run.frame_rate / n
+        self.wall_time_s: float = run.wall_time_s
+        self.scene = run.scene
+        self.time: np.ndarray = run.time[self._frames]
+        self.pose: np.ndarray = run.pose[self._frames]
+        self.body_points: np.ndarray = run.body_points[self._frames]
+        self.force: np.ndarray = frame_means(run.force, n)
+        self.torque: np.ndarray = frame_means(run.torque, n)
+
+    def positions(self, frames: slice = slice(None)) -> np.ndarray:
+        """Soil particles [m], shape (t, n, 3)."""
+        return self._run.positions(self._frames[frames])
+
+
+# --- Trainings that take a given processor time, whatever a step of theirs takes ------------------------
+
+# Steps that are timed to find out how many fit, after as many that warm up.
+PILOT_STEPS = 12
+SHORTEST_STEP = 1e-6  # [s]; less no step takes
+# How often the validation runs choose the best checkpoint.
+VALIDATIONS = 4
+_SCHEME = 1  # of what a folder of a training stands for
+
+
+@dataclass(frozen=True)
+class TimedTraining:
+    """A complete training.
+
+    Attributes:
+        checkpoint: The best by the validation runs.
+        processor_s: Processor time of the training, validation included [s].
+        steps: Optimiser steps; 0 where there are none (polynomials).
+        samples: Windows seen, all steps together; of polynomials those of the moments, noise drawn anew counted again.
+    """
+
+    checkpoint: Path
+    processor_s: float
+    steps: int
+    samples: int
+
+
+def train_for(
+    seconds: float, reduced: ReducedDataset, settings: Mapping[str, Any], folder: Path, seed: int = 0
+) -> TimedTraining:
+    """Train on this thread for about so much processor time, or take what is complete.
+
+    The steps of the optimiser are as many as fit, by the time of a few, and the learning rate falls over them, so that
+    every training is a whole one. Polynomials are fitted, however long it takes.
+
+    Args:
+        seconds: Processor time of the steps; validation comes on top.
+        reduced: The dataset in its basis.
+        settings: `conf/train` as plain values.
+        folder: Trainings are kept in, each in a folder named by what it depends on.
+        seed: Of weights, noise and order.
+    """
+    model, training = settings["model"], settings["training"] | {"threads": 1, "resume": False}
+    num_modes = reduced.num_modes
+    output = folder / _key(seconds, reduced, model, training, seed)
+    record = output / "timed.json"
+    if record.exists():
+        return read_record(record)
+    torch.set_num_threads(1)
+    frames = sum(len(run.latent) - 1 for run in reduced.runs("train"))
+    checked = model_settings(model)
+    if not isinstance(checked, ModelSettings):
+        steps, samples = 0, frames * training["draws"]
+    else:
+        steps = max(VALIDATIONS, round(seconds / seconds_per_step(reduced, checked, training, seed)))
+        training |= {
+            "max_steps": steps,
+            "validate_every": -(-steps // VALIDATIONS),
+            "warmup_steps": min(training["warmup_steps"], steps // 10),
+        }
+        samples = steps * training["batch_size"]
+    began = time.process_time()
+    train(
+        reduced,
+        num_modes=num_modes,
+        model=model,
+        training=training,
+        output=output,
+        seed=seed,
+        provenance={
+            "preset": settings["preset"]["name"],
+            "dataset": settings["dataset"]["name"],
+            "seconds": seconds,
+        },
+    )
+    done = TimedTraining(output / "best.ckpt", round(elapsed(began, time.process_time()), 1), steps, samples)
+    write_whole(record, json.dumps({k: v for k, v in asdict(done).items() if k != "checkpoint"}) + "\n")
+    return done
+
+
+def read_record(record: Path) -> TimedTraining:
+    """What `train_for` keeps beside a checkpoint.
+
+    Raises:
+        UserError: It is damaged.
+    """
+    advice = "remove it to train again"
+    known = read_json(record, "not the record of a training", advice)
+    kinds = {"processor_s": (int, float), "steps": int, "samples": int}
+    if not isinstance(known, dict) or known.keys() != kinds.keys():
+        raise UserError(f"{record} does not say {', '.join(kinds)}; {advice}")
+    for key, kind in kinds.items():
+        value = known[key]
+        if not isinstance(value, kind) or isinstance(value, bool) or not 0 <= value < math.inf:
+            raise UserError(f"{record}: {key} is {value!r:.40}, not a number of 0 or more; {advice}")
+    return TimedTraining(record.with_name("best.ckpt"), **known)
+
+
+def seconds_per_step(
+    reduced: ReducedDataset, model: ModelSettings, training: Mapping[str, Any], seed: int
+) -> float:
+    """Processor time of an optimiser step with its batch, median of a few [s].
+
+    Raises:
+        UserError: the processor's clock stands still.
+    """
+    settings = TrainingSettings.from_dict(training)
+    surrogate, data = prepared(reduced, reduced.num_modes, model, settings, seed, {}, None)
+    module = SurrogateTraining(surrogate, settings)
+    # Lightning logs only within a trainer, so the step is taken by hand; small, for nothing of it is kept.
+    optimiser = torch.optim.AdamW(module.parameters(), lr=1e-6, fused=True)
+    taken = []
+    for step in range(2 * PILOT_STEPS):
+        began = time.process_time()
+        losses = module.losses(data.training_windows.batch(step, settings.batch_size, data.noise))
+        optimiser.zero_grad()
+        sum(settings.loss[name] * value for name, value in losses.items()).backward()
+        torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+        optimiser.step()
+        taken.append(elapsed(began, time.process_time()))
+    found = statistics.median(taken[PILOT_STEPS:])
+    if found < SHORTEST_STEP:
+        raise UserError(
+            "the processor's clock stands still, so nobody knows how many steps a training may take; repeat the "
+            "command when the machine runs undisturbed"
+        )
+    return found
+
+
+def _key(
+    seconds: float,
+    reduced: ReducedDataset,
+    model: Mapping[str, Any],
+    training: Mapping[str, Any],
+    seed: int,
+) -> str:
+    """Name of the folder of a training: of everything that its result depends on."""
+    told = [
+        _SCHEME,
+        seconds,
+        reduced.folder.name,
+        reduced.num_modes,
+        reduced.frame_rate,
+        model,
+        training,
+        seed,
+    ]
+    return hashlib.blake2b(json.dumps(told, sort_keys=True).encode(), digest_size=8).hexdigest()
+
+
+# --- A surrogate against the solver that made its training runs, on runs that it has not seen -----------
+
+
+class Decoded:
+    """A rollout as far as `sgns.evaluate.metrics` reads runs; frames are decoded when they are asked for.
+
+    Args:
+        simulator: Whose it is.
+        rollout: Of T frames.
+        name: For messages.
+    """
+
+    def __init__(self, simulator: Simulator, rollout: Rollout, name: str) -> None:
+        self._basis, self._latent = simulator.basis, torch.as_tensor(rollout.latent)
+        self.path = Path(f"rollout of {name}")
+        self.frame_count = len(rollout.latent)
+        self.particle_count = len(simulator.start_positions)
+        self.arrangement_hash = simulator.arrangement_hash
+        self.time: np.ndarray = np.arange(self.frame_count) / simulator.frame_rate
+        self.pose, self.force, self.torque = rollout.poses, rollout.force, rollout.torque
+
+    def positions(self, frames: slice = slice(None)) -> np.ndarray:
+        """Soil particles [m], shape (t, n, 3)."""
+        return self._basis.inverse(self._latent[frames]).numpy()
+
+
+def own_errors(
+    simulator: Simulator, paths: Sequence[Path], training_paths: Sequence[Path], every: int = 1
+) -> Scores:
+    """Scores over some runs together, each rolled out from its first d true frames, as `sgns evaluate` does it.
+
+    Args:
+        simulator: Trained at 1/every of the runs' frame rate.
+        paths: Runs to be predicted.
+        training_paths: Runs whose mean force is a baseline.
+        every: Frames of the runs in one of the simulator's.
+    """
+    d = int(simulator.history)
+    mean_force, mean_torque = training_means(training_paths, d)
+    grid = surface_grid(np.asarray(simulator.start_positions, dtype=np.float64))
+    found = []
+    for path in paths:
+        with Run(path) as run, single_thread():
+            truth = EveryNthFrame(run, every)
+            guess = Decoded(simulator, roll_out(simulator, truth), path.stem)
+            errors = position_errors(truth, guess, simulator.basis, d, grid)
+            body = body_errors(truth, guess, d)
+            found.append(run_scores(path.stem, errors, truth, guess, d, mean_force, mean_torque, body))
+    return aggregate(found)
+
+
+# --- Operating points of surrogates: trained for a given time, rolled out from rest on the cases, timed -
+# An entry of `study.scenes.<scene>.surrogate` has axis, label and overrides of `sgns train`, and these
+# keys, which may
+# also be given for all entries of a scene under `training`:
+#
+#     seconds          processor time of the training's steps [s]
+#     runs             training runs, of which the basis is made, too; null: all
+#     every            frames of the dataset in one of the surrogate's
+#     seed             of weights, noise and order of the samples
+#     table, case      an entry that was measured elsewhere: the line `case` of a table of experiments/full_space
 
 REPEATS = 5  # timed rollouts of every case, after one that warms up
 INCLUDES = (

@@ -1,63 +1,409 @@
-"""`sgns reduce`: fit the basis, reduce the runs, and say what every number of modes holds."""
+"""The basis of a dataset's training runs, and every run in that basis, kept in the dataset's folder."""
 
 from __future__ import annotations
 
-import csv
+import hashlib
+import json
 import logging
 import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TypedDict
 
-from sgns.claim import only_here
-from sgns.reduction.reconstruction import ReductionCurves, reduction_curves
-from sgns.reduction.reduced import reduce_dataset
-from sgns.wholefile import whole_file
+import numpy as np
+import torch
+from tqdm import tqdm
 
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
-__all__ = ["main", "write_energy_table"]
+from sgns.arrays import require_shapes
+from sgns.config import UserError, check_fields
+from sgns.data.dataset import SPLITS, Dataset
+from sgns.data.files import new_hdf5, require_replaceable
+from sgns.data.layout import BROKEN, open_hdf5, own_attribute, own_dataset
+from sgns.data.run import Run, frame_chunks
+from sgns.data.small_files import parse_json
+from sgns.reduction.basis import CENTRINGS, Basis, reconstruction_curve
+from sgns.reduction.pca import IncrementalPCA, checked_device
 
 log = logging.getLogger(__name__)
 
 
-def main(cfg: DictConfig) -> float:
-    """The `sgns reduce` command; returns the mean squared reconstruction error on the training runs [m²]."""
-    from sgns.campaign import Dataset
-
-    dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
-    table = Path(cfg.output) / "energy.csv"
-    with only_here(table):
-        reduced = reduce_dataset(dataset, cfg.reduction, device=cfg.device)
-        basis, used = reduced.basis, reduced.num_modes
-        validation = dataset.runs("validation")
-        curves = reduction_curves(basis, validation)
-        write_energy_table(curves, table)
-    log.info("%s", "\n".join(energy_lines(curves, used)))
-    log.info("errors on %d training and %d validation runs", len(basis.fitted_on or []), len(validation))
-    log.info("every number of modes: %s; basis and reduced runs: %s", table, reduced.folder)
-    return float(basis.residual_mse(used))
+# --- An incremental PCA over run files ------------------------------------------------------------------
 
 
-def energy_lines(curves: ReductionCurves, used: int) -> list[str]:
-    """A table for the terminal: powers of two, all modes, and the number in use."""
-    last = len(curves.energy)
-    lines = ["modes  energy     displacement energy  training RMSE [mm]  validation RMSE [mm]"]
-    for r in sorted({2**k for k in range(last.bit_length())} | {used, last}):
-        training, held_out = (1e3 * math.sqrt(mse) for mse in (curves.training[r - 1], curves.held_out[r]))
-        lines.append(
-            f"{r:5d}  {curves.energy[r - 1]:.6f}  {curves.displacement_energy[r - 1]:19.6f}  {training:18.3f}  "
-            f"{held_out:20.3f}" + ("  <- reduction.num_modes" if r == used else "")
+def fit_runs(paths: Iterable[Path], max_modes: int, device: str = "cpu") -> IncrementalPCA:
+    """One stream over runs; the bases of all centrings follow from it.
+
+    Args:
+        paths: Run files, each read in chunks.
+        max_modes: Modes to keep track of.
+        device: Torch device that does it.
+    """
+    pca = IncrementalPCA(max_modes, device=device)
+    for path in paths:
+        with Run(path) as run:
+            for frames in frame_chunks(run.particle_count, run.frame_count):
+                positions = run.positions(frames)
+                try:
+                    pca.partial_fit(positions)
+                except UserError:
+                    require_positions(path, frames.start, positions)
+                    raise
+    return pca
+
+
+def require_positions(path: Path, first: int, positions: np.ndarray) -> None:
+    """Refuses positions (t, n, 3) of a run from its frame `first` on that are no numbers; the line says where."""
+    bad = ~np.isfinite(positions)
+    if bad.any():
+        frame, particle, axis = (int(i) for i in np.argwhere(bad)[0])
+        raise UserError(
+            f"{path}: the position of particle {particle} along {'xyz'[axis]} is {positions[frame, particle, axis]} "
+            f"at frame {first + frame}; simulate this run again, or remove it"
         )
-    return lines
 
 
-def write_energy_table(curves: ReductionCurves, path: Path) -> None:
-    """`energy.csv`: a line for every number of modes; the validation column is empty without such runs."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["modes", "energy", "displacement_energy", "mse_training_m2", "mse_validation_m2"])
-        columns = (curves.energy, curves.displacement_energy, curves.training, curves.held_out[1:])
-        for r, values in enumerate(zip(*columns, strict=True), start=1):
-            writer.writerow([r, *("" if math.isnan(value) else float(value) for value in values)])
+# --- How many modes are enough: `reduction.num_modes=auto` ----------------------------------------------
+
+MEASURES = ("position", "energy", "displacement_energy")
+"""What the number of modes is chosen by: error of positions, or one of the two energies."""
+
+
+def choose_modes(basis: Basis, settings: Mapping[str, Any], validation: Sequence[Path]) -> tuple[int, str]:
+    """The fewest modes that are good enough, and why.
+
+    Args:
+        basis: With all its modes.
+        settings: `conf/reduction`; used are choose, tolerance and share.
+        validation: Run files that the basis was not fitted on, for `position`; without any, the error on
+            the runs that it was fitted on counts.
+
+    Returns:
+        Number of modes; the reason as part of a sentence.
+
+    Raises:
+        UserError: All modes together are not good enough; the line says what they reach.
+    """
+    if settings["choose"] == "position":
+        curve = (
+            reconstruction_curve(validation, basis)[1:] if validation else np.asarray(basis.residual_mse())
+        )
+        values = 1e3 * np.sqrt(curve)
+        limit, key, unit, sign = settings["tolerance"], "tolerance", " mm", "≤"
+        what = f"RMSE on {len(validation)} validation runs" if validation else "RMSE on the training runs"
+        enough = values <= limit
+    else:
+        values = np.asarray(getattr(basis, settings["choose"])())
+        limit, key, unit, sign = settings["share"], "share", "", "≥"
+        what = f"{settings['choose'].replace('_', ' ')} of the training runs"
+        enough = values >= limit
+    if not enough.any():
+        # With fewer modes than were asked for there are no more to be had.
+        more = "" if basis.num_modes < settings["max_modes"] else ", or raise reduction.max_modes"
+        raise UserError(
+            f"reduction.num_modes=auto: {what} must be {sign} reduction.{key}={limit:g}{unit} but all "
+            f"{basis.num_modes} modes reach {_shown(values[-1], limit)}{unit}; "
+            f"{'raise' if key == 'tolerance' else 'lower'} reduction.{key}{more}"
+        )
+    first = int(enough.argmax())
+    return (
+        first + 1,
+        f"{what} is {_shown(values[first], limit)}{unit}, {sign} reduction.{key}={limit:g}{unit}",
+    )
+
+
+def _shown(value: float, limit: float) -> str:
+    """`value` with enough digits to tell it from `limit`."""
+    digits = 4
+    if value != limit:
+        digits = max(digits, 1 + math.ceil(-math.log10(abs(value - limit) / max(abs(value), abs(limit)))))
+    return f"{value:.{digits}g}"
+
+
+# --- The basis of a dataset's training runs, and every run in that basis, kept in the dataset's folder --
+#     <dataset>/reduced/<key>/basis.h5               fitted on the training split only
+#     <dataset>/reduced/<key>/<content hash>.h5      one reduced run each
+#
+# The key is made of the training runs' content and of the settings that the basis depends on, not of how many of
+# its modes are used: a basis of `max_modes` modes is kept and its first `num_modes` are used, so that a sweep over
+# them fits once. Every file appears complete or not at all, so several processes may do this at the same time.
+#
+# Letters: T frames, n particles, M body points, r modes.
+
+_FORMAT = "sgns-reduced-run-1"
+_SERIES: dict[str, tuple[int | str, ...]] = {
+    "latent": ("T", "r", 3),
+    "time": ("T",),
+    "pose": ("T", 7),
+    "body_points": ("T", "M", 3),
+    "force": ("T", 3),
+    "torque": ("T", 3),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedRun:
+    """A run whose soil is a few modes.
+
+    Attributes:
+        name: File name of the run without its ending.
+        latent: Modes [m], shape (T, r, 3).
+        time: [s], shape (T,).
+        pose: Centre of mass [m] and quaternion x, y, z, w, shape (T, 7).
+        body_points: World frame [m], shape (T, M, 3).
+        force: By the soil on the body [N], shape (T, 3).
+        torque: About the centre of mass [N m], shape (T, 3).
+        scene: The complete scene as plain data.
+    """
+
+    name: str
+    latent: np.ndarray
+    time: np.ndarray
+    pose: np.ndarray
+    body_points: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    scene: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedDataset:
+    """A dataset in the basis of its training split.
+
+    Attributes:
+        basis: The basis with all `max_modes` modes; `basis.sliced(r)` keeps the first r, `latent[:, :r]`
+            likewise.
+        num_modes: r, the modes to use: `reduction.num_modes`, or what `auto` chose.
+        folder: Where it is cached.
+        frame_rate: [Hz].
+        start_positions: Common start of the soil [m], shape (n, 3), float64.
+    """
+
+    basis: Basis
+    num_modes: int
+    folder: Path
+    frame_rate: float
+    start_positions: np.ndarray
+    _runs: Mapping[str, Sequence[ReducedRun]] = field(repr=False)
+
+    @property
+    def arrangement_hash(self) -> str:
+        """Of the particle arrangement all runs share."""
+        return self.basis.arrangement_hash
+
+    def runs(self, split: str) -> list[ReducedRun]:
+        """The runs of "train", "validation" or "test"."""
+        if split not in self._runs:
+            raise UserError(f"no split {split!r}; allowed: {', '.join(SPLITS)}")
+        return list(self._runs[split])
+
+
+def reduce_dataset(
+    dataset: Dataset, reduction: Mapping[str, Any], progress: bool = True, device: str = "cpu"
+) -> ReducedDataset:
+    """Fit the basis, or take the cached one, and reduce every run that is not yet.
+
+    Args:
+        dataset: With complete runs.
+        reduction: Values of `conf/reduction`.
+        progress: Whether to show a bar (never without a terminal).
+        device: Torch device that fits and projects.
+
+    Returns:
+        The reduced dataset, with all `max_modes` modes.
+
+    Raises:
+        UserError: No training runs, runs of different beds, more modes asked than the data has, or no
+            number of modes good enough.
+    """
+    settings = check_settings(reduction)
+    checked_device(device)
+    paths = {split: [Path(path) for path in dataset.runs(split)] for split in SPLITS}
+    if not paths["train"]:
+        raise UserError(
+            f"{dataset.path} has no complete training runs; make them with: sgns simulate "
+            f"dataset={dataset.name}"
+        )
+    content, frame_rate = check_one_bed([path for split in SPLITS for path in paths[split]])
+    folder = Path(dataset.path) / "reduced" / cache_key([content[path] for path in paths["train"]], settings)
+    bar = {"disable": not (progress and sys.stderr.isatty()), "unit": "run", "leave": False}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        cached = [folder / "basis.h5", *(folder / f"{one}.h5" for one in content.values())]
+        require_replaceable(*(file for file in cached if not file.is_file()))
+        basis = fitted_basis(folder / "basis.h5", paths["train"], settings, bar, device)
+        projector = basis.to(device)
+        num_modes = modes_to_use(projector, settings, paths["validation"])
+        everything = [path for split in SPLITS for path in paths[split]]
+        reduced = {
+            path: reduced_run(folder / f"{content[path]}.h5", path, projector)
+            for path in tqdm(everything, desc="reducing runs", **bar)
+        }
+    except OSError as error:
+        raise UserError(
+            f"cannot keep the reduced runs in {folder}: {error}; make the dataset's folder writable"
+        ) from error
+    with Run(paths["train"][0]) as run:
+        start = run.positions(slice(0, 1))[0].astype(np.float64)
+    runs = {split: [reduced[path] for path in paths[split]] for split in SPLITS}
+    return ReducedDataset(basis, num_modes, folder, frame_rate, start, runs)
+
+
+class ReductionSettings(TypedDict):
+    """What `conf/reduction` says; see there for the meaning of each key."""
+
+    num_modes: int | str
+    max_modes: int
+    centring: str
+    choose: str
+    tolerance: float
+    share: float
+
+
+def check_settings(reduction: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings as plain values, refused where they make no sense."""
+    check_fields(ReductionSettings, reduction, "reduction")
+    settings = dict(reduction)
+    for key, allowed in (("centring", CENTRINGS), ("choose", MEASURES)):
+        if settings[key] not in allowed:
+            raise UserError(f"reduction.{key} is {settings[key]!r}; allowed: {', '.join(allowed)}")
+    num_modes, max_modes = settings["num_modes"], settings["max_modes"]
+    if isinstance(num_modes, str) and num_modes != "auto":
+        raise UserError(f"reduction.num_modes is {num_modes!r}; it must be a whole number or auto")
+    if not 1 <= (1 if num_modes == "auto" else num_modes) <= max_modes:
+        raise UserError(
+            f"reduction.num_modes is {num_modes}; allowed: 1 to reduction.max_modes "
+            f"({max_modes}); raise reduction.max_modes to keep more"
+        )
+    if settings["tolerance"] <= 0:
+        raise UserError(f"reduction.tolerance is {settings['tolerance']}; it must be more than 0 [mm]")
+    if not 0 < settings["share"] <= 1:
+        raise UserError(f"reduction.share is {settings['share']}; it must be more than 0 and at most 1")
+    return settings
+
+
+def check_one_bed(paths: Sequence[Path]) -> tuple[dict[Path, str], float]:
+    """Content hash of every run, and the frame rate they share; refuses a mixture of beds or rates."""
+    content: dict[Path, str] = {}
+    beds: dict[tuple[str, int, float], Path] = {}
+    for path in paths:
+        with Run(path) as run:
+            content[path] = run.content_hash
+            beds.setdefault((run.arrangement_hash, run.particle_count, run.frame_rate), path)
+    if len(beds) > 1:
+        one, other = list(beds.values())[:2]
+        raise UserError(
+            f"the runs do not belong together: {one} and {other} differ in particle arrangement or frame "
+            "rate; one basis serves one bed: keep one dataset per bed"
+        )
+    return content, next(iter(beds))[2]
+
+
+def modes_to_use(basis: Basis, settings: Mapping[str, Any], validation: Sequence[Path]) -> int:
+    """`reduction.num_modes`, or for `auto` the number that is enough, with a line that says why."""
+    asked = settings["num_modes"]
+    if asked == "auto":
+        chosen, reason = choose_modes(basis, settings, validation)
+        log.info("reduction.num_modes=auto: %d modes; %s", chosen, reason)
+        return chosen
+    if asked > basis.num_modes:
+        raise UserError(
+            f"reduction.num_modes is {asked} but the training runs give "
+            f"{basis.num_modes} modes; ask for at most {basis.num_modes}"
+        )
+    return asked
+
+
+def cache_key(training_content: Sequence[str], settings: Mapping[str, Any]) -> str:
+    """Name of the cache for a training split, in any order, and the settings that the basis depends on."""
+    told = {key: settings[key] for key in ("max_modes", "centring")}
+    text = json.dumps([_FORMAT, sorted(training_content), told], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def fitted_basis(
+    path: Path, runs: Sequence[Path], settings: Mapping[str, Any], bar: dict[str, Any], device: str = "cpu"
+) -> Basis:
+    """The cached basis, or a new one of as many modes as the data gives up to `max_modes`."""
+    if path.exists():
+        try:
+            return Basis.load(path)
+        except UserError as error:
+            log.warning("%s; fitting it anew", error)
+    # More modes than particles or rows cannot be had, whatever is asked.
+    pca = fit_runs(tqdm(runs, desc="fitting the basis", **bar), settings["max_modes"], device)
+    with Run(runs[0]) as run:
+        arrangement = run.arrangement_hash
+    rank = pca.rank(settings["centring"])
+    if rank == 0:
+        raise UserError(
+            "nothing moves in the training runs: the data has rank 0 and no modes; simulate "
+            "runs that move the soil"
+        )
+    basis = pca.basis(
+        settings["centring"], rank, arrangement_hash=arrangement, fitted_on=[path.stem for path in runs]
+    )
+    basis.save(path)
+    return basis
+
+
+def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
+    """The cached reduced run, or a new one."""
+    if path.exists():
+        try:
+            return replace(read_reduced(path, {"r": basis.num_modes}), name=run_path.stem)
+        except BROKEN as error:
+            log.warning("%s is damaged (%s); reducing %s again", path, error, run_path)
+    with Run(run_path) as run:
+        parts = []
+        for frames in frame_chunks(run.particle_count, run.frame_count):
+            positions = run.positions(frames)
+            parts.append(basis.transform(positions).cpu())
+            if not bool(parts[-1].isfinite().all()):
+                require_positions(run_path, frames.start, positions)
+        reduced = ReducedRun(
+            run_path.stem,
+            torch.cat(parts).numpy(),
+            run.time,
+            run.pose,
+            run.body_points,
+            run.force,
+            run.torque,
+            run.scene,
+        )
+    write_reduced(path, reduced)
+    return reduced
+
+
+def write_reduced(path: Path, run: ReducedRun) -> None:
+    """Write a reduced run; it appears complete or not at all."""
+    with new_hdf5(path) as file:
+        for name in _SERIES:
+            file.create_dataset(name, data=getattr(run, name))
+        file.create_dataset("scene", data=json.dumps(run.scene))
+        file.attrs["name"] = run.name
+        file.attrs["format"] = _FORMAT
+
+
+def read_reduced(path: Path, counts: Mapping[str, int] | None = None) -> ReducedRun:
+    """Read a reduced run.
+
+    Args:
+        path: The file.
+        counts: T, r or M where they are known.
+
+    Raises:
+        One of sgns.data.layout.BROKEN: Not one, or its arrays do not fit together.
+    """
+    with open_hdf5(path) as file:
+        if own_attribute(file, "format") != _FORMAT:
+            raise ValueError("not a reduced run")
+        series = {name: own_dataset(file, name)[()] for name in _SERIES}
+        require_shapes(series, _SERIES, counts)
+        if infinite := [name for name, values in series.items() if not np.isfinite(values).all()]:
+            raise ValueError(f"{infinite[0]} is not finite")
+        scene = parse_json(own_dataset(file, "scene")[()])
+        if not isinstance(scene, dict):
+            raise ValueError("its scene is no group of keys")
+        return ReducedRun(name=str(own_attribute(file, "name")), scene=scene, **series)

@@ -15,16 +15,16 @@ from hydra import compose, initialize_config_module
 from tiny import make_dataset
 
 from sgns import __version__
-from sgns.cli import COMMANDS
-from sgns.cli.command_help import groups_of, options_of
+from sgns.cli.commands import COMMANDS
+from sgns.cli.help import groups_of, options_of
 
 # Runs `sgns train` with a training module that only holds the given body of `main(cfg)`.
 FAKE = """
-import sys, types, sgns.cli, sgns.errors
-module = types.ModuleType("sgns.learning.training")
-module.UserError = sgns.errors.UserError
+import sys, types, sgns.cli, sgns.config
+module = types.ModuleType("sgns.train.command")
+module.UserError = sgns.config.UserError
 exec("def main(cfg):\\n    " + sys.argv.pop(1), module.__dict__)
-sys.modules["sgns.learning.training"] = module
+sys.modules["sgns.train.command"] = module
 sys.exit(sgns.cli.main())
 """
 

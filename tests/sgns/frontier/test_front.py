@@ -7,10 +7,14 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from sgns.frontier.figures import reduction_figure, scene_figure, through_time_figure, training_figure
-from sgns.frontier.gather import effective_error, front
-from sgns.frontier.labels import place_labels
-from sgns.frontier.point import Point
+from sgns.frontier.figures import (
+    place_labels,
+    reduction_figure,
+    scene_figure,
+    through_time_figure,
+    training_figure,
+)
+from sgns.frontier.point import Point, effective_error, front
 
 BANDS = {"force_nrmse": 0.2}
 

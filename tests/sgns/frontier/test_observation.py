@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from mpm_warp import Bed, Excavation
-from sgns.errors import UserError
-from sgns.frontier.comparison import compare, errors
+from sgns.config import UserError
 from sgns.frontier.observation import (
     Observation,
     Observer,
+    compare,
+    errors,
     observe_arrays,
     observed_frames,
     read_observation,

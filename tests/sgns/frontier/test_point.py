@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sgns.errors import UserError
+from sgns.config import UserError
 from sgns.frontier.point import Point, read_points, write_points
 
 

@@ -10,14 +10,16 @@ import yaml
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from sgns.campaign import SPLITS, plan
-from sgns.cli.command_help import options_of
-from sgns.errors import UserError
-from sgns.frontier import read_points, solver_points, timing
-from sgns.frontier.frontier import axes_of, main
-from sgns.frontier.study import AXES, Study
-from sgns.frontier.timing import composed_scene
-from sgns.scene_effects import asked_effects
+from sgns.cli.help import options_of
+from sgns.config import UserError
+from sgns.data.dataset import SPLITS
+from sgns.frontier import solver_points
+from sgns.frontier import study as timing
+from sgns.frontier.command import axes_of, main
+from sgns.frontier.point import read_points
+from sgns.frontier.study import AXES, Study, composed_scene
+from sgns.simulate.campaign import plan
+from sgns.simulate.scene import asked_effects
 
 TINY = yaml.safe_load("""
 name: tiny

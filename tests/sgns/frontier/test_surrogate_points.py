@@ -1,25 +1,216 @@
-"""Points of surrogates: what an entry may say, what is taken from elsewhere, what a rollout becomes."""
+"""Smaller training sets: nested subsets of runs, every nth frame."""
 
 import csv
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from tiny import MODEL, REDUCTION, TRAINING
+from surrogates import FakeSimulator, fitted, frozen_latent, small_dataset
+from tiny import FIT, MODEL, POLYNOMIAL, REDUCTION, TRAINING, make_dataset, reduced
 
 from mpm_warp import Solver, effects_for
-from sgns.errors import UserError
-from sgns.frontier import surrogate_points, timed_training
-from sgns.frontier.study import Study
+from sgns.config import UserError
+from sgns.data.run import Run
+from sgns.data.writer import RunWriter
+from sgns.evaluate.command import evaluate
+from sgns.frontier import surrogate_points
+from sgns.frontier import surrogate_points as timed_training
+from sgns.frontier.study import Study, composed_scene
 from sgns.frontier.surrogate_points import (
+    EveryNthFrame,
     TrainingPlan,
+    every_nth_frame,
+    frame_means,
     full_space_fields,
     measure_surrogates,
+    own_errors,
+    read_record,
+    seconds_per_step,
+    train_for,
     training_settings,
+    with_training_runs,
 )
-from sgns.frontier.timing import composed_scene
-from sgns.runs import RunWriter
+from sgns.model.checkpoint import read_checkpoint
+from sgns.model.settings import ModelSettings
+
+# --- Smaller training sets: nested subsets of runs, every nth frame -------------------------------------
+
+
+def test_subsets_of_runs_are_nested_and_leave_the_other_splits_alone(tmp_path):
+    dataset = make_dataset(tmp_path)
+    subsets = [set(with_training_runs(dataset, count, seed=3).split["train"]) for count in (1, 2, 3, 4)]
+    assert [len(subset) for subset in subsets] == [1, 2, 3, 4]
+    assert subsets[0] < subsets[1] < subsets[2] < subsets[3] == set(dataset.split["train"])
+    part = with_training_runs(dataset, 2)
+    assert part.split["test"] == dataset.split["test"]
+    assert part.split["train"] == [n for n in dataset.split["train"] if n in part.split["train"]]
+    assert with_training_runs(dataset, None) is dataset
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_more_runs_than_there_are_is_one_line(tmp_path, count):
+    with pytest.raises(UserError, match=f"training_runs is {count}.*give 1 to 4"):
+        with_training_runs(make_dataset(tmp_path), count)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_means_of_frames_keep_the_impulse(n):
+    force = np.random.default_rng(0).normal(size=(3 * n + 1, 3))
+    means = frame_means(force, n)
+    assert len(means) == len(force[::n])
+    np.testing.assert_array_equal(means[0], force[0])
+    np.testing.assert_allclose(n * means[1:].sum(axis=0), force[1:].sum(axis=0), atol=1e-12)
+
+
+def test_frames_that_fill_no_whole_mean_are_left_out():
+    assert len(frame_means(np.zeros((8, 3)), 3)) == 3  # 0, 1-3, 4-6
+
+
+def test_a_slower_dataset_has_every_nth_frame(tmp_path):
+    fast = reduced(tmp_path)  # 14 frames, run f 12
+    slow = every_nth_frame(fast, 3)
+    assert slow.frame_rate == fast.frame_rate / 3
+    for split in ("train", "validation", "test"):
+        for whole, part in zip(fast.runs(split), slow.runs(split), strict=True):
+            np.testing.assert_array_equal(part.latent, whole.latent[::3])
+            np.testing.assert_array_equal(part.pose, whole.pose[::3])
+            assert len(part.time) == len(part.force) == len(part.torque) == len(part.latent)
+    assert every_nth_frame(fast, 1) is fast
+
+
+def test_a_run_read_slowly_is_the_slow_reduced_run(tmp_path):
+    slow = every_nth_frame(reduced(tmp_path), 3).runs("test")[0]
+    with Run(tmp_path / "runs" / "g.h5") as run:
+        view = EveryNthFrame(run, 3)
+        assert view.frame_rate == 20.0
+        assert view.frame_count == len(slow.latent)
+        for name in ("time", "pose", "body_points", "force", "torque"):
+            np.testing.assert_allclose(getattr(view, name), getattr(slow, name), atol=1e-12)
+        np.testing.assert_array_equal(view.positions(slice(1, 3)), run.positions([3, 6]))
+        same = EveryNthFrame(run, 1)
+        np.testing.assert_array_equal(same.force, run.force)
+
+
+# --- Trainings of a given time: whole, kept, told apart by what they depend on --------------------------
+
+NAMES = {"preset": {"name": "tiny"}, "dataset": {"name": "tiny"}}
+NETWORK = {"model": MODEL, "training": TRAINING, **NAMES}
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    monkeypatch.setattr(surrogate_points, "seconds_per_step", lambda *_: 0.01)
+    return reduced(tmp_path / "data")
+
+
+def test_as_many_steps_as_fit_and_the_rate_falls_over_them(data, tmp_path):
+    done = train_for(0.2, data, NETWORK, tmp_path / "kept")
+    assert (done.steps, done.samples) == (20, 20 * TRAINING["batch_size"])
+    assert done.processor_s >= 0
+    training = read_checkpoint(done.checkpoint)["hyper_parameters"]["settings"]["training"]
+    assert training["max_steps"] == 20
+    assert training["warmup_steps"] == 2
+    assert json.loads((done.checkpoint.parent / "training.json").read_text())["steps"] == 20
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"processor_s": 1, "steps": "x", "samples": 3}', "[" * 10**5]
+)
+def test_a_damaged_record_is_one_line(tmp_path, text):
+    (tmp_path / "timed.json").write_text(text)
+    with pytest.raises(UserError, match=r"timed\.json.*; remove it to train again"):
+        read_record(tmp_path / "timed.json")
+
+
+def test_what_is_complete_is_taken_and_what_is_not_is_begun_anew(data, tmp_path):
+    done = train_for(0.1, data, NETWORK, tmp_path / "kept")
+    made = done.checkpoint.stat().st_mtime_ns
+    assert train_for(0.1, data, NETWORK, tmp_path / "kept") == done
+    assert done.checkpoint.stat().st_mtime_ns == made
+    (done.checkpoint.parent / "timed.json").unlink()  # as if killed before its end
+    again = train_for(0.1, data, NETWORK, tmp_path / "kept")
+    assert again.checkpoint == done.checkpoint
+    assert again.checkpoint.stat().st_mtime_ns > made
+
+
+def test_other_settings_have_another_folder(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(surrogate_points, "train", lambda *_, output, **__: output.mkdir(parents=True))
+    wider = NETWORK | {"model": MODEL | {"hidden_width": 8}}
+    done = {
+        train_for(seconds, data, settings, tmp_path / "kept", seed).checkpoint
+        for seconds, settings, seed in (
+            (0.1, NETWORK, 0),
+            (0.12, NETWORK, 0),
+            (0.1, wider, 0),
+            (0.1, NETWORK, 1),
+        )
+    }
+    assert len(done) == 4
+
+
+def test_polynomials_have_no_steps(data, tmp_path):
+    done = train_for(1.0, data, {"model": POLYNOMIAL, "training": FIT, **NAMES}, tmp_path / "kept")
+    assert done.steps == 0
+    assert done.samples == FIT["draws"] * 4 * 13  # four runs of 14 frames
+    assert done.checkpoint.exists()
+
+
+def test_a_step_with_more_windows_takes_longer(tmp_path):
+    data = reduced(tmp_path)
+    few, many = (
+        seconds_per_step(data, ModelSettings(**MODEL), TRAINING | {"batch_size": size}, 0)
+        for size in (2, 2000)
+    )
+    assert 0 < few < many
+
+
+def test_a_clock_that_stands_still_gives_no_number_of_steps(tmp_path, monkeypatch):
+    monkeypatch.setattr(timed_training.time, "process_time", lambda: 1.0)
+    with pytest.raises(UserError, match="the processor's clock stands still"):
+        train_for(0.2, reduced(tmp_path / "data"), NETWORK, tmp_path / "kept")
+
+
+# --- Errors against the training data's solver: those of `sgns evaluate` --------------------------------
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return small_dataset(tmp_path_factory.mktemp("data"))
+
+
+def simulator(dataset, **kw):
+    return FakeSimulator(fitted(dataset.runs("train"), 6), dataset.runs("train") + dataset.runs("test"), **kw)
+
+
+def test_they_are_those_of_evaluate(dataset, tmp_path):
+    known = simulator(
+        dataset, mistake=lambda z, d: z + 1e-3 * np.arange(len(z))[:, None, None], force_factor=1.1
+    )
+    found = own_errors(known, dataset.runs("test"), dataset.runs("train")).row()
+    told = evaluate(known, dataset, tmp_path, checkpoint=Path("best.ckpt")).total.row()
+    assert set(found) == set(told)
+    # A run file keeps positions in float32.
+    for key in ("rmse_total_mm", "skill_frozen", "surface_rmse_mm", "force_nrmse", "draft_mpe_percent"):
+        assert found[key] == pytest.approx(told[key], rel=1e-3)
+
+
+def test_the_truth_leaves_only_the_reduction(dataset):
+    scores = own_errors(simulator(dataset), dataset.runs("test"), dataset.runs("train"))
+    assert scores.force.overall_nrmse == 0
+    assert scores.rmse_mm("total") == pytest.approx(scores.rmse_mm("reduction"), rel=1e-6)
+
+
+def test_a_frozen_bed_has_no_skill(dataset):
+    known = simulator(dataset, mistake=frozen_latent)
+    scores = own_errors(known, dataset.runs("test"), dataset.runs("train"))
+    # But for what the reduction leaves out of the frame it is frozen in.
+    assert abs(scores.skill("frozen")) < 0.2
+
+
+# --- Points of surrogates: what an entry may say, what is taken from elsewhere, what a rollout becomes --
 
 BED = [
     "scene.bed.spacing=0.05",
@@ -119,7 +310,7 @@ class NoWorkload:
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
+def data_of_surrogate_points(tmp_path_factory):
     """Five runs of the smallest bed that a plate cuts, by the solver."""
     folder = tmp_path_factory.mktemp("data")
     split = {"train": ["a", "b", "c"], "validation": ["d"], "test": ["e"]}
@@ -154,17 +345,17 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture
-def tiny(data, monkeypatch):
+def tiny(data_of_surrogate_points, monkeypatch):
     """Small networks on those runs, trained for ten steps."""
     settings = {
         "model": MODEL,
         "training": TRAINING,
         "reduction": REDUCTION,
         "preset": {"name": "tiny"},
-        "dataset": {"name": "tiny", "path": str(data)},
+        "dataset": {"name": "tiny", "path": str(data_of_surrogate_points)},
     }
     monkeypatch.setattr(surrogate_points, "Workload", NoWorkload)
-    monkeypatch.setattr(timed_training, "seconds_per_step", lambda *_: 0.01)
+    monkeypatch.setattr(surrogate_points, "seconds_per_step", lambda *_: 0.01)
     monkeypatch.setattr(surrogate_points, "training_settings", lambda *_: settings)
 
 

@@ -10,7 +10,7 @@ from fuzzing import OUTCOMES
 from small import TRAIN, call, small_dataset
 from synthetic import make_run
 
-from sgns.errors import UserError
+from sgns.config import UserError
 
 
 @pytest.fixture(autouse=True)
@@ -44,11 +44,11 @@ def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
         raise Begun("begun")
 
     for name in (
-        "sgns.simulate.simulate_scene",
-        "sgns.campaign_runs._compile",
-        "sgns.learning.training.fit",
-        "sgns.learning.training.fit_polynomial",
-        "sgns.evaluation.evaluate.roll_out",
+        "sgns.simulate.command.simulate_scene",
+        "sgns.simulate.command.workers._compile",
+        "sgns.train.command.fit",
+        "sgns.train.command.fit_polynomial",
+        "sgns.evaluate.command.roll_out",
         "sgns.rollout.rollout_scene",
     ):
         monkeypatch.setattr(name, begun)

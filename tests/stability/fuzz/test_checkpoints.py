@@ -14,8 +14,8 @@ from hydra import compose, initialize_config_module
 from hypothesis import given
 from small import SMALL
 
-from sgns.errors import UserError
-from sgns.learning.surrogate import load_surrogate
+from sgns.config import UserError
+from sgns.model.checkpoint import load_surrogate
 
 
 def test_checkpoints(good, tmp_path) -> None:

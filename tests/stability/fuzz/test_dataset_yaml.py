@@ -13,8 +13,8 @@ from fuzz_values import YAML, changed
 from fuzzing import bounded, cases, refused_or_read
 from hypothesis import given
 
-from sgns.campaign import Dataset
-from sgns.yaml_text import parse_yaml
+from sgns.config import parse_yaml
+from sgns.data.dataset import Dataset
 
 
 @pytest.fixture

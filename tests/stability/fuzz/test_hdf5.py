@@ -14,8 +14,9 @@ from fuzzing import bounded, cases, refused_or_read
 from hypothesis import given
 from kills import as_bytes
 
-from sgns.reduction import Basis
-from sgns.runs import Run, check_run
+from sgns.data.check import check_run
+from sgns.data.run import Run
+from sgns.reduction.basis import Basis
 
 
 @st.composite

@@ -11,7 +11,7 @@ from fuzz_values import damaged
 from fuzzing import OUTCOMES, cases, refused_or_read
 from hypothesis import given
 
-from mpm_warp.mesh_file import closed_mesh, read_mesh
+from mpm_warp.mesh import closed_mesh, read_mesh
 
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
 LINES = ["v 1 2 3", "f 1 2 3", "f 1/2 2 9", "f 1e9", "f -1 -2 -3", "v a b c", f"f {10**30} 1 2"]

@@ -14,7 +14,7 @@ from hypothesis import given
 from scipy.spatial.transform import Rotation, Slerp
 
 from mpm_warp import Scene
-from sgns.scenes import read_path
+from sgns.simulate.scene import read_path
 
 COLUMNS = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 SCENE = {

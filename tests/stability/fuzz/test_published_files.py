@@ -12,7 +12,7 @@ from fuzzing import cases, refused_or_read
 from hypothesis import given
 from test_published import record
 
-from sgns.published_dataset import published_dataset
+from sgns.data.published import published_dataset
 
 
 def test_published_files(tmp_path) -> None:

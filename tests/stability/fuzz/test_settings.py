@@ -15,7 +15,7 @@ from hypothesis import given
 from omegaconf import OmegaConf
 from small import SMALL, TRAIN, call
 
-from sgns.settings import flattened
+from sgns.config import flattened
 
 SHOWN = st.one_of(
     NUMBERS.map(str),

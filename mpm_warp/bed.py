@@ -1,0 +1,352 @@
+"""The bed of soil: its size, walls and undisturbed particles."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from .ranges import (
+    MOST_NODES,
+    MOST_PARTICLES,
+)
+from .state import SceneError
+
+# --- What soil may do at the floor and the walls of its bin ---------------------------------------------
+
+KINDS = ("no_slip", "slip", "periodic")
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Condition at each pair of walls and at the floor.
+
+    - `no_slip`: soil sticks, also where it would move away.
+    - `slip`: soil moves along the wall freely, but neither into it nor away from it.
+    - a number, 0 or more: Coulomb friction with that coefficient; soil may move away.
+    - `periodic` (x or y): no walls; what leaves at one end comes in at the other.
+    """
+
+    x: str | float = "no_slip"
+    """The walls at x = 0 and x = Lx."""
+    y: str | float = "no_slip"
+    """The walls at y = 0 and y = Ly."""
+    floor: str | float = "no_slip"
+    """The floor at z = -Lz."""
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "floor"):
+            value = getattr(self, name)
+            kinds = KINDS if name != "floor" else KINDS[:2]
+            friction = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if friction and math.isfinite(value) and value >= 0:
+                object.__setattr__(self, name, float(value))
+            elif friction or value not in kinds:
+                raise SceneError(
+                    f"bed.walls.{name} is {value!r}; allowed: {', '.join(kinds)} or a friction coefficient of 0 or more"
+                )
+
+    @property
+    def kinds(self) -> tuple[str, str, str]:
+        """`no_slip`, `slip`, `friction` or `periodic` for x, y and the floor: what the kernels are compiled for."""
+        return tuple(v if isinstance(v, str) else "friction" for v in (self.x, self.y, self.floor))
+
+    @property
+    def friction(self) -> tuple[float, float, float]:
+        """Coulomb coefficients for x, y and the floor, 0 where there is no friction [-]."""
+        return tuple(0.0 if isinstance(v, str) else v for v in (self.x, self.y, self.floor))
+
+
+# --- Where the particles of an undisturbed bed are ------------------------------------------------------
+
+ARRANGEMENTS = ("lattice", "jittered", "poisson")
+# Poisson-disk radius in units of the particle spacing; with it a bed holds about 0.8 points per cube of the
+# spacing, which is the published beds' density.
+POISSON_RADIUS = 0.897
+
+
+@lru_cache(maxsize=8)  # a random bed takes seconds to fill, and all scenes of a dataset share it
+def arrange(
+    kind: str, size: tuple[float, float, float], spacing: float, seed: int, mirrored: bool = False
+) -> tuple[np.ndarray, float]:
+    """Particles of a bed 0 <= x <= Lx, 0 <= y <= Ly, -Lz <= z <= 0.
+
+    Args:
+        kind: `lattice` (full, regular), `jittered` (the lattice, each particle moved at random by up to half
+            a spacing) or `poisson` (random points no closer than 0.897 spacings, not filling the bed).
+        size: (Lx, Ly, Lz) [m].
+        spacing: nominal distance between particles [m].
+        seed: of the random numbers.
+        mirrored: a random bed is its own mirror image about y = Ly / 2.
+
+    Returns:
+        Positions [m], shape (n, 3), float64, read-only, and the volume of one particle [m^3].
+    """
+    points, volume = _arranged(kind, size, spacing, seed, mirrored)
+    points.flags.writeable = False
+    return points, volume
+
+
+def _arranged(
+    kind: str, size: tuple[float, float, float], spacing: float, seed: int, mirrored: bool
+) -> tuple[np.ndarray, float]:
+    if kind == "lattice":
+        return lattice(size, spacing)
+    if kind == "jittered":
+        points, volume = lattice(size, spacing)
+        rng = np.random.default_rng(seed)
+        counts = rows_of(size, spacing)
+        moved = (np.asarray(size) / counts * rng.uniform(-0.5, 0.5, points.shape)).reshape(*counts, 3)
+        if mirrored:
+            # The far half of the rows moves as the near one does, mirrored; a row in the middle stays in the plane.
+            image = moved[:, ::-1] * [1.0, -1.0, 1.0]
+            far = np.arange(counts[1]) >= (counts[1] + 1) // 2
+            moved[:, far] = image[:, far]
+            if counts[1] % 2:
+                moved[:, counts[1] // 2, :, 1] = 0.0
+        points = points + moved.reshape(-1, 3)
+        return points, volume
+    if kind == "poisson":
+        # Sampled on a larger box and trimmed: points crowd at the edge of the box they were sampled in.
+        radius = POISSON_RADIUS * spacing
+        margin = 2.0 * radius
+        if mirrored:
+            # Points that would be too close to their own image go onto the plane.
+            lx, ly, lz = size
+            points = poisson_disk(
+                (lx + 2.0 * margin, 0.5 * ly + margin, lz + 2.0 * margin), radius, seed, snap=0.5 * radius
+            )
+            points += [-margin, 0.5 * ly, margin]
+            off_plane = points[points[:, 1] > 0.5 * ly]
+            points = np.concatenate([points, off_plane * [1.0, -1.0, 1.0] + [0.0, ly, 0.0]])
+            points = points[_reading_order(points, radius)]
+            inside = (points >= [0.0, 0.0, -lz]) & (points <= [lx, ly, 0.0])
+            return points[inside.all(axis=1)], spacing**3
+        points = poisson_disk(tuple(s + 2.0 * margin for s in size), radius, seed)
+        points += [-margin, -margin, margin]
+        inside = (points >= [0.0, 0.0, -size[2]]) & (points <= [size[0], size[1], 0.0])
+        return points[inside.all(axis=1)], spacing**3
+    raise SceneError(f"bed.arrangement is {kind!r}; allowed: {', '.join(ARRANGEMENTS)}")
+
+
+def rows_of(size: tuple[float, float, float], spacing: float) -> np.ndarray:
+    """Particles of a lattice along each side, shape (3,)."""
+    return np.maximum(1, np.round(np.asarray(size) / spacing)).astype(int)
+
+
+def particle_volume(kind: str, size: tuple[float, float, float], spacing: float) -> float:
+    """The volume that `arrange` gives with the particles [m^3], without making these."""
+    if kind == "poisson":
+        return spacing**3
+    return float(np.prod(np.asarray(size) / rows_of(size, spacing)))
+
+
+def lattice(size: tuple[float, float, float], spacing: float) -> tuple[np.ndarray, float]:
+    """A regular lattice that fills the bed exactly; the spacing is adjusted to fit each side."""
+    counts = rows_of(size, spacing)
+    step = np.asarray(size) / counts
+    axes = [(np.arange(c) + 0.5) * s for c, s in zip(counts, step, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid[:, 2] -= size[2]
+    return grid, float(np.prod(step))
+
+
+def poisson_disk(
+    size: tuple[float, float, float], radius: float, seed: int, candidates: int = 30, snap: float = 0.0
+) -> np.ndarray:
+    """Random points no closer to each other than `radius` (Bridson 2007), shape (n, 3) [m].
+
+    What would come closer than `snap` [m] to the side y = 0 is put on it.
+    """
+    rng = np.random.default_rng(seed)
+    extent = np.asarray(size, dtype=float)
+    cell = radius / np.sqrt(3.0)
+    shape = np.floor(extent / cell).astype(int) + 1
+    pad = 2  # a point's neighbours lie at most two cells away; padding spares bounds checks
+    index = np.full(shape + 2 * pad, -1, dtype=np.int64)
+    points = np.empty((int(np.prod(shape)) + 1, 3))
+    # Row -1 of `points` stands for "no neighbour": it lies outside every bed.
+    points[-1] = -1e9
+    offsets = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    strides = np.array([index.shape[1] * index.shape[2], index.shape[2], 1])
+    flat, flat_offsets = index.reshape(-1), offsets @ strides
+
+    def key(x: np.ndarray) -> np.ndarray:
+        return ((x // cell).astype(np.int64) + pad) @ strides
+
+    points[0] = extent * rng.random(3)
+    points[0, 1] = points[0, 1] if points[0, 1] >= snap else 0.0
+    flat[key(points[0])] = 0
+    count, active = 1, [0]
+    while active:
+        slot = int(rng.integers(len(active)))
+        direction = rng.normal(size=(candidates, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        distance = radius * (1.0 + 7.0 * rng.random((candidates, 1))) ** (1.0 / 3.0)
+        trial = points[active[slot]] + direction * distance
+        trial[(trial[:, 1] >= 0.0) & (trial[:, 1] < snap), 1] = 0.0
+        trial = trial[np.all((trial >= 0.0) & (trial < extent), axis=1)]
+        near = points[flat[key(trial)[:, None] + flat_offsets]]
+        free = np.all(np.sum((near - trial[:, None]) ** 2, axis=-1) >= radius**2, axis=1)
+        if free.any():
+            new = trial[np.argmax(free)]
+            points[count] = new
+            flat[key(new)] = count
+            active.append(count)
+            count += 1
+        else:
+            active[slot] = active[-1]
+            active.pop()
+    # Sorted so that neighbours in space are near in memory: the transfers read the grid in order.
+    found = points[:count]
+    return found[_reading_order(found, radius)] - np.array([0.0, 0.0, extent[2]])
+
+
+def _reading_order(points: np.ndarray, radius: float) -> np.ndarray:
+    """Indices that sort points by cells of `radius` in x, then y, then z."""
+    return np.lexsort((points[:, 2] // radius, points[:, 1] // radius, points[:, 0] // radius))
+
+
+# --- What is to be simulated: plain data, checked, without physics --------------------------------------
+
+PADDING = 3
+"""Grid cells outside the bin, so that the nodes around a particle at a wall exist."""
+INITIAL_STRESSES = ("geostatic", "k0", "none")
+
+
+@dataclass(frozen=True)
+class Bed:
+    """The soil bin and how it is filled. z = 0 is the undisturbed surface."""
+
+    size: tuple[float, float, float] = (0.80, 0.60, 0.15)
+    """Lx, Ly, Lz [m]."""
+    spacing: float = 0.8 / 60
+    """Grid spacing dx [m]."""
+    particles_per_cell: float = 1.0
+    """Particles per grid cell of a full bed."""
+    arrangement: str = "lattice"
+    """lattice | jittered | poisson (arrangement.py)."""
+    seed: int = 0
+    """Of the random arrangements."""
+    mirrored: bool = False
+    """A random arrangement is its own mirror image about y = Ly / 2, which mirror symmetry needs."""
+    initial_stress: str = "geostatic"
+    """geostatic: isotropic pressure rho g depth; k0: the horizontal stress is nu / (1 - nu) times the vertical one;
+    none: stress-free, settles in the first frames."""
+    headroom: float = 0.25
+    """Height above the surface up to which soil may be thrown or piled [m]."""
+    store_every: int = 1
+    """Particles per particle that is recorded; the solver computes all of them."""
+    walls: Walls = field(default_factory=Walls)
+    """What soil may do at walls and floor."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "size", tuple(float(s) for s in self.size))
+        if len(self.size) != 3 or not all(math.isfinite(s) and s > 0 for s in self.size):
+            raise SceneError(f"bed.size is {self.size}; it needs three lengths above 0 m")
+        if not (math.isfinite(self.spacing) and 0 < self.spacing <= min(self.size) / 2):
+            raise SceneError(
+                f"bed.spacing is {self.spacing} m; allowed: above 0, at most half the bin's smallest side"
+            )
+        if not 0 < self.particles_per_cell <= 64:
+            raise SceneError(
+                f"bed.particles_per_cell is {self.particles_per_cell}; allowed: above 0, at most 64"
+            )
+        particles = math.prod(s / self.spacing for s in self.size) * self.particles_per_cell
+        if not particles <= MOST_PARTICLES:
+            raise SceneError(
+                f"the bed would hold {particles:.2g} particles; at most {MOST_PARTICLES:g} are allowed: use a larger "
+                "bed.spacing, a smaller bed.size or fewer bed.particles_per_cell"
+            )
+        if self.arrangement not in ARRANGEMENTS:
+            raise SceneError(f"bed.arrangement is {self.arrangement!r}; allowed: {', '.join(ARRANGEMENTS)}")
+        if self.initial_stress not in INITIAL_STRESSES:
+            raise SceneError(
+                f"bed.initial_stress is {self.initial_stress!r}; allowed: {', '.join(INITIAL_STRESSES)}"
+            )
+        if not (math.isfinite(self.headroom) and self.headroom > 0):
+            raise SceneError(f"bed.headroom is {self.headroom} m; it must be above 0")
+        height, margin = self.size[2] + self.headroom, 2.0 * PADDING + 2.0
+        floor = math.prod(s / self.spacing + margin for s in self.size[:2])
+        nodes = floor * (height / self.spacing + margin)
+        if not nodes <= MOST_NODES:
+            fits = floor * (self.size[2] / self.spacing + margin) <= 0.5 * MOST_NODES
+            key = "lower bed.headroom" if fits else "use a larger bed.spacing"
+            raise SceneError(
+                f"bed.headroom is {self.headroom} m and bed.spacing {self.spacing} m: the grid would have {nodes:.3g} "
+                f"nodes; at most {MOST_NODES:g} are allowed: {key}"
+            )
+        if not (self.store_every >= 1 and self.store_every == int(self.store_every)):
+            raise SceneError(f"bed.store_every is {self.store_every}; it must be a whole number, 1 or more")
+        if not isinstance(self.mirrored, bool):
+            raise SceneError(f"bed.mirrored is {self.mirrored!r}; allowed: true, false")
+        for name, kind, length in zip("xy", self.walls.kinds, self.size, strict=False):
+            if kind == "periodic" and abs(length / self.spacing - round(length / self.spacing)) > 1e-6:
+                raise SceneError(
+                    f"bed.walls.{name} is periodic but the bin's {length} m are {length / self.spacing:.3f} grid "
+                    "spacings; it must be a whole number of them: change bed.size or bed.spacing"
+                )
+
+    @property
+    def particle_spacing(self) -> float:
+        """Nominal distance between particles [m]."""
+        return self.spacing / self.particles_per_cell ** (1.0 / 3.0)
+
+    @property
+    def particle_volume(self) -> float:
+        """Volume of a particle [m^3], as in `filled`."""
+        return particle_volume(self.arrangement, self.size, self.particle_spacing)
+
+    @property
+    def node_counts(self) -> tuple[int, int, int]:
+        """Nodes of the grid along x, y and z, with those outside the bin and up to the headroom."""
+        h = self.spacing
+        x, y = (math.ceil(s / h - 1e-6) + 2 * PADDING + 1 for s in self.size[:2])
+        return x, y, math.ceil((self.size[2] + self.headroom) / h) + 2 * PADDING + 1
+
+    @cached_property
+    def filled(self) -> tuple[np.ndarray, float]:
+        """Particle positions (n, 3) [m] and the volume of one [m^3]."""
+        return self._arranged
+
+    @property
+    def filling(self) -> float:
+        """Share of the bin below the surface that its particles fill [-]: 1, but for random points that keep apart."""
+        positions, volume = self._arranged
+        return len(positions) * volume / float(np.prod(self.size))
+
+    @property
+    def _arranged(self) -> tuple[np.ndarray, float]:
+        return arrange(self.arrangement, self.size, self.particle_spacing, self.seed, self.mirrored)
+
+    @cached_property
+    def stored(self) -> np.ndarray:
+        """Indices of the particles of a full bed that are recorded; see `stored_of`."""
+        return self.stored_of(len(self.filled[0]))
+
+    def stored_of(self, count: int) -> np.ndarray:
+        """Indices of those of `count` particles that are recorded, increasing: one of every `store_every` that follow
+        each other.
+
+        Which one is drawn at random, always the same way: at fixed steps a lattice would be recorded in some of
+        its layers only.
+        """
+        first = np.arange(0, count, self.store_every)
+        left = np.minimum(self.store_every, count - first)
+        return first + np.random.default_rng(0).integers(left)
+
+    @property
+    def arrangement_hash(self) -> str:
+        """Same for every run whose recorded particles start at the same places in the same order."""
+        key = [self.size, self.spacing, self.particles_per_cell, self.arrangement]
+        if self.arrangement != "lattice":
+            key.append(self.seed)
+            if self.mirrored:
+                key.append("mirrored")
+        if self.store_every != 1:
+            key.append(f"one of {self.store_every}")
+        return hashlib.blake2b(json.dumps(key).encode(), digest_size=8).hexdigest()

@@ -1,0 +1,266 @@
+"""The stress update of granular soil as Warp functions.
+
+State per particle: the deviatoric part e of the elastic spatial log (Hencky) strain, six components
+(xx, yy, zz, xy, xz, yz), and ln J, the log of volume over volume at the critical density. Plastic flow
+keeps volume, so the elastic volume strain is ln J itself and the pressure is p = -K ln J. Both are small
+numbers stored as such, which is what keeps float32 accurate: a bed at rest strains by 1e-4.
+
+The trial strain is half the log of b = (I + A) exp(2 e) (I + A)^T with A = dt L, without a decomposition on the
+hot path. There are three ranges, by the size s of e and A (Frobenius norm of both):
+
+- s up to 0.01: the expansion of the log to second order, e + d + w e - e w + A A^T / 2 - d^2 with d and w the
+  symmetric and skew parts of A. What is left out is of third order, s^2 times the step.
+- b - I up to 0.05: series of exp and log to fourth order, from b - I itself, so nothing cancels.
+- beyond: eigenvalues.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from ..effects import Effects
+from .fluidity import fluidity, soil_struct
+
+SECOND_ORDER_LIMIT = 0.01
+"""Size of strain and step up to which the second-order expansion is used: it misses at most 1e-4 of the step."""
+SERIES_LIMIT = 0.05
+"""Frobenius norm of b - I up to which the four-term log series is used: its relative error is then below 2e-6."""
+
+
+@cache
+def constitutive(real: type, effects: Effects) -> SimpleNamespace:
+    """Warp functions in precision `real`, with only the physics in `effects`.
+
+    Returns a namespace of
+
+    - `strain_trial(e, A)` -> deviatoric trial strain (6),
+    - `volume_step(A)` -> ln det(I + A),
+    - `yield_stress(tau_trial, p, dt, soil)` -> equivalent shear stress after the plastic return,
+    - `update(e, ln_j, A, dt, soil, g)` -> new e (6) and new ln J as a 7-vector. `g` is a number of the effects that
+      have one, otherwise unused: with `nonlocality` alone the excess of the fluidity over its local value; with
+      `fluidity` the particle's fluidity [1/s], whose new value is then the eighth number of the answer,
+    - `kirchhoff(e, ln_j, soil)` -> Kirchhoff stress (3 x 3) [Pa].
+    """
+    vec3 = wp.types.vector(3, real)
+    vec6 = wp.types.vector(6, real)
+    mat33 = wp.types.matrix((3, 3), real)
+    Soil = soil_struct(real, effects.fluidity)
+    State = wp.types.vector(8 if effects.fluidity else 7, real)
+    fluid = fluidity(real, effects)
+    coefficients, fluidity_step = fluid.coefficients, fluid.fluidity_step
+    friction_with_excess = fluid.friction_with_excess
+    second_order_limit = wp.constant(SECOND_ORDER_LIMIT**2)
+    series_limit = wp.constant(SERIES_LIMIT**2)
+
+    @wp.func
+    def full(s: vec6):
+        return mat33(s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2])
+
+    @wp.func
+    def commuting_product(a: vec6, b: vec6):
+        # Product of two symmetric matrices that commute, hence symmetric.
+        return vec6(
+            a[0] * b[0] + a[3] * b[3] + a[4] * b[4],
+            a[3] * b[3] + a[1] * b[1] + a[5] * b[5],
+            a[4] * b[4] + a[5] * b[5] + a[2] * b[2],
+            a[0] * b[3] + a[3] * b[1] + a[4] * b[5],
+            a[0] * b[4] + a[3] * b[5] + a[4] * b[2],
+            a[3] * b[4] + a[1] * b[5] + a[5] * b[2],
+        )
+
+    @wp.func
+    def norm_squared(s: vec6):
+        return s[0] * s[0] + s[1] * s[1] + s[2] * s[2] + real(2.0) * (s[3] * s[3] + s[4] * s[4] + s[5] * s[5])
+
+    @wp.func
+    def deviator(s: vec6):
+        third = (s[0] + s[1] + s[2]) / real(3.0)
+        return vec6(s[0] - third, s[1] - third, s[2] - third, s[3], s[4], s[5])
+
+    @wp.func
+    def half_log_exact(x: vec6):
+        # Half the log of I + x by eigenvalues. Negative or zero eigenvalues (an inverted particle) are floored,
+        # which gives a huge strain that the plastic return or the non-finite guard deals with.
+        q, d = wp.eig3(full(x))
+        h0 = real(0.5) * wp.log(wp.max(real(1.0) + d[0], real(1e-6)))
+        h1 = real(0.5) * wp.log(wp.max(real(1.0) + d[1], real(1e-6)))
+        h2 = real(0.5) * wp.log(wp.max(real(1.0) + d[2], real(1e-6)))
+        h = q * wp.diag(vec3(h0, h1, h2)) * wp.transpose(q)
+        return vec6(h[0, 0], h[1, 1], h[2, 2], h[0, 1], h[0, 2], h[1, 2])
+
+    @wp.func
+    def half_log(x: vec6):
+        if norm_squared(x) > real(series_limit):
+            return half_log_exact(x)
+        x2 = commuting_product(x, x)
+        x3 = commuting_product(x2, x)
+        x4 = commuting_product(x2, x2)
+        return real(0.5) * x - real(0.25) * x2 + x3 / real(6.0) - real(0.125) * x4
+
+    @wp.func
+    def exp_twice_minus_one_exact(e: vec6):
+        q, d = wp.eig3(full(e))
+        m0 = wp.exp(real(2.0) * wp.min(d[0], real(10.0))) - real(1.0)
+        m1 = wp.exp(real(2.0) * wp.min(d[1], real(10.0))) - real(1.0)
+        m2 = wp.exp(real(2.0) * wp.min(d[2], real(10.0))) - real(1.0)
+        m = q * wp.diag(vec3(m0, m1, m2)) * wp.transpose(q)
+        return vec6(m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2])
+
+    @wp.func
+    def exp_twice_minus_one(e: vec6):
+        if real(4.0) * norm_squared(e) > real(series_limit):
+            return exp_twice_minus_one_exact(e)
+        e2 = commuting_product(e, e)
+        e3 = commuting_product(e2, e)
+        return real(2.0) * e + real(2.0) * e2 + real(4.0) / real(3.0) * e3
+
+    @wp.func
+    def second_order(e: vec6, a: mat33):
+        d0 = a[0, 0]
+        d1 = a[1, 1]
+        d2 = a[2, 2]
+        d3 = real(0.5) * (a[0, 1] + a[1, 0])
+        d4 = real(0.5) * (a[0, 2] + a[2, 0])
+        d5 = real(0.5) * (a[1, 2] + a[2, 1])
+        w3 = a[0, 1] - d3
+        w4 = a[0, 2] - d4
+        w5 = a[1, 2] - d5
+        # Sum of d and twice the spin term's sources: (w e + (w e)^T) for e, half of it for d.
+        f0 = e[0] + real(0.5) * d0
+        f1 = e[1] + real(0.5) * d1
+        f2 = e[2] + real(0.5) * d2
+        f3 = e[3] + real(0.5) * d3
+        f4 = e[4] + real(0.5) * d4
+        f5 = e[5] + real(0.5) * d5
+        # A A^T / 2 - d^2 = (w d - d w - d^2 - w^2) / 2
+        return vec6(
+            e[0] + d0 + real(2.0) * (w3 * f3 + w4 * f4)
+            - real(0.5) * (d0 * d0 + d3 * d3 + d4 * d4 - w3 * w3 - w4 * w4),
+            e[1] + d1 + real(2.0) * (w5 * f5 - w3 * f3)
+            - real(0.5) * (d1 * d1 + d3 * d3 + d5 * d5 - w3 * w3 - w5 * w5),
+            e[2] + d2 - real(2.0) * (w4 * f4 + w5 * f5)
+            - real(0.5) * (d2 * d2 + d4 * d4 + d5 * d5 - w4 * w4 - w5 * w5),
+            e[3] + d3 + w3 * (f1 - f0) + w4 * f5 + w5 * f4
+            - real(0.5) * (d0 * d3 + d3 * d1 + d4 * d5 - w4 * w5),
+            e[4] + d4 + w4 * (f2 - f0) + w3 * f5 - w5 * f3
+            - real(0.5) * (d0 * d4 + d3 * d5 + d4 * d2 + w3 * w5),
+            e[5] + d5 + w5 * (f2 - f1) - w3 * f4 - w4 * f3
+            - real(0.5) * (d3 * d4 + d1 * d5 + d5 * d2 - w3 * w4),
+        )  # fmt: skip
+
+    @wp.func
+    def strain_trial(e: vec6, a: mat33):
+        if norm_squared(e) + wp.ddot(a, a) < real(second_order_limit):
+            return deviator(second_order(e, a))
+        # b - I = M + Y + Y^T + Y A^T with M = exp(2 e) - I and Y = A (I + M): no cancellation.
+        m6 = exp_twice_minus_one(e)
+        m = full(m6)
+        y = a + a * m
+        z = y * wp.transpose(a)
+        x = vec6(
+            m6[0] + real(2.0) * y[0, 0] + z[0, 0],
+            m6[1] + real(2.0) * y[1, 1] + z[1, 1],
+            m6[2] + real(2.0) * y[2, 2] + z[2, 2],
+            m6[3] + y[0, 1] + y[1, 0] + z[0, 1],
+            m6[4] + y[0, 2] + y[2, 0] + z[0, 2],
+            m6[5] + y[1, 2] + y[2, 1] + z[1, 2],
+        )
+        return deviator(half_log(x))
+
+    @wp.func
+    def volume_step(a: mat33):
+        # ln det(I + A) from det - 1, which a float32 difference would lose.
+        t = a[0, 0] + a[1, 1] + a[2, 2]
+        second = (
+            a[0, 0] * a[1, 1] + a[1, 1] * a[2, 2] + a[0, 0] * a[2, 2]
+            - a[0, 1] * a[1, 0] - a[1, 2] * a[2, 1] - a[0, 2] * a[2, 0]
+        )  # fmt: skip
+        g = t + second + wp.determinant(a)
+        if wp.abs(g) < real(0.01):
+            return g * (real(1.0) - g * (real(0.5) - g * (real(1.0) / real(3.0) - g * real(0.25))))
+        return wp.log(wp.max(real(1.0) + g, real(1e-6)))
+
+    @wp.func
+    def yield_stress(tau: real, p: real, dt: real, soil: Soil):
+        s0 = soil.static_friction * p
+        if tau <= s0:
+            return tau
+        if wp.static(effects.rate_dependence):
+            # Closed-form implicit mu(I): Dunatunga and Kamrin, J. Fluid Mech. 779 (2015).
+            s2 = soil.limit_friction * p
+            alpha = soil.shear_modulus * dt * soil.reference_rate * wp.sqrt(p)
+            if soil.linear_rate_law != 0:
+                k = alpha / ((soil.limit_friction - soil.static_friction) * p)
+                return (tau + k * s0) / (real(1.0) + k)
+            b = s2 + tau + alpha
+            h = s2 * tau + s0 * alpha
+            return real(2.0) * h / (b + wp.sqrt(wp.max(b * b - real(4.0) * h, real(0.0))))
+        return s0
+
+    @wp.func
+    def state_of(e: vec6, ln_j: real, g: real):
+        if wp.static(effects.fluidity):
+            return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j, g)
+        else:
+            return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j)
+
+    @wp.func
+    def separated_fluidity(a: mat33, dt: real, soil: Soil):
+        # Soil that comes back into contact flows as it did apart.
+        d = vec6(
+            a[0, 0], a[1, 1], a[2, 2],
+            real(0.5) * (a[0, 1] + a[1, 0]), real(0.5) * (a[0, 2] + a[2, 0]), real(0.5) * (a[1, 2] + a[2, 1]),
+        )  # fmt: skip
+        return wp.sqrt(real(2.0) * norm_squared(deviator(d))) / (dt * soil.static_friction)
+
+    @wp.func
+    def update(e: vec6, ln_j: real, a: mat33, dt: real, soil: Soil, g: real):
+        new_ln_j = ln_j + volume_step(a)
+        if wp.static(effects.separation):
+            if new_ln_j >= real(0.0):
+                if wp.static(effects.fluidity):
+                    return state_of(vec6(), new_ln_j, separated_fluidity(a, dt, soil))
+                else:
+                    return state_of(vec6(), new_ln_j, g)
+        t = strain_trial(e, a)
+        new_g = g
+        if wp.static(effects.yielding):
+            p = -soil.bulk_modulus * new_ln_j
+            if p <= real(0.0):
+                t = vec6()
+            else:
+                tau = soil.shear_modulus * wp.sqrt(real(2.0) * norm_squared(t))
+                if wp.static(effects.fluidity):
+                    ac = coefficients(p, dt, soil)
+                    mu = tau * ac[0] / (soil.shear_modulus * dt)
+                    found = fluidity_step(mu, ac[0], ac[1], g, dt, soil)
+                    if mu > real(0.0):
+                        t = t * (found[0] / mu)
+                    new_g = found[1]
+                elif wp.static(effects.nonlocality):
+                    if tau > real(0.0):
+                        ac = coefficients(p, dt, soil)
+                        mu = tau * ac[0] / (soil.shear_modulus * dt)
+                        t = t * (friction_with_excess(mu, ac[0], ac[1], g, soil) / mu)
+                else:
+                    if tau > soil.static_friction * p:
+                        t = t * (yield_stress(tau, p, dt, soil) / tau)
+        return state_of(t, new_ln_j, new_g)
+
+    @wp.func
+    def kirchhoff(e: vec6, ln_j: real, soil: Soil):
+        if wp.static(effects.separation):
+            if ln_j >= real(0.0):
+                return mat33()
+        return real(2.0) * soil.shear_modulus * full(e) + wp.diag(vec3(soil.bulk_modulus * ln_j))
+
+    return SimpleNamespace(
+        strain_trial=strain_trial,
+        volume_step=volume_step,
+        yield_stress=yield_stress,
+        update=update,
+        kirchhoff=kirchhoff,
+        vec6=vec6,
+        mat33=mat33,
+    )

@@ -1,0 +1,164 @@
+"""The background grid: momentum to velocity, gravity, floor and walls."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from ..launch import scene_kernel
+
+
+@cache
+def grid_struct(real: type) -> type:
+    """Struct of the grid and the step in precision `real`."""
+    vec3 = wp.types.vector(3, real)
+
+    @wp.struct
+    class Grid:
+        origin: vec3  # position of node (0, 0, 0) [m]
+        spacing: real  # dx [m]
+        inverse_spacing: real  # 1 / dx [1/m]
+        nx: int
+        ny: int
+        nz: int
+        dt: real  # [s]
+        volume_averaging: real  # share of a particle's own volume change that the mean replaces
+        forgetting: real  # share of recent volume changes that a step forgets
+        damping: real  # viscous time of the elastic strain / dt
+        gravity: vec3  # [m/s^2]
+        # Nodes with index <= low or >= high belong to the floor and the walls.
+        low: wp.vec3i
+        high: wp.vec3i
+        wall_friction: (
+            vec3  # Coulomb coefficient of the x walls, the y walls and the floor, where they have one
+        )
+        particle_mass: real  # [kg]
+        particle_volume: real  # at the critical density [m^3]
+        density_per_mass: real  # of a node: soil's density there over that of an undisturbed bed [1/kg]
+        beyond_walls: (
+            vec3  # the whole around a node on an x wall, a y wall, the floor over its part in the bin
+        )
+        speed_limit: real  # one cell per step [m/s]
+
+    return Grid
+
+
+@cache
+def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
+    """Kernels on the nodes in precision `real`.
+
+    - `begin`: momentum and mass to velocity, 1 / mass and the density over that of an undisturbed bed after a remap.
+      A node on a wall sees but a part of what is around it; soil is taken to go on beyond.
+    - `step`: velocity from the step's impulse and gravity, walls and floor; counts the step.
+
+    Both clear what they have used for the next sum. `walls` are the kinds of x walls, y walls and floor
+    (`Walls.kinds`); the kernels hold no code of other kinds.
+    """
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    Grid = grid_struct(real)
+
+    @wp.func
+    def no_slip(v: vec3, inward: vec3, friction: real):
+        return vec3()
+
+    @wp.func
+    def slip(v: vec3, inward: vec3, friction: real):
+        return v - wp.dot(v, inward) * inward
+
+    @wp.func
+    def rub(v: vec3, inward: vec3, friction: real):
+        # What moves into the wall is stopped, and slowed along the wall by Coulomb friction.
+        into = wp.dot(v, inward)
+        if into >= real(0.0):
+            return v
+        sliding = v - into * inward
+        speed = wp.length(sliding)
+        if speed <= -friction * into:
+            return vec3()
+        return sliding * (real(1.0) + friction * into / speed)
+
+    conditions = {"no_slip": no_slip, "slip": slip, "friction": rub, "periodic": slip}
+    at_x, at_y, at_floor = (conditions[kind] for kind in walls)
+
+    @wp.func
+    def place(n: int, grid: Grid):
+        # `/` of whole numbers is one instruction; `//` and `%` follow Python's rule for negative numbers.
+        column = n / grid.nz
+        i = column / grid.ny
+        return wp.vec3i(i, column - i * grid.ny, n - column * grid.nz)
+
+    @wp.func
+    def walls_seen(n: int, grid: Grid):
+        at = place(n, grid)
+        share = real(1.0)
+        for axis in range(3):
+            if at[axis] == grid.low[axis] or at[axis] == grid.high[axis]:
+                share *= grid.beyond_walls[axis]
+        return share
+
+    @scene_kernel()
+    def begin(
+        n: int,
+        grid: Grid,
+        momentum: wp.array(dtype=vec4),
+        velocity: wp.array(dtype=vec4),
+        before: wp.array(dtype=vec4),
+        inverse_mass: wp.array(dtype=real),
+        impulse: wp.array(dtype=vec4),
+    ):
+        node = momentum[n]
+        mass = node[3]
+        result = vec4()
+        inverse = real(0.0)
+        # A node that a particle on a cell's face barely touches has no mass to speak of, and 1 / mass no value.
+        if mass > real(1.0e-20) * grid.particle_mass:
+            inverse = real(1.0) / mass
+            result = vec4(node[0] / mass, node[1] / mass, node[2] / mass, real(0.0))
+        momentum[n] = vec4()
+        impulse[n] = vec4()
+        velocity[n] = result
+        result[3] = mass * grid.density_per_mass * walls_seen(n, grid)
+        before[n] = result
+        inverse_mass[n] = inverse
+
+    @scene_kernel()
+    def step(
+        n: int,
+        grid: Grid,
+        velocity: wp.array(dtype=vec4),
+        inverse_mass: wp.array(dtype=real),
+        impulse: wp.array(dtype=vec4),
+        substep: wp.array(dtype=int),
+    ):
+        # `static` around the walls' functions: Warp knows a kernel by its text and its functions, but not under which
+        # names it calls these. Without, walls x slip, y no_slip would get the kernel of x no_slip, y slip.
+        if n == 0:
+            substep[0] = substep[0] + 1
+        inverse = inverse_mass[n]
+        if inverse > real(0.0):
+            change = impulse[n]
+            now = velocity[n] + inverse * change
+            impulse[n] = vec4()
+            v = vec3(now[0], now[1], now[2]) + grid.dt * grid.gravity
+            at = place(n, grid)
+            i = at[0]
+            j = at[1]
+            k = at[2]
+            low = grid.low
+            high = grid.high
+            rough = grid.wall_friction
+            if wp.static(walls[0] != "periodic"):
+                if i <= low[0]:
+                    v = wp.static(at_x)(v, vec3(real(1.0), real(0.0), real(0.0)), rough[0])
+                if i >= high[0]:
+                    v = wp.static(at_x)(v, vec3(real(-1.0), real(0.0), real(0.0)), rough[0])
+            if wp.static(walls[1] != "periodic"):
+                if j <= low[1]:
+                    v = wp.static(at_y)(v, vec3(real(0.0), real(1.0), real(0.0)), rough[1])
+                if j >= high[1]:
+                    v = wp.static(at_y)(v, vec3(real(0.0), real(-1.0), real(0.0)), rough[1])
+            if k <= low[2]:
+                v = wp.static(at_floor)(v, vec3(real(0.0), real(0.0), real(1.0)), rough[2])
+            velocity[n] = vec4(v[0], v[1], v[2], inverse * change[3])
+
+    return SimpleNamespace(begin=begin, step=step)

@@ -1,0 +1,177 @@
+"""Signed distances of bodies as Warp functions, compiled for one shape each."""
+
+from functools import cache
+
+import warp as wp
+
+from ..bodies import Body
+
+OUT_OF_REACH = 1.0e6  # [m], for points that cannot touch
+
+
+@cache
+def shape_struct(real: type, shape: str) -> type:
+    """Struct of a shape's sizes [m] in precision `real`."""
+    vec3 = wp.types.vector(3, real)
+
+    if shape == "box":
+
+        @wp.struct
+        class BoxSize:
+            half: vec3
+
+        return BoxSize
+
+    if shape == "cylinder":
+
+        @wp.struct
+        class CylinderSize:
+            radius: real
+            half_width: real
+            grousers: int
+            tip_radius: real
+            grouser_half: real  # half the thickness
+            grouser_offset: (
+                real  # added to the grousers' distance, so that they begin to act at a depth of their own
+            )
+
+        return CylinderSize
+
+    @wp.struct
+    class MeshSize:
+        id: wp.uint64
+        half: vec3  # of the box that holds the mesh and everything in contact with it
+
+    return MeshSize
+
+
+def shape_data(body: Body, real: type, margin: float, device: wp.Device) -> tuple[object, wp.Mesh | None]:
+    """The filled struct of a body, and the mesh that has to be kept alive with it.
+
+    Args:
+        margin: distance at which contact begins, negative inside [m].
+    """
+    vec3 = wp.types.vector(3, real)
+    data = shape_struct(real, body.surface)()
+    if body.surface == "box":
+        data.half = vec3(*body.half_size)
+        return data, None
+    if body.surface == "cylinder":
+        data.radius, data.half_width = 0.5 * body.diameter, 0.5 * body.width
+        data.grousers, data.tip_radius = body.grousers, body.tip_radius
+        data.grouser_half = 0.5 * body.grouser_thickness
+        # A bar can be thinner than twice the depth at which contact begins; it then begins half-way to its middle.
+        data.grouser_offset = min(0.0, margin + 0.25 * body.grouser_thickness)
+        return data, None
+    vertices, triangles, _ = body.mesh
+    mesh = wp.Mesh(
+        points=wp.array(vertices, dtype=wp.vec3, device=device),
+        indices=wp.array(triangles.ravel(), dtype=int, device=device),
+        support_winding_number=True,
+    )
+    data.id, data.half = mesh.id, vec3(*(body.half_size + max(0.0, margin)))
+    return data, mesh
+
+
+@cache
+def signed_distance(real: type, shape: str) -> wp.Function:
+    """Warp function (point in the body frame, struct of the shape) -> outward normal and, as the fourth number,
+    signed distance [m], negative inside. Inside a corner the nearest face counts; inside a grouser's root the
+    distance is a lower bound."""
+    return {"box": _box, "cylinder": _cylinder, "mesh": _mesh}[shape](real)
+
+
+@cache
+def _nearest_face(real: type) -> wp.Function:
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+
+    @wp.func
+    def nearest_face(d: vec3):
+        # d: signed distances from three faces at right angles. Outward normal and signed distance of their corner.
+        out = vec3(wp.max(d[0], real(0.0)), wp.max(d[1], real(0.0)), wp.max(d[2], real(0.0)))
+        distance = wp.length(out)
+        if distance > real(0.0):
+            n = out / distance
+        else:
+            distance = wp.max(d[0], wp.max(d[1], d[2]))
+            n = vec3(real(1.0), real(0.0), real(0.0))
+            if d[1] > d[0] and d[1] >= d[2]:
+                n = vec3(real(0.0), real(1.0), real(0.0))
+            if d[2] > d[0] and d[2] > d[1]:
+                n = vec3(real(0.0), real(0.0), real(1.0))
+        return vec4(n[0], n[1], n[2], distance)
+
+    return nearest_face
+
+
+def _box(real: type) -> wp.Function:
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    Size = shape_struct(real, "box")
+    nearest_face = _nearest_face(real)
+
+    @wp.func
+    def box_distance(q: vec3, size: Size):
+        half = size.half
+        n = nearest_face(vec3(wp.abs(q[0]) - half[0], wp.abs(q[1]) - half[1], wp.abs(q[2]) - half[2]))
+        return vec4(n[0] * wp.sign(q[0]), n[1] * wp.sign(q[1]), n[2] * wp.sign(q[2]), n[3])
+
+    return box_distance
+
+
+def _cylinder(real: type) -> wp.Function:
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    Size = shape_struct(real, "cylinder")
+    nearest_face = _nearest_face(real)
+
+    @wp.func
+    def cylinder_distance(q: vec3, size: Size):
+        r = wp.sqrt(q[0] * q[0] + q[2] * q[2])
+        end = wp.abs(q[1]) - size.half_width
+        side = wp.sign(q[1])
+        away = vec3(real(1.0), real(0.0), real(0.0))  # from the axis; on it any direction will do
+        if r > real(0.0):
+            away = vec3(q[0] / r, real(0.0), q[2] / r)
+        rim = nearest_face(vec3(r - size.radius, end, -size.radius))
+        normal = rim[0] * away
+        distance = rim[3]
+        normal[1] = rim[1] * side
+        if size.grousers > 0:
+            # The bar nearest in angle, which reaches from the axis to its tip: its foot is no surface.
+            period = real(2.0) * real(wp.pi) / real(size.grousers)
+            angle = period * wp.round(wp.atan2(q[2], q[0]) / period)
+            along = vec3(wp.cos(angle), real(0.0), wp.sin(angle))
+            across = vec3(-along[2], real(0.0), along[0])
+            t = wp.dot(q, across)
+            bar = nearest_face(vec3(wp.dot(q, along) - size.tip_radius, end, wp.abs(t) - size.grouser_half))
+            if bar[3] + size.grouser_offset < distance:
+                distance = bar[3] + size.grouser_offset
+                normal = bar[0] * along + bar[2] * wp.sign(t) * across
+                normal[1] = bar[1] * side
+        return vec4(normal[0], normal[1], normal[2], distance)
+
+    return cylinder_distance
+
+
+def _mesh(real: type) -> wp.Function:
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    Size = shape_struct(real, "mesh")
+
+    @wp.func
+    def mesh_distance(q: vec3, size: Size):
+        half = size.half
+        found = vec4(real(0.0), real(0.0), real(1.0), real(OUT_OF_REACH))
+        if wp.abs(q[0]) < half[0] and wp.abs(q[1]) < half[1] and wp.abs(q[2]) < half[2]:
+            # Warp's queries are single precision only.
+            p = wp.vec3(wp.float32(q[0]), wp.float32(q[1]), wp.float32(q[2]))
+            query = wp.mesh_query_point_sign_winding_number(size.id, p, wp.float32(OUT_OF_REACH))
+            if query.result:
+                away = p - wp.mesh_eval_position(size.id, query.face, query.u, query.v)
+                distance = wp.length(away)
+                # On the surface itself the difference has no direction, but the triangle has.
+                n = wp.mesh_eval_face_normal(size.id, query.face)
+                if distance > wp.float32(1.0e-6) * wp.length(p):
+                    n = away * (query.sign / distance)
+                found = vec4(real(n[0]), real(n[1]), real(n[2]), real(query.sign * distance))
+        return found
+
+    return mesh_distance

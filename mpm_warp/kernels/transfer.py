@@ -1,0 +1,297 @@
+"""Particle-grid transfers with quadratic B-splines (APIC / MLS), and the material update.
+
+Momentum is carried to the grid only now and then (`to_grid`, `from_grid`: a remap). In between the velocities live on
+the grid: particles give impulses (`scatter`) and feel the velocity and its gradient (`gather`), with the spline weights
+of the place they had at the remap, their `home`. A remap smooths velocities over a grid spacing; done in every step,
+that smoothing acts as a viscosity that grows with 1 / dt.
+
+The transfers visit the 27 nodes around a particle, as 9 rows along z. Node (i, j, k) is entry (i ny + j) nz + k of a
+flat array of 4-vectors: momentum and mass, or impulse and mass times the particles' last volume change, or velocity and
+its mean.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from ..effects import Effects
+from ..launch import scene_kernel
+from .constitutive import constitutive
+from .contact import ContactLaw, body_struct, contact
+from .fluidity import fluidity, soil_struct
+from .grid import grid_struct
+from .loose_soil import loose
+from .node_rows import rows, splines
+
+
+@cache
+def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: bool) -> SimpleNamespace:
+    """Kernels in precision `real` with only the physics in `effects`: `to_grid` and `from_grid` at a remap;
+    `scatter`, `gather` and `material` in every step.
+
+    `touch` is the contact with a body, None without one; `atomic` is needed where many threads write to the grid at
+    once (a GPU).
+    """
+    # Warp writes a product and the sum it goes into as two statements: without the flag they stay two instructions.
+    fused = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast"}
+    vec3 = wp.types.vector(3, real)
+    vec4 = wp.types.vector(4, real)
+    law = constitutive(real, effects)
+    vec6, mat33 = law.vec6, law.mat33
+    Soil, Grid = soil_struct(real, effects.fluidity), grid_struct(real)
+    Body = body_struct(real, touch or ContactLaw())
+    with_body = touch is not None
+    push = contact(real, touch or ContactLaw(), atomic).push
+    update, kirchhoff = law.update, law.kirchhoff
+    fading = fluidity(real, effects).fading
+    apart, loose_volume = loose(real).apart, loose(real).volume
+    spline = splines(real)
+    base_and_offset, weights, moments = spline.base_and_offset, spline.weights, spline.moments
+    lanes = rows(real, gpu=atomic)
+    row, plus, gather_row, scatter_row, spread, fold = (
+        lanes.row, lanes.plus, lanes.gather, lanes.scatter, lanes.spread, lanes.fold
+    )  # fmt: skip
+
+    @wp.func
+    def node_index(base: wp.vec3i, i: int, j: int, grid: Grid):
+        return ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
+
+    @wp.func
+    def fault(stray: wp.array(dtype=int), p: int, substep: int, left_grid: int):
+        # The first faulty particle is remembered; the solver stops at the end of the frame.
+        if wp.atomic_add(stray, 0, 1) == 0:
+            stray[1] = p
+            stray[2] = substep
+            stray[3] = left_grid
+
+    @wp.func
+    def deposit(base: wp.vec3i, f: vec3, corner: vec4, q: mat33, grid: Grid, nodes: wp.array(dtype=vec4)):
+        # Adds weight times an affine field: `corner` at the lowest node, the columns of q more with every cell along
+        # x, y, z. The sum over a row is the same for all nine rows but for the weights.
+        wx = weights(f[0])
+        wy = weights(f[1])
+        wz = weights(f[2])
+        zero = real(0.0)
+        plane = spread(wz, corner, vec4(q[0, 2], q[1, 2], q[2, 2], zero))
+        row_x = spread(wz, vec4(q[0, 0], q[1, 0], q[2, 0], zero), vec4())
+        row_y = spread(wz, vec4(q[0, 1], q[1, 1], q[2, 1], zero), vec4())
+        for i in range(3):
+            at = plane
+            for j in range(3):
+                scatter_row(nodes, node_index(base, i, j, grid), plus(row(), wx[i] * wy[j], at))
+                at = plus(at, real(1.0), row_y)
+            plane = plus(plane, real(1.0), row_x)
+
+    @scene_kernel(fused)
+    def to_grid(
+        p: int,
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        c: wp.array(dtype=mat33),
+        home: wp.array(dtype=vec3),
+        grid: Grid,
+        momentum: wp.array(dtype=vec4),
+        top_speed: wp.array(dtype=real),
+        substep: wp.array(dtype=int),
+        stray: wp.array(dtype=int),
+    ):
+        speed = wp.length(v[p])
+        if not (speed < grid.speed_limit):  # true for a NaN, too
+            fault(stray, p, substep[0], 0)
+            return
+        wp.atomic_max(top_speed, 0, speed)
+        home[p] = x[p]
+        base, f = base_and_offset(x[p], grid)
+        q = c[p] * (grid.particle_mass * grid.spacing)
+        start = grid.particle_mass * v[p] - q * f
+        deposit(base, f, vec4(start[0], start[1], start[2], grid.particle_mass), q, grid, momentum)
+
+    @scene_kernel(fused)
+    def scatter(
+        p: int,
+        x: wp.array(dtype=vec3),
+        home: wp.array(dtype=vec3),
+        felt: wp.array(dtype=vec4),
+        stress: wp.array(dtype=vec6),
+        swelling: wp.array(dtype=real),
+        grid: Grid,
+        body: Body,
+        impulse: wp.array(dtype=vec4),
+        substep: wp.array(dtype=int),
+    ):
+        base, f = base_and_offset(home[p], grid)
+        # Of the stress: -dt V D^-1 tau (x_i - x_p), D = dx^2 / 4; q is per cell.
+        t = stress[p]
+        q = mat33(t[0], t[3], t[4], t[3], t[1], t[5], t[4], t[5], t[2]) * (
+            real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing
+        )
+        start = -(q * f)
+        if wp.static(with_body):
+            u = vec3(felt[p][0], felt[p][1], felt[p][2])
+            start += push(p, x[p], u, grid.particle_mass, grid.dt, substep[0], body)
+        deposit(
+            base, f, vec4(start[0], start[1], start[2], grid.particle_mass * swelling[p]), q, grid, impulse
+        )
+
+    @scene_kernel(fused)
+    def gather(
+        p: int,
+        x: wp.array(dtype=vec3),
+        home: wp.array(dtype=vec3),
+        felt: wp.array(dtype=vec4),
+        c: wp.array(dtype=mat33),
+        grid: Grid,
+        velocity: wp.array(dtype=vec4),
+        cooperation: wp.array(dtype=vec4),
+        excess: wp.array(dtype=real),
+        substep: wp.array(dtype=int),
+        stray: wp.array(dtype=int),
+    ):
+        base, f = base_and_offset(home[p], grid)
+        wx = weights(f[0])
+        wy = weights(f[1])
+        wz = weights(f[2])
+        # Weights times the node's distance from the particle, for the velocity gradient.
+        ax = moments(wx, f[0])
+        ay = moments(wy, f[1])
+        az = moments(wz, f[2])
+        all_v = row()
+        all_x = row()
+        all_y = row()
+        for i in range(3):
+            plane = row()
+            plane_y = row()
+            for j in range(3):
+                v_row = gather_row(velocity, node_index(base, i, j, grid))
+                plane = plus(plane, wy[j], v_row)
+                plane_y = plus(plane_y, ay[j], v_row)
+            all_v = plus(all_v, wx[i], plane)
+            all_x = plus(all_x, ax[i], plane)
+            all_y = plus(all_y, wx[i], plane_y)
+        total = fold(wz, all_v)
+        if wp.static(effects.nonlocality):
+            around = row()
+            for i in range(3):
+                for j in range(3):
+                    nodes = gather_row(cooperation, node_index(base, i, j, grid))
+                    around = plus(around, wx[i] * wy[j], nodes)
+            excess[p] = fold(wz, around)[0]
+        gx = fold(wz, all_x)
+        gy = fold(wz, all_y)
+        gz = fold(az, all_v)
+        scale = real(4.0) * grid.inverse_spacing
+        moved = x[p] + grid.dt * vec3(total[0], total[1], total[2])
+        g = (moved - grid.origin) * grid.inverse_spacing
+        inside = (
+            g[0] >= real(0.5) and g[1] >= real(0.5) and g[2] >= real(0.5)
+            and g[0] < real(grid.nx) - real(1.5)
+            and g[1] < real(grid.ny) - real(1.5)
+            and g[2] < real(grid.nz) - real(1.5)
+        )  # fmt: skip
+        near = wp.length_sq(moved - home[p]) < grid.spacing * grid.spacing  # false for a NaN, too
+        if inside and near:
+            x[p] = moved
+            felt[p] = total
+            c[p] = mat33(
+                gx[0] * scale, gy[0] * scale, gz[0] * scale,
+                gx[1] * scale, gy[1] * scale, gz[1] * scale,
+                gx[2] * scale, gy[2] * scale, gz[2] * scale,
+            )  # fmt: skip
+        else:
+            c[p] = mat33()  # the particle keeps its last good state
+            fault(stray, p, substep[0], wp.where(near, 1, 0))
+
+    # A kernel of its own: in one with the transfer the C++ compiler makes both slower.
+    @scene_kernel(fused)
+    def material(
+        p: int,
+        felt: wp.array(dtype=vec4),
+        c: wp.array(dtype=mat33),
+        e: wp.array(dtype=vec6),
+        ln_j: wp.array(dtype=real),
+        stress: wp.array(dtype=vec6),
+        swelling: wp.array(dtype=real),
+        excess: wp.array(dtype=real),
+        grid: Grid,
+        soil: Soil,
+    ):
+        # What `update` means by its last number; `excess` is what cooperative flow adds (nonlocal_fluidity.py).
+        g = real(0.0)
+        if wp.static(effects.nonlocality):
+            g = excess[p]
+        if wp.static(effects.fluidity):
+            kept = real(1.0)
+            if wp.static(effects.nonlocality):
+                kept = fading(grid.inverse_spacing, grid.dt, soil)
+            g = wp.max(kept * soil.g[p] + g, real(0.0))
+        before = e[p]
+        # Volume changes as the mean over the nodes around does: what a particle's own gradient says besides is noise,
+        # and is taken back within the time a wave needs for a cell. `swelling` is the sum of its recent changes, and
+        # felt[p][3] the mean of that. Soil that bears no stress has no say in it and repeats the mean: its changes are
+        # large, and shared out they would compress the dense soil that it falls on.
+        recent = swelling[p]
+        averaged = grid.volume_averaging * grid.forgetting * (felt[p][3] - recent)
+        if wp.static(effects.separation):
+            averaged *= real(1.0) - apart(ln_j[p])
+        volume_before = ln_j[p] + averaged
+        state = update(before, volume_before, grid.dt * c[p], grid.dt, soil, g)
+        after = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
+        e[p] = after
+        ln_j[p] = state[6]
+        changes = (real(1.0) - grid.forgetting) * recent + state[6] - volume_before
+        if wp.static(effects.separation):
+            mean = (real(1.0) - grid.forgetting) * felt[p][3]
+            changes += apart(wp.max(volume_before, state[6])) * (mean - changes)
+        swelling[p] = changes
+        if wp.static(effects.fluidity):
+            soil.g[p] = state[7]
+        # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone. It
+        # takes away at most half of the pressure, since soil can bear no tension.
+        volume = state[6] + grid.damping * (state[6] - volume_before)
+        if wp.static(effects.separation):
+            volume = wp.where(state[6] < real(0.0), wp.min(volume, real(0.5) * state[6]), state[6])
+        t = kirchhoff(after + grid.damping * (after - before), volume, soil)
+        stress[p] = vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])
+
+    @wp.func
+    def within_walls(x: vec3, grid: Grid):
+        # A wall is a condition at nodes; between two remaps a particle on it may follow the node inside and get beyond.
+        # Where there is none, `low` and `high` lie outside of the grid.
+        for axis in range(3):
+            x[axis] = wp.max(x[axis], grid.origin[axis] + real(grid.low[axis]) * grid.spacing)
+            x[axis] = wp.min(x[axis], grid.origin[axis] + real(grid.high[axis]) * grid.spacing)
+        return x
+
+    @scene_kernel(fused)
+    def from_grid(
+        p: int,
+        x: wp.array(dtype=vec3),
+        home: wp.array(dtype=vec3),
+        felt: wp.array(dtype=vec4),
+        v: wp.array(dtype=vec3),
+        grid: Grid,
+        before: wp.array(dtype=vec4),
+        keep: wp.array(dtype=real),
+        ln_j: wp.array(dtype=real),
+    ):
+        # The particle's own velocity changes by what changed on the grid; of the part that the grid does not resolve
+        # the share `keep` is left.
+        base, f = base_and_offset(home[p], grid)
+        wx = weights(f[0])
+        wy = weights(f[1])
+        total = row()
+        for i in range(3):
+            for j in range(3):
+                total = plus(total, wx[i] * wy[j], gather_row(before, node_index(base, i, j, grid)))
+        smooth = fold(weights(f[2]), total)
+        u = vec3(felt[p][0], felt[p][1], felt[p][2])
+        x[p] = within_walls(x[p], grid)
+        if wp.static(effects.separation):
+            if ln_j[p] > real(0.0):
+                ln_j[p] = loose_volume(ln_j[p], node_index(base, 0, 0, grid), f, before, grid)
+        v[p] = u + keep[0] * (v[p] - vec3(smooth[0], smooth[1], smooth[2]))
+
+    return SimpleNamespace(
+        to_grid=to_grid, scatter=scatter, gather=gather, material=material, from_grid=from_grid
+    )

@@ -1,0 +1,365 @@
+"""Warp: its start, kernels for one scene or many, and the work that scenes ask of the device."""
+
+from __future__ import annotations
+
+import ctypes
+import inspect
+import linecache
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .state import SceneError
+
+# --- Starting Warp without noise, and finding its devices -----------------------------------------------
+
+
+@cache
+def start_warp() -> None:
+    """Initialise Warp once, without its banner and, where there is no CUDA driver, without saying so.
+
+    Raises:
+        SceneError: it has no place for compiled kernels.
+    """
+    # Warp announces every kernel it loads; here only its warnings are of use.
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    try:
+        with nullcontext() if _has_cuda_driver() else silent_stderr():
+            wp.init()
+    except OSError as error:
+        raise SceneError(
+            f"Warp cannot make its folder of compiled kernels ({error}); name another one in the environment variable "
+            "WARP_CACHE_PATH"
+        ) from error
+
+
+def find_device(name: str) -> wp.Device:
+    """The device called `cpu`, `cuda`, `cuda:0`, ..., with Warp started.
+
+    Raises:
+        SceneError: there is no such device here.
+    """
+    start_warp()
+    if name == "cuda" and wp.is_cuda_available():
+        return wp.get_device(name)
+    devices = {str(device): device for device in wp.get_devices()}
+    if name not in devices:
+        raise SceneError(f"device is {name!r}; allowed here: {', '.join(devices)}")
+    return devices[name]
+
+
+def _has_cuda_driver() -> bool:
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
+@contextmanager
+def silent_stderr() -> Iterator[None]:
+    """Nothing reaches the error stream, not from native code either."""
+    # The warning comes from native code, past Python's sys.stderr.
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is no stderr
+        yield
+        return
+    silent = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(silent, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(silent)
+
+
+# --- Loading kernels from Warp's cache, whatever became of the files there ------------------------------
+
+
+def load_kernel(kernel: wp.Kernel, device: wp.Device) -> None:
+    """Load a kernel's module; what is damaged in Warp's cache is compiled again, once.
+
+    A full disk or a machine that was switched off leaves files that are cut short; Warp trusts whatever has the right
+    name.
+
+    Raises:
+        SceneError: the cache cannot be written, or what was compiled anew does not load either.
+    """
+    module = kernel.module
+    block_dim = 1 if device.is_cpu else module.options["block_dim"]
+    folder = Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim)
+    there = os.path.lexists(folder)
+    try:
+        with silent_stderr() if there else nullcontext():  # the line that follows says it, or it is repaired
+            wp.load_module(module, device, max_workers=0)
+        return
+    except OSError as error:
+        if not there:
+            raise SceneError(_unwritable(error)) from error
+    except Exception:  # Warp's own have no class of theirs
+        if not there:
+            raise
+    aside = folder.with_name(f"{folder.name}.damaged-{os.getpid()}")
+    try:
+        # A folder that cannot be read can still be renamed. Another process may have done so.
+        with suppress(FileNotFoundError):
+            folder.rename(aside)
+        shutil.rmtree(aside, ignore_errors=True)
+        module.unload()  # a failure is remembered otherwise
+        wp.load_module(module, device, max_workers=0)
+    except OSError as error:
+        raise SceneError(_unwritable(error)) from error
+    except Exception as error:
+        raise SceneError(
+            f"the kernel {kernel.key} in {folder} was damaged and does not load when compiled anew either "
+            f"({str(error).splitlines()[0]}); remove {wp.config.kernel_cache_dir} and try again"
+        ) from error
+
+
+def _unwritable(error: OSError) -> str:
+    return (
+        f"Warp's folder of compiled kernels, {wp.config.kernel_cache_dir}, cannot be used ({error}); repair or remove "
+        "it, or name another one in the environment variable WARP_CACHE_PATH"
+    )
+
+
+# --- Kernels that work for one scene or, in one launch, for many ----------------------------------------
+# What a scene asks of the device is a fixed order of kernels with fixed arguments. Where several scenes ask
+# for the same
+# kernels, one launch of each serves them all: a table holds every scene's arguments, and thread (s, i) does
+# in scene s
+# what thread i does where the scene is alone. Each scene keeps arrays, sizes, a material and a time step of its own.
+
+
+class SceneKernel:
+    """The two kernels made of one function.
+
+    Args:
+        body: what thread i does; i is its first argument, the others are the kernel's.
+        module_options: Warp's options for the kernels' modules.
+    """
+
+    def __init__(self, body: Callable, module_options: dict[str, Any] | None = None) -> None:
+        _, *arguments = inspect.get_annotations(body).items()
+        self.name = body.__name__
+        self._types = dict(arguments)
+        self._body, self._options = body, module_options
+        self._function = wp.func(body)
+
+    @cached_property
+    def alone(self) -> wp.Kernel:
+        """Over the items of one scene, with the function's arguments."""
+        arguments = ", ".join(f"{name}: types[{name!r}]" for name in self._types)
+        return self._kernel("", arguments, f"one_item(wp.tid(), {', '.join(self._types)})")
+
+    @cached_property
+    def together(self) -> wp.Kernel:
+        """Over (scenes, items); `counts` are the scenes' items, and a scene with no more than `step` steps to do is
+        left as it is."""
+        return self._kernel(
+            "_together",
+            "table: wp.array(dtype=row), counts: wp.array(dtype=int), steps: wp.array(dtype=int), step: int",
+            "s, i = wp.tid()",
+            "if i < counts[s] and step < steps[s]:",
+            f"    one_item(i, {', '.join(f'table[s].{name}' for name in self._types)})",
+        )
+
+    @property
+    def row(self) -> Any:
+        """Struct of one scene's arguments in the table of `together`."""
+        # Not the one made below: where Warp has met the same text and types before, it gives the kernel it made then.
+        return self.together.adj.arg_types["table"].dtype
+
+    def _kernel(self, ending: str, arguments: str, *lines: str) -> wp.Kernel:
+        # Warp translates a kernel's text. This one stands in no file, so Python has to be told of it.
+        name = self.name + ending
+        text = "\n    ".join((f"def {name}({arguments}):", *lines)) + "\n"
+        file = f"<{self._body.__module__}.{self._body.__qualname__}{ending} {id(self)}>"
+        linecache.cache[file] = len(text), None, text.splitlines(keepends=True), file
+        names: dict[str, Any] = {"wp": wp, "one_item": self._function, "types": self._types}
+        names["__name__"] = self._body.__module__
+        if ending:
+            names["row"] = wp.struct(type(f"{self.name}_row", (), {"__annotations__": self._types}))
+        exec(compile(text, file, "exec"), names)
+        function: Any = names[name]
+        function.__qualname__ = self._body.__qualname__ + ending
+        return wp.kernel(function, module="unique", enable_backward=False, module_options=self._options)
+
+
+def scene_kernel(module_options: dict[str, Any] | None = None) -> Callable[[Callable], SceneKernel]:
+    """Decorator that makes a `SceneKernel` of a function."""
+    return lambda body: SceneKernel(body, module_options)
+
+
+@dataclass(frozen=True, eq=False)
+class Launch:
+    """A kernel over the items of one scene."""
+
+    kernel: SceneKernel
+    count: int
+    arguments: Sequence[Any]
+    """Of the kernel's function, without its first. Arrays keep their place and numbers their value."""
+    device: wp.Device
+
+    def load(self) -> None:
+        """Load the kernel, which compiles it the first time."""
+        _ = self._recorded
+
+    def launch(self, step: int = 0) -> None:
+        """Run it, whatever the number of the step."""
+        self._recorded.launch()
+
+    @cached_property
+    def _recorded(self) -> wp.Launch:
+        load_kernel(self.kernel.alone, self.device)
+        return wp.launch(self.kernel.alone, self.count, self.arguments, device=self.device, record_cmd=True)
+
+
+class Together:
+    """The same kernel over the items of several scenes.
+
+    Args:
+        launches: one of each scene.
+        steps: that each scene has to do.
+    """
+
+    def __init__(self, launches: Sequence[Launch], steps: wp.array) -> None:
+        self._launches = launches  # they hold the arrays that the table points to
+        kernel, device, rows = launches[0].kernel, launches[0].device, []
+        row = kernel.row
+        for launch in launches:
+            rows.append(row())
+            for name, value in zip(row.vars, launch.arguments, strict=True):
+                setattr(rows[-1], name, value)
+        counts = [launch.count for launch in launches]
+        table = wp.array(rows, dtype=row, device=device), wp.array(counts, dtype=int, device=device)
+        load_kernel(kernel.together, device)
+        self._recorded = wp.launch(
+            kernel.together,
+            (len(launches), max(counts)),
+            [*table, steps, 0],
+            device=device,
+            record_cmd=True,
+        )
+
+    def launch(self, step: int = 0) -> None:
+        """Run it for the scenes that have more than `step` steps to do."""
+        self._recorded.set_param_by_name("step", step)
+        self._recorded.launch()
+
+
+# --- What scenes ask of the device, done for all of them at once ----------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """What a scene lets the device do: `begin`, then `step` as often as it asks, then `end`."""
+
+    begin: Sequence[Launch]
+    step: Sequence[Launch] = ()
+    end: Sequence[Launch] = ()
+
+    @cached_property
+    def kernels(self) -> tuple[tuple[SceneKernel, ...], ...]:
+        """Programs that have the same can run as one."""
+        return tuple(tuple(launch.kernel for launch in part) for part in (self.begin, self.step, self.end))
+
+
+@dataclass
+class Work:
+    """A program and the number of its steps; with none of them its kernels are loaded and nothing runs."""
+
+    program: Program
+    steps: int
+    shared_by: int = 1
+    """How many scenes had work done at the same time; known afterwards."""
+
+
+def captures(device: wp.Device) -> bool:
+    """Whether launches are captured as a graph. Warp can do that on a CPU, too, which tests make use of."""
+    return device.is_cuda
+
+
+class _Stack:
+    """Programs of the same kernels as one; on a GPU the whole of it is one CUDA graph."""
+
+    def __init__(self, programs: Sequence[Program], device: wp.Device) -> None:
+        self.programs, self._device = programs, device
+        self._steps = wp.zeros(len(programs), dtype=int, device=device)
+        self._graphs: dict[int, wp.Graph] = {}
+        self._begin = self._serving([p.begin for p in programs])
+        self._step = self._serving([p.step for p in programs])
+        self._end = self._serving([p.end for p in programs])
+
+    def _serving(self, parts: Sequence[Sequence[Launch]]) -> list[Launch | Together]:
+        """What runs in place of the programs' launches, in order."""
+        if len(parts) == 1:
+            for launch in parts[0]:
+                launch.load()
+            return list(parts[0])
+        made: dict[tuple[Launch, ...], Together] = {}
+        for launches in zip(*parts, strict=True):
+            if launches not in made:
+                made[launches] = Together(launches, self._steps)
+        return [made[launches] for launches in zip(*parts, strict=True)]
+
+    def run(self, steps: Sequence[int]) -> None:
+        """Do so many steps of each program."""
+        most = max(steps)
+        if most == 0:
+            return
+        if len(steps) > 1:
+            self._steps.assign(np.array(steps, dtype=np.int32))
+        if not captures(self._device):
+            self._launch(most)
+            return
+        if most not in self._graphs:
+            with wp.ScopedCapture(device=self._device) as capture:
+                self._launch(most)
+            self._graphs[most] = capture.graph
+        wp.capture_launch(self._graphs[most])
+
+    def _launch(self, steps: int) -> None:
+        for launch in self._begin:
+            launch.launch()
+        for step in range(steps):
+            for launch in self._step:
+                launch.launch(step)
+        for launch in self._end:
+            launch.launch()
+
+
+class Worker:
+    """Has a device do what scenes ask for.
+
+    Args:
+        device: on which their arrays lie.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self._device = device
+        self._stacks: dict[object, _Stack] = {}  # kernels → the programs that last asked for them
+
+    def do(self, works: Sequence[Work]) -> None:
+        """Do works that do not touch each other's arrays, those of the same kernels together."""
+        alike: dict[object, list[Work]] = {}
+        for work in works:
+            work.shared_by = len(works)
+            alike.setdefault(work.program.kernels, []).append(work)
+        for kernels, group in alike.items():
+            programs = [work.program for work in group]
+            stack = self._stacks.get(kernels)
+            if stack is None or stack.programs != programs:
+                stack = self._stacks[kernels] = _Stack(programs, self._device)
+            stack.run([work.steps for work in group])

@@ -1,0 +1,238 @@
+"""`sgns advise`: which setting of the solver, or which surrogate, is good enough and fast enough."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from sgns.config import UserError
+from sgns.frontier.point import Point, effective_error, read_points, usable
+
+log = logging.getLogger(__name__)
+
+
+STEP = 1.0 / 60.0
+"""Simulated time of one step: what `time` is the wall time of [s]."""
+# Key of `error` → column, what one of its units is of the key's, and words. Lengths are metres in settings.
+ERRORS = {
+    "force": ("force_nrmse", 1.0, "force NRMSE", ""),
+    "position": ("position_rmse_mm", 1e3, "displacement of the soil", " mm"),
+    "surface": ("surface_rmse_mm", 1e3, "surface at the end", " mm"),
+    "sinkage": ("sinkage_error_mm", 1e3, "sinkage", " mm"),
+}
+OWN = {
+    "force": "own_force_nrmse",
+    "position": "own_position_rmse_mm",
+    "surface": "own_surface_rmse_mm",
+    "sinkage": "own_sinkage_error_mm",
+}
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a person needs.
+
+    Attributes:
+        scene: whose points are looked at.
+        errors: column of `Point` → largest error, in the column's unit.
+        time: longest wall time of a step of `STEP` [s], or None.
+        particles: whether the positions of all particles are wanted in every step.
+        bands: column → how wrong the reference itself may be.
+        columns: key of `error` → the column it is about.
+    """
+
+    scene: str
+    errors: Mapping[str, float]
+    time: float | None
+    particles: bool
+    bands: Mapping[str, float]
+    columns: Mapping[str, str]
+
+    def step_time(self, point: Point) -> float:
+        """Wall time of a step of a point [s]; NaN if it is not known."""
+        return STEP * (point.decoded_cost if self.particles else point.cost)
+
+    def error(self, point: Point, column: str) -> float:
+        """What counts: of a surrogate the larger of its error and of that against the solver that made its training
+        runs, since a surrogate that is nearer to the reference than to what it learned from is so by luck."""
+        found = effective_error(point, column, self.bands)
+        own = getattr(point, f"own_{column.removeprefix('own_')}", math.nan)
+        return found if math.isnan(own) else max(found, own)
+
+    def excess(self, point: Point) -> float:
+        """The largest of what a point does over what is allowed; 1 or less: it is good enough."""
+        shares = [self.error(point, column) / limit for column, limit in self.errors.items()]
+        if self.time is not None:
+            shares.append(self.step_time(point) / self.time)
+        return math.nan if any(map(math.isnan, shares)) else max(shares)
+
+
+def chosen(points: Sequence[Point], wish: Wish) -> tuple[Point, bool]:
+    """The point to use and whether it meets the wish.
+
+    Of those that meet it the fastest, or with a time alone the one with the smallest error of the force; if none does,
+    the one that misses it by the smallest factor. Surrogates that no command makes, such as those trained on some of
+    the runs or frames, are for the study only.
+
+    Raises:
+        UserError: no point of the scene has the errors asked for.
+    """
+    there = [
+        p
+        for p in points
+        if p.scene == wish.scene
+        and usable(p)
+        and not (p.kind == "surrogate" and p.note)  # the note says what the command leaves out
+        and not math.isnan(wish.excess(p) + wish.step_time(p))
+    ]
+    if not there:
+        raise UserError(
+            f"no operating point of task={wish.scene} has all the numbers asked for; its kinds of error are "
+            f"in points.csv"
+        )
+    good = [p for p in there if wish.excess(p) <= 1.0]
+    if good and wish.errors:
+        return min(good, key=wish.step_time), True
+    if good:
+        force = wish.columns["force"]
+        with_force = [p for p in good if not math.isnan(wish.error(p, force))] or good
+        return min(with_force, key=lambda p: (wish.error(p, force), wish.step_time(p))), True
+    return min(there, key=lambda p: (wish.excess(p), wish.step_time(p))), False
+
+
+def advice(points: Sequence[Point], wish: Wish) -> list[str]:
+    """The answer in lines."""
+    point, met = chosen(points, wish)
+    lines = [f"{'use' if met else 'nothing meets this; closest'}: {point.kind}, {point.label}"]
+    lines += [f"  {line}" for line in commands(point)]
+    step = wish.step_time(point)
+    soil = "" if point.kind == "solver" else ", all particles decoded" if wish.particles else ", none decoded"
+    lines.append(
+        f"  costs {1e3 * step:.3g} ms per step of 1/60 s{soil}, on one core of {point.machine}: up to "
+        f"{1.0 / step:.3g} steps a second"
+    )
+    for key, (_, _, words, unit) in ERRORS.items():
+        column = wish.columns[key]
+        value = effective_error(point, column, wish.bands)
+        if math.isnan(value):
+            continue
+        limit, band = wish.errors.get(column), wish.bands.get(column, 0.0)
+        said = f"  {words}: {value:.3g}{unit}"
+        if value <= band:
+            said += " or less (within the reference's own error)"
+        elif (low := getattr(point, f"{column}_low", math.nan)) < (
+            high := getattr(point, f"{column}_high", 0.0)
+        ):
+            said += f" ({low:.3g} to {high:.3g} from case to case)"
+        said += f", asked for {limit:.3g}{unit}" if limit is not None else ""
+        lines.append(said)
+        if limit is not None and limit < band:
+            lines.append(
+                f"    the reference itself is only known to {band:g}{unit}: nothing can be shown to be better"
+            )
+    if point.kind == "surrogate" and wish.columns != OWN and not math.isnan(point.own_force_nrmse):
+        lines.append(
+            f"  against the solver that made its training runs: force NRMSE {point.own_force_nrmse:.3g}, particles "
+            f"{point.own_position_rmse_mm:.3g} mm; the larger error counts"
+        )
+    reference = next((p for p in points if p.scene == wish.scene and p.axis == "reference"), None)
+    against = f"against the solver at {reference.label}" if reference else "against the study's reference"
+    if wish.columns == OWN:
+        against = "against the solver that made the training runs, over its test runs"
+    measured = f"version {point.version}" + (f", commit {point.commit}" if point.commit else "")
+    lines.append(
+        f"  rests on study {point.study}, scene {point.scene}: errors {against}; measured with {measured}"
+    )
+    if point.note:
+        lines.append(f"  note: {point.note}")
+    return lines
+
+
+def commands(point: Point) -> list[str]:
+    """What to type for a point."""
+    if point.kind == "solver":
+        return [f"sgns simulate {point.settings} output=run.h5"]
+    if point.kind == "surrogate":
+        return [
+            f"sgns train {point.settings} output=outputs/advised",
+            "sgns rollout checkpoint=outputs/advised/best.ckpt "
+            f"scene={shipped(point.study, point.scene).get('scene', '...')} output=rollout.h5",
+        ]
+    return [point.settings] if point.settings else []
+
+
+def main(cfg: DictConfig) -> float:
+    """The command; returns the wall time of a step [s]."""
+    points = read_points(table(cfg.table))
+    wish = wished(OmegaConf.to_container(cfg, resolve=True), points)
+    for line in advice(points, wish):
+        log.info("%s", line)
+    return wish.step_time(chosen(points, wish)[0])
+
+
+def table(asked: str | None) -> Path:
+    """The file asked for, or the one that ships with the package."""
+    return Path(asked) if asked else Path(str(files("sgns.frontier").joinpath("table.csv")))
+
+
+def wished(cfg: Mapping[str, Any], points: Sequence[Point]) -> Wish:
+    """The wish in the settings of the command.
+
+    Raises:
+        UserError: a limit is no number above 0, nothing is asked for, or the table has no such scene.
+    """
+    scenes = list(dict.fromkeys(p.scene for p in points))
+    if cfg["task"] not in scenes:
+        raise UserError(f"task is {cfg['task']!r}; the table has {', '.join(scenes) or 'none'}")
+    if not isinstance(cfg["error"], Mapping):
+        raise UserError(f"error is {cfg['error']!r}; give one of its keys, as error.force=0.3")
+    if wrong := set(cfg["error"]) - set(ERRORS):
+        raise UserError(f"error has no key {min(wrong)!r}; allowed: {', '.join(ERRORS)}")
+    if cfg["against"] not in ("reference", "training"):
+        raise UserError(f"against is {cfg['against']!r}; allowed: reference, training")
+    if not isinstance(cfg["particles"], bool):
+        raise UserError(f"particles is {cfg['particles']!r}; allowed: true, false")
+    own = cfg["against"] == "training"
+    columns = OWN if own else {key: error[0] for key, error in ERRORS.items()}
+    limits = {}
+    for key, value in cfg["error"].items():
+        if value is not None:
+            limits[columns[key]] = ERRORS[key][1] * positive(f"error.{key}", value)
+    time = None if cfg["time"] is None else positive("time", cfg["time"])
+    if not limits and time is None:
+        raise UserError(
+            "nothing is asked for; give error.force=0.2, error.position=0.005 (m), time=0.01 (s), ..."
+        )
+    study = next(p.study for p in points if p.scene == cfg["task"])
+    return Wish(
+        cfg["task"], limits, time, cfg["particles"], {} if own else bands(study, cfg["task"]), columns
+    )
+
+
+def positive(key: str, value: Any) -> float:
+    """A number above 0."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
+        raise UserError(f"{key} is {value!r}; it must be a number above 0")
+    return float(value)
+
+
+def shipped(study: str, scene: str) -> dict[str, Any]:
+    """Settings of a scene of a study that ships with the package; empty for others."""
+    # Looked up among the names that there are: a table may say anything, and must not name a file to be read.
+    found = (file for file in files("sgns.conf").joinpath("study").iterdir() if file.name == f"{study}.yaml")
+    if (file := next(found, None)) is None:
+        return {}
+    return yaml.safe_load(file.read_text(encoding="utf-8"))["scenes"].get(scene, {})
+
+
+def bands(study: str, scene: str) -> dict[str, float]:
+    """How wrong the reference of a study may be, by column; empty where it is not known."""
+    return {key: float(value) for key, value in (shipped(study, scene).get("bands") or {}).items()}

@@ -1,0 +1,177 @@
+"""Arrays that a person or a file gives: their kind, shape and numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+
+from sgns.config import UserError
+
+# --- Whether arrays that were read from a file fit together ---------------------------------------------
+
+
+def require_shapes(
+    arrays: Mapping[str, np.ndarray],
+    shapes: Mapping[str, tuple[int | str, ...]],
+    counts: Mapping[str, int] | None = None,
+) -> None:
+    """Refuses arrays that are missing, hold no floating-point numbers or have other shapes.
+
+    Args:
+        arrays: by name.
+        shapes: name → shape; a letter stands for the same number of at least 1 in all of them.
+        counts: letters whose number is known.
+
+    Raises:
+        ValueError: what is wrong with the first that does not fit.
+    """
+    known = dict(counts or {})
+    for name, shape in shapes.items():
+        if not isinstance(found := arrays.get(name), np.ndarray):
+            raise ValueError(f"{name} is missing")
+        if found.dtype.kind != "f":
+            raise ValueError(f"{name} does not hold floating-point numbers")
+        wanted = tuple(known.get(size, size) if isinstance(size, str) else size for size in shape)
+        fits = len(found.shape) == len(wanted) and all(
+            actual > 0 if isinstance(size, str) else actual == size
+            for size, actual in zip(wanted, found.shape, strict=True)
+        )
+        if not fits:
+            raise ValueError(f"{name} has shape {found.shape}, expected ({', '.join(map(str, wanted))})")
+        for size, actual in zip(shape, found.shape, strict=True):
+            if isinstance(size, str):
+                known[size] = actual
+
+
+# --- What a person gives in Python: what is none of the kind that is needed is refused in one line ------
+
+
+def is_whole(value: Any) -> bool:
+    """Whether a value is a whole number; True and False are none."""
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+def real_array(values: Any, what: str, needs: str) -> np.ndarray:
+    """A float64 copy of real numbers.
+
+    Args:
+        values: An array, a list, a tensor on the CPU.
+        what: How to call them in an error.
+        needs: What is allowed, for an error.
+
+    Raises:
+        UserError: Words, truth values, complex numbers, objects, rows of unequal length, or nothing of the kind.
+    """
+    try:
+        found = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"the {what} cannot be read as numbers ({reason}); it needs {needs}") from error
+    # Words and complex numbers would be cast without a word.
+    if found.dtype.kind not in "iuf":
+        raise UserError(f"the {what} is not numeric ({found.dtype}); it needs {needs}")
+    return found.astype(np.float64)
+
+
+def finite_array(values: Any, what: str, shape: Sequence[int | str]) -> np.ndarray:
+    """A float64 copy of finite numbers in a shape.
+
+    Args:
+        values: As for `real_array`.
+        what: How to call them in an error.
+        shape: Sizes; a letter or word stands for any size but 0.
+
+    Raises:
+        UserError: As `real_array`, another shape, or a value that is not finite.
+    """
+    needs = f"shape ({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+    found = real_array(values, what, needs)
+    fits = len(found.shape) == len(shape) and all(
+        size > 0 if isinstance(wanted, str) else size == wanted
+        for size, wanted in zip(found.shape, shape, strict=True)
+    )
+    if not fits:
+        raise UserError(f"the {what} has shape {found.shape}; it needs {needs}")
+    if not np.isfinite(found).all():
+        raise UserError(f"the {what} holds values that are not finite; every value must be")
+    return found
+
+
+# --- Poses of a body: rotations, points carried along, and the check of what a person gives -------------
+# A pose is the position of the centre of mass [m] and a unit quaternion x, y, z, w, body -> world.
+# Shapes: T frames, M body points.
+
+
+def check_pose(pose: np.ndarray, what: str = "tool pose") -> np.ndarray:
+    """One pose as float64 with an exactly unit quaternion.
+
+    Args:
+        pose: Centre of mass [m] and quaternion x, y, z, w, shape (7,).
+        what: How to call it in an error.
+
+    Returns:
+        Shape (7,), a copy.
+
+    Raises:
+        UserError: As `check_poses`; several poses are refused, too.
+    """
+    return require_poses(pose_rows(pose, what, "x, y, z, qx, qy, qz, qw, shape (7,)", 1), what, "")[0]
+
+
+def first_pose(poses: np.ndarray, what: str = "first pose") -> np.ndarray:
+    """As `check_pose`, of a pose (7,) or of the first of some (T, 7), the others not looked at."""
+    return require_poses(pose_rows(poses, what)[:1], what, "")[0]
+
+
+def check_poses(poses: np.ndarray, what: str = "tool path") -> np.ndarray:
+    """Poses as float64 with exactly unit quaternions.
+
+    Args:
+        poses: Centre of mass [m] and quaternion x, y, z, w, shape (T, 7) or (7,).
+        what: How to call them in an error.
+
+    Returns:
+        Shape (T, 7), a copy.
+
+    Raises:
+        UserError: No real numbers, wrong shape, a value that is not finite, or a quaternion off unit length by more
+            than 1e-3.
+    """
+    return require_poses(pose_rows(poses, what), what)
+
+
+def pose_rows(
+    poses: np.ndarray,
+    what: str,
+    needs: str = "rows x, y, z, qx, qy, qz, qw, shape (T, 7)",
+    most: int = 2,
+) -> np.ndarray:
+    """A float64 copy of what has the shape of poses, (T, 7) or (7,), of at most so many axes; shape (T, 7)."""
+    poses = real_array(poses, what, needs)
+    if not 1 <= poses.ndim <= most or poses.shape[-1] != 7 or len(poses) == 0:
+        raise UserError(f"the {what} has shape {poses.shape}; it needs {needs}")
+    return np.atleast_2d(poses)
+
+
+def require_poses(poses: np.ndarray, what: str, where: str = " at frame {}") -> np.ndarray:
+    """Poses (T, 7), whose quaternions are made exactly unit in place, or a UserError that says where they are none."""
+    bad = ~np.isfinite(poses).all(axis=1)
+    if bad.any():
+        frame = int(bad.argmax())
+        raise UserError(
+            f"the {what} is not finite{where.format(frame)}: {poses[frame].tolist()}; every pose must be finite"
+        )
+    with np.errstate(over="ignore"):  # the length is refused below
+        length = np.linalg.norm(poses[:, 3:], axis=1)
+    bad = np.abs(length - 1) > 1e-3
+    if bad.any():
+        frame = int(bad.argmax())
+        raise UserError(
+            f"the {what} has a quaternion of length {length[frame]:.4g}{where.format(frame)}; "
+            "x, y, z, w must have length 1 (within 0.001)"
+        )
+    poses[:, 3:] /= length[:, None]
+    return poses

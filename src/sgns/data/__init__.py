@@ -1,0 +1,1 @@
+"""Runs and datasets on disk: written whole, checked, read back."""

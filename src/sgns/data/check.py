@@ -1,0 +1,323 @@
+"""Checking run files: `sgns check`."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import h5py
+import numpy as np
+from omegaconf import OmegaConf
+
+from mpm_warp.poses import rotation_matrices
+from sgns.config import UserError, parse_yaml
+from sgns.data.layout import (
+    BROKEN,
+    ELEMENTS,
+    PRODUCERS,
+    one_line,
+    open_run,
+    own_dataset,
+    own_object,
+    read_attributes,
+    read_mesh,
+    require_mesh_was_read,
+    require_own_view,
+    scene_problems,
+    structure_problems,
+)
+from sgns.data.vtkhdf import view_problems
+from sgns.data.writer import ContentHash
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+log = logging.getLogger(__name__)
+
+
+# --- Checking a run file: every problem, in words -------------------------------------------------------
+# Letters: T frames, n soil particles, M body points.
+
+RIGID_TOLERANCE = 1e-4
+"""How far a body point may be from where the pose puts it [m]."""
+QUATERNION_TOLERANCE = 1e-5
+"""How far a quaternion's length may be from 1."""
+INTERVAL_TOLERANCE = 1e-2
+"""How far the time between frames may be from 1 / frame_rate, as a share of it."""
+
+
+def check_run(path: str | os.PathLike[str]) -> list[str]:
+    """Everything that is wrong with a run file, in words; an empty list means it is good.
+
+    Reads every dataset, a frame of soil at a time.
+    """
+    try:
+        file = open_run(path)
+    except UserError as error:
+        return [str(error)]
+    with file, np.errstate(all="ignore"):  # damaged numbers may be huge
+        try:
+            problems = structure_problems(file)
+        except BROKEN as error:
+            return [f"the file is damaged ({one_line(error)})"]
+        checks = [_check_h5md, _check_attributes]
+        if not problems:  # the rest relies on complete datasets of the right shapes
+            checks += [_check_stopped, _check_times, _check_body, _check_mesh, _check_view, _check_frames]
+        for check in checks:
+            try:
+                problems += check(file)
+            except BROKEN as error:
+                problems.append(f"the file is damaged ({one_line(error)})")
+    return problems
+
+
+def _check_h5md(file: h5py.File) -> list[str]:
+    problems = []
+    h5md = own_object(file, "h5md")
+    if not isinstance(h5md, h5py.Group):
+        return ["group /h5md is missing"]
+    if tuple(np.atleast_1d(h5md.attrs.get("version", ()))) != (1, 1):
+        problems.append("attribute version of /h5md is not (1, 1)")
+    for group, key in (("author", "name"), ("creator", "name"), ("creator", "version")):
+        found = own_object(h5md, group)
+        if found is None or key not in found.attrs:
+            problems.append(f"attribute {key} of /h5md/{group} is missing")
+    for group in ("soil", "body"):
+        box = own_object(file, f"particles/{group}/box")
+        if box is None or "dimension" not in box.attrs or "boundary" not in box.attrs:
+            problems.append(f"group /particles/{group}/box with dimension and boundary is missing")
+    return problems
+
+
+def _check_attributes(file: h5py.File) -> list[str]:
+    problems = []
+    values = read_attributes(file)
+    for name in ("scene", "effects", "extra"):
+        text = values.get(name)
+        if not isinstance(text, str):
+            continue  # reported with the structure
+        try:
+            data = parse_yaml(text)
+        except ValueError as error:
+            problems.append(f"root attribute {name!r} is not YAML ({one_line(error)})")
+            continue
+        if not isinstance(data, dict):
+            problems.append(f"root attribute {name!r} is not a group of keys")
+        elif name == "scene":
+            problems += scene_problems(data)
+            try:
+                require_mesh_was_read(data)
+            except ValueError as error:
+                problems.append(f"root attribute 'scene': {one_line(error)}")
+        elif name == "effects":
+            problems += [
+                f"effect {key!r} does not say whether it is on and why"
+                for key, effect in data.items()
+                if not _says_why(effect)
+            ]
+    producer = values.get("producer")
+    if isinstance(producer, str) and producer not in PRODUCERS:
+        problems.append(f"producer is {producer!r}; allowed: {', '.join(PRODUCERS)}")
+    return problems
+
+
+def _says_why(effect: object) -> bool:
+    return isinstance(effect, dict) and isinstance(effect.get("on"), bool) and bool(effect.get("reason"))
+
+
+def _check_stopped(file: h5py.File) -> list[str]:
+    reason = read_attributes(file).get("stopped")
+    if reason is None:
+        return []
+    frames = file[f"{ELEMENTS['position'].path}/value"].shape[0]
+    return [f"the run stopped after {frames} good frames: {one_line(reason)}"]
+
+
+def _check_times(file: h5py.File) -> list[str]:
+    problems = []
+    time = file[f"{ELEMENTS['position'].path}/time"][...]
+    step = file[f"{ELEMENTS['position'].path}/step"][...]
+    for element in ELEMENTS.values():
+        for part, expected in (("time", time), ("step", step)):
+            if not np.array_equal(file[f"{element.path}/{part}"][...], expected, equal_nan=part == "time"):
+                problems.append(f"dataset /{element.path}/{part} differs from that of the soil positions")
+    if not np.isfinite(time).all():
+        return [*problems, f"time is not finite at frame {np.flatnonzero(~np.isfinite(time))[0]}"]
+    if not (np.diff(step) > 0).all():
+        problems.append(f"step does not increase at frame {np.flatnonzero(np.diff(step) <= 0)[0] + 1}")
+    interval = np.diff(time)
+    if not (interval > 0).all():
+        return [*problems, f"time does not increase at frame {np.flatnonzero(interval <= 0)[0] + 1}"]
+    wrong = ~(np.abs(interval * float(file.attrs["frame_rate"]) - 1.0) <= INTERVAL_TOLERANCE)
+    if wrong.any():
+        frame = np.flatnonzero(wrong)[0] + 1
+        problems.append(
+            f"time before frame {frame} advances by {interval[frame - 1]:.6g} s, "
+            f"not by 1 / frame_rate = {1.0 / float(file.attrs['frame_rate']):.6g} s"
+        )
+    return problems
+
+
+def _check_body(file: h5py.File) -> list[str]:
+    problems = []
+    data = {
+        name: file[f"{ELEMENTS[name].path}/value"][...].astype(float)
+        for name in ("pose", "force", "torque", "body_points")
+    }
+    for name, values in data.items():
+        frame = _first(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
+        if frame is not None:
+            problems.append(f"{name} is not finite at frame {frame}")
+    if problems:
+        return problems
+    pose, points = data["pose"], data["body_points"]
+    length = np.linalg.norm(pose[:, 3:], axis=1)
+    frame = _first(~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE))
+    if frame is not None:
+        return [f"the quaternion of frame {frame} has length {length[frame]:.6g}, not 1"]
+    rotation = rotation_matrices(pose[:, 3:])  # (T, 3, 3)
+    body_frame = (points - pose[:, None, :3]) @ rotation  # rows times R = R^T applied to each point
+    error = np.linalg.norm(body_frame - body_frame[:1], axis=2)
+    frame = _first(~(error <= RIGID_TOLERANCE).all(axis=1))
+    if frame is not None:
+        point = int(error[frame].argmax())
+        problems.append(
+            f"body point {point} of frame {frame} is {error[frame, point]:.3g} m from where the pose puts it "
+            f"(allowed {RIGID_TOLERANCE:g} m)"
+        )
+    return problems
+
+
+def _check_mesh(file: h5py.File) -> list[str]:
+    """That the tool's mesh is one, and that the body points are vertices of it."""
+    try:
+        mesh = read_mesh(file)
+    except BROKEN as error:
+        return [f"the tool's mesh is damaged ({one_line(error)})"]
+    if mesh is None:
+        return []
+    pose, points = (file[f"{ELEMENTS[name].path}/value"][0].astype(float) for name in ("pose", "body_points"))
+    nodes = (points - pose[:3]) @ rotation_matrices(pose[None, 3:])[0]
+    for number, node in enumerate(nodes):
+        away = float(np.linalg.norm(mesh[0] - node, axis=1).min())
+        if not away <= RIGID_TOLERANCE:
+            return [
+                f"body point {number} is {away:.3g} m from the nearest vertex of the tool's mesh (allowed "
+                f"{RIGID_TOLERANCE:g} m): the mesh is of another tool"
+            ]
+    return []
+
+
+def _check_view(file: h5py.File) -> list[str]:
+    frames, particles, _ = file[f"{ELEMENTS['position'].path}/value"].shape
+    return view_problems(file, frames, particles)
+
+
+def _check_frames(file: h5py.File) -> list[str]:
+    """Finite soil, the same numbers through /VTKHDF, and the content hash; memory for a frame only."""
+    values = {name: file[f"{element.path}/value"] for name, element in ELEMENTS.items()}
+    small = {name: values[name][...] for name in values if name not in ("position", "velocity")}
+    small["time"] = file[f"{ELEMENTS['position'].path}/time"][...]
+    views = {
+        "position": _view(file, "VTKHDF/Points"),
+        "velocity": _view(file, "VTKHDF/PointData/velocity"),
+    }
+    frames, particles, _ = values["position"].shape
+    found: dict[str, str] = {}  # the first problem of each kind
+    content = ContentHash()
+    for frame in range(frames):
+        arrays = {name: series[frame] for name, series in small.items()}
+        for name, view in views.items():
+            arrays[name] = soil = values[name][frame]
+            finite = np.isfinite(soil).all(axis=1)
+            if not finite.all():
+                found.setdefault(
+                    f"{name} finite", f"{name} of particle {_first(~finite)} is not finite at frame {frame}"
+                )
+            if view is not None and view.shape == (frames * particles, 3):
+                seen = view[frame * particles : (frame + 1) * particles]
+                if not np.array_equal(seen, soil, equal_nan=True):
+                    found.setdefault(f"{name} view", f"/VTKHDF shows another {name} at frame {frame}")
+        content.update(arrays)
+    if content.hexdigest() != read_attributes(file)["content_hash"]:
+        found["hash"] = "the data do not match content_hash: they were changed or damaged after the run"
+    return list(found.values())
+
+
+def _view(file: h5py.File, path: str) -> h5py.Dataset | None:
+    """A dataset of this file's own values; what else may be there is reported with the view."""
+    try:
+        found = own_object(file, path)
+        if not isinstance(found, h5py.Dataset) or not found.is_virtual:
+            return own_dataset(file, path)
+        require_own_view(found)
+    except (KeyError, ValueError):
+        return None
+    return found
+
+
+def _first(wrong: np.ndarray) -> int | None:
+    """Index of the first True, or None."""
+    return int(np.argmax(wrong)) if wrong.any() else None
+
+
+# --- `sgns check`: read run files through and list what is wrong with them ------------------------------
+
+
+def run_files(paths: Iterable[str | Path]) -> list[Path]:
+    """Run files that the given paths stand for, in order.
+
+    Args:
+        paths: Files, and folders that hold run files themselves or, like a dataset, in a folder `runs`.
+
+    Raises:
+        UserError: A path does not exist, or a folder holds no run file.
+    """
+    files: list[Path] = []
+    for path in map(Path, paths):
+        if not os.path.isdir(path):  # unlike Path.is_dir, takes any name
+            if not os.path.exists(path):
+                raise UserError(f"{path}: no such file; give run files (.h5) or folders of them")
+            files.append(path)
+            continue
+        folder = path / "runs" if (path / "runs").is_dir() else path
+        # a name that begins with a dot is one that is still being written
+        found = sorted(file for file in folder.glob("*.h5") if not file.name.startswith("."))
+        if not found:
+            raise UserError(f"{folder}: holds no run file (*.h5); `sgns simulate` writes them")
+        files.extend(found)
+    if not files:
+        raise UserError("nothing to check; give run files: sgns check run.h5")
+    return files
+
+
+def main(cfg: DictConfig) -> float:
+    """Check the run files `cfg.files`; returns the number of problems, which is 0.
+
+    Raises:
+        UserError: A path is missing or a file has a problem; all problems have been listed before.
+    """
+    named = [cfg.files] if isinstance(cfg.files, str) else OmegaConf.to_container(cfg, resolve=True)["files"]
+    if not isinstance(named, list) or not all(isinstance(path, str) for path in named):
+        raise UserError(f"files is {named!r}; it must be paths of run files, as in sgns check run.h5")
+    files = run_files(named)
+    bad = 0
+    for path in files:
+        try:
+            problems = check_run(path)
+        except UserError as error:
+            problems = [str(error)]
+        if problems:
+            bad += 1
+            for problem in problems:
+                log.info("%s", problem if str(path) in problem else f"{path}: {problem}")
+        else:
+            log.info("%s: good", path)
+    if bad:
+        raise UserError(
+            f"{bad} of {len(files)} files checked {'is' if bad == 1 else 'are'} not good; see above"
+        )
+    return 0.0

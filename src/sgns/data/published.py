@@ -1,0 +1,380 @@
+"""The reduced runs published by the paper's authors: their files, and a dataset to learn from."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch
+
+from mpm_warp.inputs import open_file, read_text
+from mpm_warp.poses import fitted_poses, quaternions
+from sgns.config import UserError
+from sgns.data.dataset import SPLITS
+from sgns.data.small_files import parse_json
+from sgns.reduction.basis import Basis
+from sgns.reduction.reduce import ReducedDataset, ReducedRun
+
+log = logging.getLogger(__name__)
+
+
+# --- Reader of the reduced runs published by the paper's authors ----------------------------------------
+# The files are TFRecords of protobuf `SequenceExample`s, the format of "Learning to Simulate" (Sanchez-Gonzalez
+# et al. 2020); both are simple enough to be read here without TensorFlow. Numbers are mapped to this package's
+# axes and signs: x forward, z up, forces by the soil on the body.
+
+_SUBSPACE = 6  # the particle type of a subspace node; all others are nodes of the rigid body
+_FREE = 0  # the particle type of a wheel's nodes; those of a blade, which is prescribed, are 3
+_MOST_BYTES = 1 << 33  # of a .tfrecord; the authors' largest has a tenth of that
+_MOST_OF_RUN = 1 << 28  # of one run in it
+_MOST_METADATA = 1 << 22
+_LONGEST = 63  # bits before the last part of a number
+_MARGIN = 0.1  # the authors' bin starts at this coordinate on each axis [m]
+_BINS = {"excavation": (0.80, 0.60, 0.15), "wheel": (0.40, 0.19, 0.0583)}  # Lx, Ly, Lz [m]
+DEPTHS = (0.02, 0.04, 0.05, 0.08, 0.10)  # [m]
+SPEEDS = (0.01, 0.04, 0.08, 0.10, 0.15)  # [m/s]
+RAKES = (0.0, 3.8, 10.0, 30.8, 45.0)  # [degrees]
+MOTIONS = ("ramp", "curved")
+GRAVITIES = (1.62, 3.72, 9.81)  # [m/s^2]
+SLIPS = (
+    0.2,
+    5.0 / 13.0,
+    0.7,
+)  # forward speeds 15.60, 12.00, 5.85 mm/s at a rim speed of 19.5; named 20, 40, 70 %
+LOADS = (100.0, 164.0, 225.0)  # [N]
+DIAMETERS = (0.05, 0.15, 0.30)  # [m]
+WIDTHS = {0.05: 0.25 / 3, 0.15: 0.25 / 3, 0.30: 0.125}  # of each diameter [m]
+ANGLES = (30.0, 37.0, 43.0)  # friction angles [degrees]
+
+
+@dataclass(frozen=True)
+class PublishedRun:
+    """One run. T frames at 60 Hz; the file's duplicated first frame is dropped."""
+
+    kind: str
+    """excavation or wheel."""
+    case: int | None
+    """Number of the run among all of its kind, from 1; None where metadata.json does not say."""
+    body_points: np.ndarray
+    """Nodes of the rigid body [m], shape (T, M, 3)."""
+    latent: np.ndarray
+    """Subspace nodes in the authors' basis and axes (the basis itself is not published), shape (T, r, 3)."""
+    force: np.ndarray
+    """By the soil on the body [N], at the end of the frame, shape (T, 3)."""
+    context: np.ndarray
+    """Of a wheel: gravity [m/s^2], friction angle [degrees] and load [N] in every frame, shape (T, 3); of a blade:
+    shape (T, 0)."""
+
+
+def excavation_case(case: int) -> dict[str, float | str]:
+    """Depth [m], speed [m/s], rake [degrees] and motion of a published excavation run, numbered from 1."""
+    grid = list(product(DEPTHS, SPEEDS, RAKES, MOTIONS))
+    if not 1 <= case <= len(grid):
+        raise UserError(f"published excavation case {case}: allowed are 1 to {len(grid)}")
+    return dict(zip(("depth", "speed", "rake", "motion"), grid[case - 1], strict=True))
+
+
+def wheel_case(case: int) -> dict[str, float]:
+    """Gravity [m/s^2], slip, load [N], diameter [m], friction angle [degrees] and width [m] of a published wheel run,
+    numbered from 1. The 5 cm wheel carries a ninth of the loads."""
+    grid = list(product(GRAVITIES, SLIPS, LOADS, DIAMETERS, ANGLES))
+    if not 1 <= case <= len(grid):
+        raise UserError(f"published wheel case {case}: allowed are 1 to {len(grid)}")
+    found = dict(zip(("gravity", "slip", "load", "diameter", "friction_angle"), grid[case - 1], strict=True))
+    if found["diameter"] == DIAMETERS[0]:
+        found["load"] /= 9.0
+    return found | {"width": WIDTHS[found["diameter"]]}
+
+
+def published_files(folder: str | Path) -> list[str]:
+    """Names of the splits in a folder: of every <split>.tfrecord."""
+    folder = Path(folder)
+    found = sorted(file.stem for file in folder.glob("*.tfrecord"))
+    if not found or not (folder / "metadata.json").is_file():
+        raise UserError(
+            f"{folder} does not hold published runs; it needs metadata.json and at least one <split>.tfrecord, as the "
+            "paper's authors published them"
+        )
+    return found
+
+
+def read_published(
+    folder: str | Path, bin_size: tuple[float, float, float] | None = None, split: str = "valid"
+) -> list[PublishedRun]:
+    """The runs of one folder with `<split>.tfrecord` and `metadata.json`.
+
+    Args:
+        bin_size: Lx, Ly, Lz of the soil bin [m]; None: the authors' own.
+    """
+    folder = Path(folder)
+    try:
+        metadata = parse_json(read_text(folder / "metadata.json", _MOST_METADATA))
+        cases = metadata["dataset_split"].get(split)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{folder} does not hold the published {split} runs: {error}") from None
+    if cases is not None and (
+        not isinstance(cases, list) or not all(case is None or type(case) is int for case in cases)
+    ):
+        raise UserError(f"{folder}: metadata.json does not name the {split} runs by their numbers")
+    try:
+        with open_file(folder / f"{split}.tfrecord", _MOST_BYTES) as file:
+            size = os.fstat(file.fileno()).st_size
+            count = sum(1 for _ in _lengths(file, size))
+            if cases is not None and len(cases) != count:
+                raise UserError(
+                    f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {count}"
+                )
+            if not count:
+                raise UserError(f"{folder}/{split}.tfrecord holds no run")
+            file.seek(0)
+            runs = [_run(None, file.read(length), bin_size) for length in _lengths(file, size)]
+    except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
+        raise UserError(f"{folder}/{split}.tfrecord is not a file of published runs: {error}") from None
+    return [replace(run, case=case) for run, case in zip(runs, cases or [None] * len(runs), strict=True)]
+
+
+def _run(case: int | None, record: bytes, bin_size: tuple[float, float, float] | None) -> PublishedRun:
+    about, frames = _sequence_example(record)
+    types = np.frombuffer(about["particle_type"], dtype="<i8")
+    nodes = _series(frames["position"], 3 * len(types)).reshape(-1, len(types), 3)[1:]
+    force = _series(frames["force"], 3)[1:]
+    given = frames.get("step_context", ())
+    context = _series(given, len(given[0]) // 4)[1:] if given and given[0] else np.zeros((len(nodes), 0))
+    if not len(nodes) == len(force) == len(context):
+        raise ValueError("its series have different numbers of frames")
+    if not (len(nodes) and np.isfinite(nodes).all() and np.isfinite(force).all()):
+        raise ValueError("a run has no frames, or values that are not finite")
+    soil = types == _SUBSPACE
+    kind = "wheel" if bool((types == _FREE).any()) else "excavation"
+    lx, _, lz = bin_size or _BINS[kind]
+    x, y, z = np.moveaxis(nodes[:, ~soil], -1, 0)
+    body = np.stack([_MARGIN + lx - x, z - _MARGIN, y - _MARGIN - lz], axis=-1)
+    return PublishedRun(
+        kind,
+        case,
+        body,
+        nodes[:, soil],
+        force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0],
+        context,
+    )
+
+
+def _series(frames: Sequence[bytes], values: int) -> np.ndarray:
+    """Numbers of every frame, so many in each, shape (T, values)."""
+    if not values or any(len(frame) != 4 * values for frame in frames):
+        raise ValueError(f"a frame does not hold {values} numbers")
+    return np.frombuffer(b"".join(frames), dtype="<f4").astype(float).reshape(-1, values)
+
+
+def _lengths(file: BinaryIO, size: int) -> Iterator[int]:
+    """Lengths of the payloads of a TFRecord file: length (8), check sum (4), payload, check sum (4).
+
+    The file stands at the beginning of each payload when its length is given.
+    """
+    at = 0
+    while at < size:
+        (length,) = struct.unpack("<Q", file.read(8))
+        if at + 16 + length > size:
+            raise ValueError("the file is cut short")
+        if not 0 < length <= _MOST_OF_RUN:
+            raise ValueError(f"a run has {length} bytes; allowed: 1 to {_MOST_OF_RUN}")
+        file.seek(at + 12)
+        yield length
+        at += 16 + length
+        file.seek(at)
+
+
+def _fields(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Number and content of a protobuf message's length-delimited fields."""
+    at = 0
+    while at < len(data):
+        key, at = _varint(data, at)
+        if key & 7 != 2:
+            raise ValueError(f"unexpected wire type {key & 7}")
+        length, at = _varint(data, at)
+        if at + length > len(data):
+            raise ValueError("a field is cut short")
+        yield key >> 3, data[at : at + length]
+        at += length
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = data[at]
+        value |= (byte & 0x7F) << shift
+        if shift > _LONGEST:
+            raise ValueError("a number is longer than 64 bits")
+        at += 1
+        shift += 7
+        if byte < 0x80:
+            return value, at
+
+
+def _entry(data: bytes) -> tuple[str, bytes]:
+    """Key and value of one entry of a protobuf map."""
+    parts = dict(_fields(data))
+    return parts[1].decode(), parts[2]
+
+
+def _first_bytes(feature: bytes) -> bytes:
+    """The first value of a Feature that holds a bytes list; empty for other kinds."""
+    lists = dict(_fields(feature))
+    return next((value for _, value in _fields(lists[1])), b"") if 1 in lists else b""
+
+
+def _sequence_example(record: bytes) -> tuple[dict[str, bytes], dict[str, list[bytes]]]:
+    """Context and per-frame features of a SequenceExample; only bytes are kept."""
+    parts = dict(_fields(record))
+    context = {key: _first_bytes(value) for key, value in (_entry(e) for _, e in _fields(parts[1]))}
+    lists = (_entry(e) for _, e in _fields(parts[2]))
+    return context, {key: [_first_bytes(f) for _, f in _fields(value)] for key, value in lists}
+
+
+# --- The published reduced runs as a dataset to learn from ----------------------------------------------
+# The authors' basis is not published, only the modes' positions. So the basis here is the unit matrix: what is called
+# soil are the modes themselves, and the mean over all particles follows from how many there were.
+#
+# Shapes: T frames, M body points, r modes.
+
+PARTICLES = {"excavation": 4880, "wheel": 6005}
+"""Particles behind the published modes."""
+_FRAME_RATE = 60.0  # [Hz]
+_RIM_SPEED = 0.0195  # of the published wheels [m/s]
+_RIM = 0.974  # the published rim's points lie at this share of the diameter
+_SPLIT = {"train": "train", "valid": "validation", "validation": "validation", "test": "test"}
+
+
+def published_dataset(settings: Mapping[str, Any], num_modes: int | str) -> ReducedDataset:
+    """The runs of a folder, split for training.
+
+    With a train.tfrecord every file is its split. Without one all runs are for training, but for one fold if there are
+    `folds`; that fold is both for validation and for the test, which therefore is not blind to the choice of the
+    checkpoint, unless the files say otherwise.
+
+    Args:
+        settings: The `dataset` group.
+        num_modes: r, the first of the published modes.
+    """
+    folder, folds, fold = Path(settings["path"]), settings.get("folds"), settings.get("fold", 0)
+    runs = published_runs(folder)
+    split: dict[str, list[ReducedRun]] = {name: [] for name in SPLITS}
+    if "train" in runs:
+        if folds is not None:
+            raise UserError(
+                f"{folder} has a train.tfrecord and thereby a split of its own; use dataset.folds=null"
+            )
+        for name, found in runs.items():
+            split[_SPLIT.get(name, "test")] += found
+    else:
+        everything = [run for found in runs.values() for run in found]
+        if folds is None:
+            split["train"] = everything
+        else:
+            _check_fold(folds, fold, len(everything))
+            split["test"] = everything[fold::folds]
+            split["train"] = [run for i, run in enumerate(everything) if i % folds != fold]
+    first = split["train"][0]
+    if {run.scene["kind"] for name in SPLITS for run in split[name]} != {first.scene["kind"]}:
+        raise UserError(f"{folder} mixes blades and wheels; keep one folder for each")
+    modes = first.latent.shape[1]
+    if not isinstance(num_modes, int) or not 1 <= num_modes <= modes:
+        raise UserError(
+            f"reduction.num_modes is {num_modes}; {folder} holds {modes} modes: allowed are 1 to {modes}"
+        )
+    basis = Basis(
+        mean=torch.zeros(modes, 3, dtype=torch.float64),
+        modes=torch.eye(modes, dtype=torch.float64),
+        eigenvalues=torch.zeros(modes, dtype=torch.float64),
+        total_variance=0.0,
+        displacement_variance=0.0,
+        centring="scalar",
+        arrangement_hash=f"published-{first.scene['kind']}",
+        fitted_on=[f"{run.name} {fingerprint(run)}" for run in split["train"]],
+    )
+    start = np.mean([run.latent[0] for run in split["train"]], axis=0)
+    return ReducedDataset(basis, num_modes, folder, _FRAME_RATE, start, split)
+
+
+def published_runs(folder: str | Path) -> dict[str, list[ReducedRun]]:
+    """All runs of a folder by the name of their file."""
+    found = {}
+    for split in published_files(folder):
+        runs = read_published(folder, split=split)
+        # The authors drew their training split with replacement: a run may be there twice.
+        unique = {run.latent.tobytes(): run for run in runs}.values()
+        found[split] = [_reduced(run, f"{split}_{i:03d}") for i, run in enumerate(unique)]
+        if len(found[split]) < len(runs):
+            log.info("%s.tfrecord: %d runs, %d of them different", split, len(runs), len(found[split]))
+    return found
+
+
+def fingerprint(run: ReducedRun) -> str:
+    """Tells whether two runs are the same, whatever they are called."""
+    return hashlib.blake2b(np.ascontiguousarray(run.latent).tobytes(), digest_size=6).hexdigest()
+
+
+def _check_fold(folds: Any, fold: Any, count: int) -> None:
+    if not isinstance(folds, int) or isinstance(folds, bool) or not 2 <= folds <= count:
+        raise UserError(f"dataset.folds is {folds!r}; allowed: 2 to {count}, the number of runs, or null")
+    if not isinstance(fold, int) or isinstance(fold, bool) or not 0 <= fold < folds:
+        raise UserError(f"dataset.fold is {fold!r}; allowed: 0 to {folds - 1}")
+
+
+def _reduced(run: PublishedRun, name: str) -> ReducedRun:
+    # To this package's axes; where the origin of a mode's positions lies does not matter.
+    latent = np.stack([-run.latent[..., 0], run.latent[..., 2], run.latent[..., 1]], axis=-1)
+    time = np.arange(len(latent)) / _FRAME_RATE
+    return ReducedRun(
+        name=name if run.case is None else f"{run.kind}_{run.case:03d}",
+        latent=latent,
+        time=time,
+        pose=_wheel_poses(run.body_points) if run.kind == "wheel" else _blade_poses(run.body_points),
+        body_points=run.body_points,
+        force=run.force,
+        torque=np.zeros_like(run.force),
+        scene={"kind": run.kind} | (_wheel_values(run) if run.kind == "wheel" else {}),
+    )
+
+
+def _wheel_values(run: PublishedRun) -> dict[str, float]:
+    """What the context of the file and the wheel's points say."""
+    points = run.body_points
+    gravity, angle, load = (float(value) for value in run.context[0])
+    across = float(np.ptp(points[0, :, 0])) / _RIM
+    speed = float(points[-1, :, 0].mean() - points[0, :, 0].mean()) * _FRAME_RATE / (len(points) - 1)
+    return {
+        "gravity": gravity,
+        "friction_angle": angle,
+        "load": load,
+        "diameter": min(DIAMETERS, key=lambda diameter: abs(diameter - across)),
+        "slip": round(1.0 - speed / _RIM_SPEED, 4),
+    }
+
+
+def _wheel_poses(points: np.ndarray) -> np.ndarray:
+    """Centre of the rim's points and turn since the first frame, shape (T, 7)."""
+    return fitted_poses(points[0] - points[0].mean(axis=0), points)
+
+
+def _blade_poses(points: np.ndarray) -> np.ndarray:
+    """Middle of the lowest row of points, and the plate's directions, shape (T, 7).
+
+    Blades with 15 and with 20 points have different middles; the lowest row is at the same place in both.
+    """
+    first = points[0]
+    tip = first[:, 2] < first[:, 2].min() + 1e-3
+    _, _, axes = np.linalg.svd(first - first.mean(axis=0))
+    across = axes[0] * np.sign(axes[0, 1])
+    along = axes[1] * np.sign(axes[1, 2])
+    turned = quaternions(np.stack([np.cross(across, along), across, along], axis=1))
+    middle = points[:, tip].mean(axis=1)
+    return np.concatenate([middle, np.tile(turned, (len(points), 1))], axis=1)

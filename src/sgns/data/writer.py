@@ -1,0 +1,354 @@
+"""Writing a run: frame by frame into a hidden file that gets its name only when it is complete.
+
+Letters: T frames, n soil particles, M body points.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import os
+from pathlib import Path, PurePath
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+import yaml
+
+from mpm_warp import State
+from sgns.config import UserError
+from sgns.data.files import NewFile
+from sgns.data.layout import ELEMENTS, FORMAT, FORMAT_VERSION, MESH, PRODUCERS, package_version, write_text
+from sgns.data.run import remove_stopped, require_run_place, stopped_path, write_state
+from sgns.data.vtkhdf import write_view
+
+log = logging.getLogger(__name__)
+
+_STREAMED = ("position", "velocity")
+
+
+class ContentHash:
+    """BLAKE2b over the stored numbers, frame by frame in the order of `ORDER`, little-endian."""
+
+    ORDER = ("time", "position", "velocity", "body_points", "pose", "force", "torque")
+
+    def __init__(self) -> None:
+        self._hash = hashlib.blake2b(digest_size=16)
+
+    def update(self, frame: dict[str, np.ndarray]) -> None:
+        """Add one frame: an array for every name in `ORDER`, in the file's types."""
+        for name in self.ORDER:
+            self._hash.update(np.ascontiguousarray(frame[name]).data)
+
+    def hexdigest(self) -> str:
+        """32 hexadecimal digits."""
+        return self._hash.hexdigest()
+
+
+class RunWriter:
+    """Writes a run file; use it as a context manager and call `finish` at the end.
+
+    The file appears under its name only when `finish` succeeds, or under another one with `stop`; leaving the context
+    in any other way removes what was written. An existing file of that name stays untouched until then.
+
+    Args:
+        path: where the run goes, usually `*.h5`; missing folders are made.
+        scene: the complete scene as plain nested data.
+        effects: physics that was on or off: {name: {"on": bool, "reason": str}}.
+        arrangement_hash: identifies the initial particle arrangement.
+        particle_count: n.
+        body_points: M.
+        frame_rate: recorded frames per second [Hz].
+        seed: of the run.
+        producer: "mpm" or "rollout".
+        extra: more provenance as plain nested data; "author" also becomes H5MD's author name.
+        mesh: of a tool that is one: vertices (V, 3) about its centre of mass [m] and triangles (F, 3).
+
+    Raises:
+        UserError: the folder cannot be written, the disk is full, something else than a run of before would be
+            destroyed, or a frame is not finite.
+        ValueError: an argument or frame has the wrong shape or value.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        scene: dict[str, Any],
+        effects: dict[str, dict[str, Any]],
+        arrangement_hash: str,
+        particle_count: int,
+        body_points: int,
+        frame_rate: float,
+        seed: int,
+        producer: str,
+        extra: dict[str, Any] | None = None,
+        mesh: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
+        if producer not in PRODUCERS:
+            raise ValueError(f"producer is {producer!r}; allowed: {', '.join(PRODUCERS)}")
+        if particle_count < 1 or body_points < 0:
+            raise ValueError(f"{particle_count} particles, {body_points} body points; need at least 1 and 0")
+        if not (math.isfinite(frame_rate) and frame_rate > 0):
+            raise ValueError(f"frame_rate is {frame_rate}; it must be above 0 Hz")
+        self.path = Path(path)
+        self._counts = {"n": int(particle_count), "M": int(body_points)}
+        self._small: dict[str, list[np.ndarray]] = {
+            name: [] for name in ContentHash.ORDER if name not in _STREAMED
+        }
+        self._hash = ContentHash()
+        extra = dict(extra or {})
+        attributes = {  # in the order of a reader's interest
+            "format": FORMAT,
+            "format_version": np.int64(FORMAT_VERSION),
+            "package_version": package_version(),
+            "producer": producer,
+            "seed": np.int64(seed),
+            "frame_rate": np.float64(frame_rate),
+            "arrangement_hash": str(arrangement_hash),
+            "scene": _yaml_text(scene),
+            "effects": _yaml_text(effects),
+            "extra": _yaml_text(extra),
+        }
+        require_run_place(self.path)
+        self._disk = NewFile(self.path)
+        self._file: h5py.File | None = None
+        try:
+            self._create(attributes, str(extra.get("author", "unknown")))
+            if mesh is not None:
+                _write_mesh(self._file, *mesh)
+            self._disk.check()
+        except BaseException:
+            self._discard()
+            raise
+
+    @property
+    def frame_count(self) -> int:
+        """Frames appended so far."""
+        return len(self._small["time"])
+
+    def append(
+        self,
+        time: float,
+        position: np.ndarray,
+        velocity: np.ndarray,
+        body_points: np.ndarray,
+        body_pose: np.ndarray,
+        force: np.ndarray,
+        torque: np.ndarray,
+    ) -> None:
+        """Write one frame.
+
+        Args:
+            time: [s], later than the frame before.
+            position: soil [m], shape (n, 3).
+            velocity: soil [m/s], shape (n, 3).
+            body_points: world frame [m], shape (M, 3).
+            body_pose: centre of mass [m] and quaternion x y z w, shape (7,).
+            force: by the soil on the body [N], world frame, mean since the frame before, shape (3,).
+            torque: likewise about the centre of mass [N m], shape (3,).
+        """
+        if self._file is None:
+            raise ValueError("the run is already finished or discarded; make a new RunWriter")
+        index = self.frame_count
+        frame = {
+            "time": np.asarray(time, dtype="<f8"),
+            "position": position,
+            "velocity": velocity,
+            "body_points": body_points,
+            "pose": body_pose,
+            "force": force,
+            "torque": torque,
+        }
+        if frame["time"].shape != ():
+            raise ValueError(f"time has shape {frame['time'].shape}; it must be one number [s]")
+        for name, element in ELEMENTS.items():
+            # A float64 beyond float32's range becomes inf here and is reported below, so numpy need not warn.
+            with np.errstate(over="ignore"):
+                convert = np.asarray if name in _STREAMED else np.array  # the small ones are kept: copy them
+                frame[name] = convert(frame[name], dtype=element.dtype, order="C")
+            if frame[name].shape != element.shape(self._counts):
+                expected = element.shape(self._counts)
+                raise ValueError(f"frame {index}: {name} has shape {frame[name].shape}, expected {expected}")
+        for name, values in frame.items():
+            if not np.isfinite(values).all():
+                where = np.argwhere(~np.isfinite(values))[0]
+                at = f" of particle {where[0]}" if name in _STREAMED else ""
+                raise UserError(
+                    f"{self.path}: frame {index} ({float(time):.4g} s): {name}{at} is not finite; "
+                    "the run is not kept; use a smaller time step or check what drives it"
+                )
+        if index and not frame["time"] > self._small["time"][-1]:
+            raise ValueError(f"frame {index}: time {time} s is not after {self._small['time'][-1]} s")
+        for name in _STREAMED:
+            dataset = self._file[f"{ELEMENTS[name].path}/value"]
+            dataset.resize(index + 1, axis=0)
+            # A frame is a chunk, so it needs neither HDF5's cache nor its conversions.
+            dataset.id.write_direct_chunk((index, 0, 0), frame[name])
+        self._disk.check()
+        for name, series in self._small.items():
+            series.append(frame[name])
+        self._hash.update(frame)
+
+    def finish(self, wall_time_s: float) -> None:
+        """Complete the file and give it its name.
+
+        Args:
+            wall_time_s: time it took to compute the run [s].
+        """
+        if self._file is None:
+            raise ValueError("the run is already finished or discarded; make a new RunWriter")
+        if self.frame_count == 0:
+            raise ValueError("no frame was appended")
+        self._complete(wall_time_s, self.path)
+        remove_stopped(self.path)
+
+    def stop(self, wall_time_s: float, reason: str, state: State | None = None) -> Path:
+        """Complete the file with the frames so far, as a stopped run beside the one it was to be (stopped.py).
+
+        Args:
+            wall_time_s: time it took so far [s].
+            reason: why there are no more frames.
+            state: at the last of them, to go on from; a rollout has none.
+
+        Returns:
+            The file's path.
+        """
+        if self._file is None:
+            raise ValueError("the run is already finished or discarded; make a new RunWriter")
+        write_text(self._file, "stopped", reason)
+        if state is not None:
+            write_state(self._file, state)
+        path = stopped_path(self.path)
+        self._complete(wall_time_s, path)
+        return path
+
+    def _complete(self, wall_time_s: float, path: Path) -> None:
+        assert self._file is not None
+        try:
+            self._write_series()
+            self._file.attrs["wall_time_s"] = np.float64(wall_time_s)
+            write_text(self._file, "content_hash", self._hash.hexdigest())
+            self._file.close()
+            self._disk.complete(path)
+        except BaseException:
+            self._discard()
+            raise
+        self._file = None
+
+    def __enter__(self) -> RunWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._file is not None:
+            if kind is None:
+                log.warning("%s was left without finish(); nothing is kept", self.path)
+            self._discard()
+
+    def _create(self, attributes: dict[str, Any], author: str) -> None:
+        # v110 is the oldest HDF5 whose files say that they were cut short and may hold virtual datasets.
+        self._file = file = h5py.File(self._disk, "w", libver=("v110", "v110"))
+        for name, value in attributes.items():
+            if isinstance(value, str):
+                write_text(file, name, value)
+            else:
+                file.attrs[name] = value
+        _write_h5md(file, author)
+        # MDAnalysis reads the first group; in order of creation that is the soil.
+        particles = file.create_group("particles", track_order=True)
+        for name in ("soil", "body"):
+            box = particles.create_group(f"{name}/box")
+            box.attrs["dimension"] = np.int64(3)
+            box.attrs["boundary"] = np.array([b"none"] * 3)
+        for name in _STREAMED:
+            element = ELEMENTS[name]
+            shape = element.shape(self._counts)
+            dataset = file.create_dataset(
+                f"{element.path}/value",
+                (0, *shape),
+                element.dtype,
+                maxshape=(None, *shape),
+                chunks=(1, *shape),
+            )
+            _describe(dataset, name)
+
+    def _write_series(self) -> None:
+        """Time, everything of the body, and the view for VTK."""
+        file = self._file
+        assert file is not None
+        first = file[ELEMENTS["position"].path]
+        first["step"] = np.arange(self.frame_count, dtype="<i8")
+        first["time"] = np.array(self._small["time"], dtype="<f8")
+        write_text(first["time"], "si_unit", "s")
+        for name, element in ELEMENTS.items():
+            if name not in _STREAMED:
+                file[f"{element.path}/value"] = np.array(self._small[name], dtype=element.dtype)
+                _describe(file[f"{element.path}/value"], name)
+            if name != "position":  # hard links: H5MD's way to say "sampled at the same times"
+                file[f"{element.path}/step"] = first["step"]
+                file[f"{element.path}/time"] = first["time"]
+        write_view(file, first["value"], file[ELEMENTS["velocity"].path]["value"], first["time"])
+
+    def _discard(self) -> None:
+        """Close and remove the hidden file, whatever state it is in."""
+        file, self._file = self._file, None
+        try:
+            if file is not None:
+                file.close()
+        finally:
+            self._disk.discard()
+
+
+def _describe(dataset: h5py.Dataset, name: str) -> None:
+    write_text(dataset, "si_unit", ELEMENTS[name].si_unit)
+    write_text(dataset, "description", ELEMENTS[name].description)
+
+
+def _write_mesh(file: h5py.File, vertices: np.ndarray, triangles: np.ndarray) -> None:
+    """Checksummed: no content hash guards it."""
+    for values, (path, dtype) in zip((vertices, triangles), MESH.values(), strict=True):
+        file.create_dataset(path, data=np.asarray(values, dtype=dtype), chunks=True, fletcher32=True)
+    write_text(file[MESH["vertices"][0]], "si_unit", "m")
+    write_text(file[MESH["vertices"][0]], "description", "of the tool, about its centre of mass, body frame")
+    write_text(file[MESH["triangles"][0]], "description", "vertices of each triangle, facing outwards")
+
+
+def _write_h5md(file: h5py.File, author: str) -> None:
+    """The group that every H5MD file must have."""
+    h5md = file.create_group("h5md")
+    h5md.attrs["version"] = np.array([1, 1], dtype="<i8")
+    write_text(h5md.create_group("author"), "name", author or "unknown")
+    creator = h5md.create_group("creator")
+    write_text(creator, "name", "sgns")
+    write_text(creator, "version", package_version())
+
+
+def _yaml_text(data: dict[str, Any]) -> str:
+    return yaml.dump(
+        _plain(data),
+        Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper),
+        sort_keys=False,
+        allow_unicode=True,
+        default_flow_style=None,
+    )
+
+
+def _plain(value: Any) -> Any:
+    """The same data in the types that YAML knows without tags."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, PurePath):
+        return str(value)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"{type(value).__name__} cannot be stored in a run; give numbers, text, lists and dicts")

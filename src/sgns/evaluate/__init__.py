@@ -1,0 +1,1 @@
+"""`sgns evaluate`: a trained simulator against true runs."""

@@ -1,0 +1,315 @@
+"""`sgns evaluate`: a trained network against the simulated runs of a split, as tables, figures and a page.
+
+Every run of the split is rolled out from its first d true frames along the same tool path, written as a run
+file, and compared with the simulated one; baselines and times are measured beside it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import statistics
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from mpm_warp.poses import in_body_frame
+from sgns.clock import elapsed
+from sgns.config import UserError
+from sgns.data.files import only_here, require_replaceable
+from sgns.data.layout import scene_problems
+from sgns.data.run import Run
+from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory, provenance
+from sgns.evaluate.figures import read_log
+from sgns.evaluate.metrics import body_errors, is_wheel, mean_prediction, position_errors, surface_grid
+from sgns.evaluate.report import write_report
+from sgns.evaluate.results import (
+    EvaluatedRun,
+    Evaluation,
+    NetworkTiming,
+    aggregate,
+    overlap_warning,
+    run_scores,
+    seen_before,
+)
+from sgns.evaluate.tables import write_tables
+from sgns.evaluate.words import describe, forward_name, short_names
+from sgns.model.settings import ModelSettings, model_settings
+from sgns.reduction.basis import Basis, reduction_curves
+from sgns.rollout import single_thread, write_rollout
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from sgns.data.dataset import Dataset
+    from sgns.simulator import Simulator
+    from sgns.states import Rollout
+
+log = logging.getLogger(__name__)
+
+
+def roll_out(simulator: Simulator, run: Run) -> Rollout:
+    """The network along a run's tool path, from the run's first d true frames."""
+    points = in_body_frame(run.pose[0], run.body_points[0])
+    given = simulator.basis.transform(run.positions(slice(0, simulator.history)))
+    return simulator.rollout(run.pose, points, latent_history=given, values=run.scene)
+
+
+def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTiming:
+    """Times rollouts along one run's tool path, after one that warms up."""
+    stepping, decoding = [], []
+    with Run(path) as run, single_thread():
+        simulated = (run.frame_count - simulator.history) / run.frame_rate
+        for repeat in range(repeats + 1):
+            forget_peak()
+            rollout = roll_out(simulator, run)
+            stepping_bytes = peak_memory()
+            forget_peak()
+            began = time.perf_counter()
+            for latent in torch.as_tensor(rollout.latent):
+                simulator.basis.inverse(latent)
+            if repeat:
+                stepping.append(float(rollout.wall_time_s) / simulated)
+                decoding.append(stepping[-1] + elapsed(began, time.perf_counter()) / simulated)
+            decoding_bytes = peak_memory()
+        return NetworkTiming(
+            statistics.median(stepping),
+            statistics.median(decoding),
+            len(stepping),
+            path.stem,
+            stepping_bytes,
+            decoding_bytes,
+        )
+
+
+def full_basis(dataset: Dataset, basis: Basis) -> Basis:
+    """The dataset's cached basis with more modes whose first modes are the network's; else the network's."""
+    best = basis
+    for path in sorted(Path(dataset.path).glob("reduced/*/basis.h5")):
+        try:
+            other = Basis.load(path)
+        except UserError:  # another version's cache: the report then shows the network's modes only
+            continue
+        shared = other.num_modes > best.num_modes and other.modes.shape[0] == basis.modes.shape[0]
+        if shared and torch.allclose(
+            other.modes[:, : basis.num_modes].double(), basis.modes.double(), atol=1e-5
+        ):
+            best = other
+    return best
+
+
+def training_means(paths: Sequence[Path], history: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean force [N] and torque [N m] of the training split, shape (3,) each."""
+    forces, torques = [], []
+    for path in paths:
+        with Run(path) as run:
+            forces.append(run.force)
+            torques.append(run.torque)
+    return mean_prediction(forces, history), mean_prediction(torques, history)
+
+
+def require_known_run(simulator: Simulator, run: Run, checkpoint: Path) -> None:
+    """Refuses a run that the checkpoint's subspace, or the report, cannot describe."""
+    if problems := scene_problems(run.scene):
+        raise UserError(f"{run.path}: {problems[0]}; repeat the run")
+    if run.arrangement_hash != simulator.arrangement_hash:
+        raise UserError(
+            f"{run.path} has another particle arrangement ({run.arrangement_hash}) than {checkpoint} was "
+            f"trained on ({simulator.arrangement_hash}); evaluate it on its own dataset"
+        )
+    if abs(run.frame_rate - float(simulator.frame_rate)) > 1e-6 * run.frame_rate:
+        raise UserError(
+            f"{run.path} was recorded at {run.frame_rate:g} Hz, {checkpoint} steps at "
+            f"{simulator.frame_rate:g} Hz; evaluate it on its own dataset"
+        )
+
+
+def evaluate(
+    simulator: Simulator,
+    dataset: Dataset,
+    output: Path,
+    *,
+    split: str = "test",
+    checkpoint: Path,
+    new_rollouts: Sequence[Path] = (),
+    repeats: int = 3,
+    full_space: bool = False,
+    made: dict[str, str] | None = None,
+) -> Evaluation:
+    """Rolls out every run of a split, measures, and writes `rollouts/`, `metrics.csv` and `metrics.json`.
+
+    Args:
+        simulator: the trained `Simulator`.
+        dataset: `Dataset` with the runs.
+        output: folder to write to.
+        split: `train`, `validation` or `test`.
+        checkpoint: file of the simulator, for messages and the rollouts' run files.
+        new_rollouts: run files without truth, checked here and shown in the report.
+        repeats: timed rollouts.
+        full_space: whether to measure what the same network would cost on every particle.
+        made: how it was made, for the report.
+    """
+    network = model_settings(simulator.card["model"]) if full_space else None
+    if full_space and not isinstance(network, ModelSettings):
+        raise UserError(
+            f"full_space=true: {checkpoint} holds polynomials; only a network has a counterpart in full space"
+        )
+    paths = [Path(path) for path in dataset.runs(split)]
+    if not paths:
+        raise UserError(
+            f"dataset {dataset.name} has no complete run in its split {split!r}; allowed: train, "
+            f"validation, test; simulate it first: sgns simulate dataset={dataset.name}"
+        )
+    for path in (*paths, *new_rollouts):  # all of them before anything is written
+        with Run(path) as run:
+            require_known_run(simulator, run, checkpoint)
+    costs = network_costs(checkpoint, simulator.card)
+    training_log = read_log(checkpoint.parent / "tensorboard")
+    require_replaceable(
+        *(output / name for name in ("metrics.csv", "examples.csv", "metrics.json", "report.html")),
+        *(output / "figures").glob("*.png"),
+        *(output / "rollouts").glob("*.h5"),
+    )
+    try:
+        (output / "rollouts").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"cannot write to output={output}: {error.strerror}; give a folder that you may write to"
+        ) from error
+    history = int(simulator.history)
+    mean_force, mean_torque = training_means(dataset.runs("train"), history)
+    start = np.asarray(simulator.start_positions, dtype=np.float64)
+    grid = surface_grid(start)
+
+    runs = []
+    labels = short_names([path.stem for path in paths])
+    for path, label in zip(tqdm(paths, desc="rolling out", unit="run", disable=None), labels, strict=True):
+        target = output / "rollouts" / f"{path.stem}.h5"
+        with ExitStack() as stack:
+            truth = stack.enter_context(Run(path))
+            write_rollout(
+                target,
+                simulator,
+                truth.scene,
+                roll_out(simulator, truth),
+                effects=truth.effects,
+                seed=truth.seed,
+                checkpoint=checkpoint,
+                given_frames=history,
+                mesh=truth.mesh,
+            )
+            prediction = stack.enter_context(Run(target))
+            errors = position_errors(truth, prediction, simulator.basis, history, grid)
+            words, wheel = describe(truth.scene), is_wheel(truth.scene)
+            body = body_errors(truth, prediction, history)
+            scores = run_scores(path.stem, errors, truth, prediction, history, mean_force, mean_torque, body)
+        runs.append(EvaluatedRun(path.stem, label, words, path, target, errors, scores, wheel))
+
+    trained_on, chosen_by = seen_before(simulator, [run.name for run in runs])
+    evaluation = Evaluation(
+        dataset=str(dataset.name),
+        split=split,
+        runs=runs,
+        total=aggregate([run.scores for run in runs]),
+        timing=time_network(simulator, paths[0], repeats),
+        costs=costs,
+        full_space=full_space_cost(paths[0], network, repeats) if network else None,
+        mean_force=mean_force,
+        mean_torque=mean_torque,
+        training_log=training_log,
+        trained_on=trained_on,
+        chosen_by=chosen_by,
+        curves=reduction_curves(full_basis(dataset, simulator.basis), paths),
+        basis=simulator.basis,
+        num_modes=int(simulator.num_modes),
+        history=history,
+        particle_count=len(start),
+        start=start,
+        new_rollouts=[Path(path) for path in new_rollouts],
+        made=dict(made or {}),
+    )
+    write_tables(evaluation, output)
+    return evaluation
+
+
+def log_summary(evaluation: Evaluation, report: Path) -> None:
+    """The main numbers on the terminal."""
+    total, timing = evaluation.total, evaluation.timing
+    if warning := overlap_warning(evaluation):
+        log.warning("%s", warning)
+    log.info("%d %s runs of %s", len(evaluation.runs), evaluation.split, evaluation.dataset)
+    log.info(
+        "position: RMSE %.3g mm (reduction alone %.3g, frozen %.3g); skill %.3f against frozen, %.3f "
+        "against constant velocity",
+        total.rmse_mm("total"),
+        total.rmse_mm("reduction"),
+        total.rmse_mm("frozen"),
+        total.skill(),
+        total.skill("constant_velocity"),
+    )
+    log.info(
+        "force: NRMSE %.3f (mean force of the training split: %.3f); %s MAE %.3g N, vertical MAE %.3g N",
+        total.force.overall_nrmse,
+        total.mean_force.overall_nrmse,
+        forward_name(evaluation),
+        total.force.mae[0],
+        total.force.mae[2],
+    )
+    log.info(
+        "wall seconds per simulated second: network %.3g (with decoding %.3g, one thread), solver %.3g",
+        timing.stepping,
+        timing.decoding,
+        total.solver_rate,
+    )
+    if full := evaluation.full_space:
+        log.info(
+            "the same network on every particle: %.3g s per simulated second, %.3g s per training step of %d samples",
+            full.rollout,
+            full.training_step,
+            full.batch_size,
+        )
+    log.info("report: %s", report)
+
+
+def main(cfg: DictConfig) -> float:
+    """The `sgns evaluate` command; returns the position skill against frozen over all runs of the split."""
+    from sgns.data.dataset import Dataset
+    from sgns.simulator import Simulator
+
+    new_rollouts = [cfg.new_rollouts] if isinstance(cfg.new_rollouts, str) else cfg.new_rollouts or []
+    if not isinstance(new_rollouts, Sequence):
+        raise UserError(f"new_rollouts is {new_rollouts!r}; it must be a list of run files, as [a.h5,b.h5]")
+    if not isinstance(cfg.timing_repeats, int) or cfg.timing_repeats < 3:
+        raise UserError(f"timing_repeats is {cfg.timing_repeats!r}; it must be a whole number, at least 3")
+    if not isinstance(cfg.full_space, bool):
+        raise UserError(f"full_space is {cfg.full_space!r}; it must be true or false")
+    checkpoint, output = Path(cfg.checkpoint), Path(cfg.output)
+    if cfg.dataset.get("format") == "published":
+        from sgns.evaluate.published import evaluate_published
+
+        simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
+        with only_here(output / "metrics.json"):
+            return evaluate_published(simulator, cfg.dataset, cfg.split, output, checkpoint)
+    dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
+    simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
+    with only_here(output / "metrics.json"):
+        evaluation = evaluate(
+            simulator,
+            dataset,
+            output,
+            split=cfg.split,
+            checkpoint=checkpoint,
+            new_rollouts=[Path(str(path)) for path in new_rollouts],
+            repeats=cfg.timing_repeats,
+            full_space=cfg.full_space,
+            made=provenance(simulator, checkpoint),
+        )
+        report = write_report(evaluation, output)
+    log_summary(evaluation, Path(os.path.relpath(report)))
+    return evaluation.total.skill("frozen")

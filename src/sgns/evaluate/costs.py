@@ -1,0 +1,205 @@
+"""What a network costs besides time, and how and where that was measured."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import shlex
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from sgns import __version__
+from sgns.clock import elapsed
+from sgns.data.run import Run
+from sgns.evaluate.results import Costs, FullSpaceCost
+from sgns.model.checkpoint import SUMMARY, load_surrogate, read_summary
+from sgns.model.full_space import FullSpaceDynamics, box_surface
+from sgns.model.settings import ModelSettings
+from sgns.rollout import single_thread
+from sgns.train.full_space import FullSpaceRun, FullSpaceWindows, losses
+
+if TYPE_CHECKING:
+    from sgns.simulator import Simulator
+
+
+# --- How a result was made: command, checkpoint, versions, machine --------------------------------------
+
+
+def cpu_model() -> str:
+    """Name of this machine's processor."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine() or "unknown"
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def command_line() -> str:
+    """The `sgns` command that is running with its overrides; empty outside Hydra."""
+    from hydra.core.hydra_config import HydraConfig
+
+    if not HydraConfig.initialized():
+        return ""
+    config = HydraConfig.get()
+    return shlex.join(["sgns", str(config.job.config_name), *config.overrides.task])
+
+
+def provenance(simulator: Simulator, checkpoint: Path) -> dict[str, str]:
+    """Name → value, in the order to show; what is not known is left out.
+
+    Args:
+        simulator: the trained `Simulator`; its card tells how it was trained.
+        checkpoint: file it was loaded from.
+    """
+    settings = simulator.card.get("settings", {})
+    facts = {
+        "command": command_line(),
+        "checkpoint": str(checkpoint),
+        "preset": str(settings.get("preset") or ""),
+        "trained on": str(settings.get("dataset") or ""),
+        "training steps": str((settings.get("training") or {}).get("max_steps") or ""),
+        "modes": str(simulator.num_modes),
+        "history frames": str(simulator.history),
+        "basis fitted on": f"{len(simulator.basis.fitted_on)} training runs",
+        "package": f"sgns {__version__}, torch {torch.__version__}, Python {platform.python_version()}",
+        "machine": f"{cpu_model()}, {usable_cores()} cores, {platform.system()}",
+        "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+    }
+    return {name: value for name, value in facts.items() if value}
+
+
+# --- What a trained network takes besides time: memory, parameters, and what its training took ----------
+
+
+def network_costs(checkpoint: Path, card: dict[str, Any]) -> Costs:
+    """What a checkpoint and the folder it lies in tell.
+
+    Args:
+        checkpoint: file; nothing is known if there is none.
+        card: of the simulator that was loaded from it.
+    """
+    return Costs(**stored(checkpoint), **trained(checkpoint, card))
+
+
+def stored(checkpoint: Path) -> dict[str, float]:
+    """Size of the checkpoint and number of its learned weights; nothing if it is no file."""
+    if not checkpoint.is_file():
+        return {}
+    weights = load_surrogate(checkpoint).dynamics.parameters()
+    return {
+        "parameters": sum(weight.numel() for weight in weights),
+        "checkpoint_bytes": checkpoint.stat().st_size,
+    }
+
+
+def trained(checkpoint: Path, card: dict[str, Any]) -> dict[str, float]:
+    """What `training.json` beside the checkpoint says of the training; nothing without it.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    if not os.path.lexists(checkpoint.parent / SUMMARY):
+        return {}
+    summary = read_summary(checkpoint.parent)
+    found = {"training_seconds": float(summary["seconds"])}
+    if "steps" in summary:  # polynomials are fitted without any
+        found["training_steps"] = summary["steps"]
+    batch = card.get("settings", {}).get("training", {}).get("batch_size")
+    return found | ({"batch_size": int(batch)} if batch else {})
+
+
+# --- memory of this process, as Linux counts it -----------------------------------------------------------
+
+
+def forget_peak() -> None:
+    """Start measuring the peak anew; without effect where the system cannot."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        pass
+
+
+def peak_memory() -> float:
+    """Largest resident memory of this process since the peak was forgotten [bytes]; NaN if not known."""
+    try:
+        for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024.0 * float(line.split()[1])
+    except OSError:
+        pass
+    return math.nan
+
+
+# --- What the same network would cost on every particle: the paper's comparison, measured on this machine
+# Costs do not depend on what a network has learned, so an untrained one is timed.
+
+_BATCH = 2  # windows of a training step, the paper's
+_REACH = 4 / 3  # radius of the neighbourhood in particle spacings: 6 neighbours in a bed at rest
+
+
+def full_space_cost(path: Path, settings: ModelSettings, repeats: int) -> FullSpaceCost:
+    """Time and memory of a step, with the tool half-way along a run.
+
+    Args:
+        path: the run.
+        settings: of the network; its body has nodes on its surface whatever `body_nodes` says.
+        repeats: timed steps, after one to warm up; medians count.
+    """
+    with Run(path) as run:
+        spacing = float(np.prod(run.scene["bed"]["size"]) / run.particle_count) ** (1 / 3)
+        blade = run.scene.get("blade")
+    # Nodes of a blade as close together as particles, so that none slips between them; of other bodies as recorded.
+    nodes = None
+    if blade is not None:
+        nodes = box_surface(np.array([blade["thickness"], blade["width"], blade["length"]]) / 2, spacing)
+    one_run = FullSpaceRun(path, nodes)
+    dynamics = FullSpaceDynamics(replace(settings, body_nodes="points"), _REACH * spacing, one_run.bin_size)
+    windows = FullSpaceWindows([one_run], dynamics.history)
+    window = windows.window(len(windows) // 2)
+    still = torch.zeros(3, dtype=torch.float64)
+
+    def training_step() -> None:
+        dynamics.zero_grad()
+        sum(losses(dynamics, windows.batch(0, _BATCH, still))).backward()
+
+    with single_thread():
+        with torch.inference_mode():
+            frame = _wall_time(lambda: dynamics.advance(window.history, window.body), repeats)
+        forget_peak()
+        step = _wall_time(training_step, repeats)
+    return FullSpaceCost(
+        parameters=sum(weight.numel() for weight in dynamics.parameters()),
+        training_step=step,
+        batch_size=_BATCH,
+        rollout=frame * one_run.frame_rate,
+        peak_bytes=peak_memory(),
+    )
+
+
+def _wall_time(action: Callable[[], object], repeats: int) -> float:
+    """Median after one call to warm up [s]."""
+    action()
+    found = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        action()
+        found.append(elapsed(began, time.perf_counter()))
+    return statistics.median(found)

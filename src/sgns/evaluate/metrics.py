@@ -1,0 +1,413 @@
+"""How far a predicted run is from a simulated one: positions, surface, force and torque."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+
+from sgns.config import UserError
+from sgns.data.run import frame_chunks
+
+# --- The body of a recorded scene: its kind, its corners, and how its force is reported -----------------
+# Scenes are plain data of a run file, of any kind.
+
+
+def is_wheel(scene: Mapping[str, Any]) -> bool:
+    """Whether the body is a wheel."""
+    return "diameter" in scene
+
+
+def forward_force(scene: Mapping[str, Any]) -> tuple[str, float]:
+    """Name of the forward force and the sign that F_x is reported with."""
+    return ("drawbar pull Fx", 1.0) if is_wheel(scene) else ("draft −Fx", -1.0)
+
+
+def sinkage(scene: Mapping[str, Any], poses: np.ndarray) -> np.ndarray:
+    """Depth of a wheel's lowest point below the undisturbed surface [m], shape (T,) for poses (T, 7)."""
+    return 0.5 * float(scene["diameter"]) + float(scene.get("grouser_height", 0.0)) - poses[:, 2]
+
+
+# --- The free surface of a bed of particles as a height map on a regular horizontal grid ----------------
+
+# A column two particle spacings wide holds several particles of an undisturbed top layer, so that
+# the highest of them follows the surface and no column of a full bed is empty.
+SPACINGS_PER_COLUMN = 2.0
+
+
+@dataclass(frozen=True)
+class SurfaceGrid:
+    """Columns of a height map.
+
+    Attributes:
+        x_edges: borders of the columns along x [m], shape (nx + 1,), increasing, equally spaced.
+        y_edges: borders of the columns along y [m], shape (ny + 1,), increasing, equally spaced.
+    """
+
+    x_edges: np.ndarray
+    y_edges: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of columns along x and y: (nx, ny)."""
+        return len(self.x_edges) - 1, len(self.y_edges) - 1
+
+    @property
+    def x_centres(self) -> np.ndarray:
+        """Middle of the columns along x [m], shape (nx,)."""
+        return 0.5 * (self.x_edges[1:] + self.x_edges[:-1])
+
+    @property
+    def y_centres(self) -> np.ndarray:
+        """Middle of the columns along y [m], shape (ny,)."""
+        return 0.5 * (self.y_edges[1:] + self.y_edges[:-1])
+
+
+def particle_spacing(positions: np.ndarray) -> float:
+    """Edge [m] of the cube that one particle occupies in an undisturbed bed.
+
+    The bed reaches half a spacing s beyond its outermost particles, so Π (extent + s) = n s³, solved by
+    iteration.
+
+    Args:
+        positions: an undisturbed bed [m], shape (n, 3).
+    """
+    extent = np.ptp(np.asarray(positions, dtype=np.float64), axis=0)
+    solid = extent[extent > 0.0]
+    if solid.size == 0:
+        return 1.0
+    spacing = 0.0
+    for _ in range(50):
+        spacing = (np.prod(solid + spacing) / len(positions)) ** (1.0 / solid.size)
+    return float(spacing)
+
+
+def surface_grid(positions: np.ndarray, column: float | None = None) -> SurfaceGrid:
+    """Height-map columns that cover an undisturbed bed.
+
+    Args:
+        positions: particles of the undisturbed bed [m], shape (n, 3).
+        column: wanted edge of a column [m]; by default two particle spacings. The edge used is the
+            nearest that divides the bed's length and width.
+    """
+    positions = np.asarray(positions, dtype=np.float64)
+    spacing = particle_spacing(positions)
+    column = SPACINGS_PER_COLUMN * spacing if column is None else column
+    edges = []
+    for axis in (0, 1):
+        # The bed reaches half a spacing beyond its outermost particles.
+        low, high = positions[:, axis].min() - 0.5 * spacing, positions[:, axis].max() + 0.5 * spacing
+        count = max(1, round((high - low) / column))
+        edges.append(np.linspace(low, high, count + 1))
+    return SurfaceGrid(*edges)
+
+
+def height_map(positions: np.ndarray, grid: SurfaceGrid) -> np.ndarray:
+    """Height of the highest particle of every column.
+
+    Particles beyond the grid's border count for the outermost columns.
+
+    Args:
+        positions: particles [m], shape (n, 3).
+        grid: columns of the map.
+
+    Returns:
+        Heights z [m], shape (nx, ny); NaN where a column holds no particle.
+    """
+    positions = np.asarray(positions)
+    nx, ny = grid.shape
+    column = []
+    for axis, edges, count in ((0, grid.x_edges, nx), (1, grid.y_edges, ny)):
+        share = (positions[:, axis] - edges[0]) / (edges[-1] - edges[0])
+        share = np.clip(np.nan_to_num(share), 0.0, 1.0)  # clipped before the cast: inf has no integer
+        column.append(np.minimum((share * count).astype(np.int64), count - 1))
+    heights = np.full(nx * ny, -np.inf)
+    np.maximum.at(heights, column[0] * ny + column[1], positions[:, 2].astype(np.float64))
+    heights[heights == -np.inf] = np.nan
+    return heights.reshape(nx, ny)
+
+
+# --- How far a predicted run is from a simulated one: positions, surface, force and torque --------------
+# Both runs are files of the same kind and are read in chunks of frames, so memory does not grow with the
+# length of a run. The frames of the history, which the prediction was given, count in no metric.
+
+# Reported names of the world axes x, y, z. Draft is −F_x; every relative metric is the same for −F_x and F_x.
+FORCE_COMPONENTS = {"draft": 0, "lateral": 1, "vertical": 2}
+TORQUE_COMPONENTS = {"roll": 0, "pitch": 1, "yaw": 2}
+# A component this small beside the whole vector (RMS) is zero by symmetry, up to noise of the truth:
+# dividing by it says nothing, so relative metrics are left out (NaN).
+NEGLIGIBLE_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class ParticleErrors:
+    """Mean-square position errors of one run's particles, over axes and the frames after the history.
+
+    Attributes:
+        reduction: PCA⁻¹PCA(truth) − truth [m²], shape (n,).
+        network: prediction − PCA⁻¹PCA(truth) [m²], shape (n,).
+    """
+
+    reduction: np.ndarray
+    network: np.ndarray
+
+
+@dataclass(frozen=True)
+class PositionErrors:
+    """Mean-square position errors of one run at every frame after the history.
+
+    Attributes:
+        time: time of the frames [s], shape (t,).
+        reduction: PCA⁻¹PCA(truth) − truth [m²], shape (t,).
+        network: prediction − PCA⁻¹PCA(truth) [m²], shape (t,); the paper's figure.
+        total: prediction − truth [m²], shape (t,).
+        frozen: last frame of the history, kept − truth [m²], shape (t,).
+        constant_velocity: last step of the history, continued − truth [m²], shape (t,).
+        surface: height map of the prediction − of the truth [m²], shape (t,).
+        surface_frozen: height map of the last frame of the history − of the truth [m²], shape (t,).
+        particles: the same run, by particle instead of by frame; None if only frames were asked for.
+    """
+
+    time: np.ndarray
+    reduction: np.ndarray
+    network: np.ndarray
+    total: np.ndarray
+    frozen: np.ndarray
+    constant_velocity: np.ndarray
+    surface: np.ndarray
+    surface_frozen: np.ndarray
+    particles: ParticleErrors | None = None
+
+    def mse(self, name: str) -> float:
+        """Mean over frames of one of the errors [m²]."""
+        return float(np.mean(getattr(self, name)))
+
+    def rmse_mm(self, name: str) -> float:
+        """Root of the mean over frames of one of the errors [mm]."""
+        return 1e3 * math.sqrt(self.mse(name)) if self.mse(name) >= 0.0 else math.nan
+
+    def skill(self, baseline: str = "frozen") -> float:
+        """1 − total MSE / MSE of a baseline (`frozen` or `constant_velocity`)."""
+        return skill([self.mse("total")], [self.mse(baseline)])
+
+
+@dataclass(frozen=True)
+class BodyErrors:
+    """How far a predicted body is from its true place, over the frames after the history.
+
+    Attributes:
+        mse: mean-square distance of the centres of mass [m²].
+        sinkage_mae: mean absolute error of a wheel's sinkage [m]; NaN for other bodies.
+    """
+
+    mse: float
+    sinkage_mae: float
+
+
+PRESCRIBED = BodyErrors(0.0, math.nan)
+"""Of a body whose path was given."""
+
+
+@dataclass(frozen=True)
+class VectorErrors:
+    """Sums from which every metric of a predicted force or torque follows; sums of runs add up.
+
+    Attributes:
+        samples: number of frames.
+        absolute: Σ |prediction − truth| per world axis, shape (3,).
+        squared: Σ (prediction − truth)², shape (3,).
+        truth_squared: Σ truth², shape (3,).
+        truth_sum: Σ truth, shape (3,).
+        prediction_sum: Σ prediction, shape (3,).
+    """
+
+    samples: int
+    absolute: np.ndarray
+    squared: np.ndarray
+    truth_squared: np.ndarray
+    truth_sum: np.ndarray
+    prediction_sum: np.ndarray
+
+    @classmethod
+    def compare(cls, truth: np.ndarray, prediction: np.ndarray) -> VectorErrors:
+        """Errors of a predicted history.
+
+        Args:
+            truth: true vectors [N or N m], shape (t, 3).
+            prediction: predicted vectors, shape (t, 3), or (3,) for a constant.
+        """
+        truth = np.asarray(truth, dtype=np.float64)
+        prediction = np.broadcast_to(np.asarray(prediction, dtype=np.float64), truth.shape)
+        difference = prediction - truth
+        return cls(
+            samples=len(truth),
+            absolute=np.abs(difference).sum(axis=0),
+            squared=(difference**2).sum(axis=0),
+            truth_squared=(truth**2).sum(axis=0),
+            truth_sum=truth.sum(axis=0),
+            prediction_sum=prediction.sum(axis=0),
+        )
+
+    def __add__(self, other: VectorErrors) -> VectorErrors:
+        return VectorErrors(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+
+    @property
+    def mae(self) -> np.ndarray:
+        """Mean absolute error per axis [N or N m], shape (3,)."""
+        return self.absolute / self.samples
+
+    @property
+    def rms_truth(self) -> float:
+        """Root mean square of the truth's length [N or N m]."""
+        return math.sqrt(self.truth_squared.sum() / self.samples)
+
+    @property
+    def nrmse(self) -> np.ndarray:
+        """RMS error / RMS of the truth per axis, shape (3,); NaN where the truth is negligible."""
+        significant = self.truth_squared > NEGLIGIBLE_SHARE**2 * self.truth_squared.sum()
+        ratio = np.full(3, np.nan)
+        np.divide(self.squared, self.truth_squared, out=ratio, where=significant)
+        return np.sqrt(ratio)
+
+    @property
+    def overall_nrmse(self) -> float:
+        """RMS length of the error vector / RMS length of the true vector; NaN for a truth of zeros."""
+        scale = float(self.truth_squared.sum())
+        return math.sqrt(float(self.squared.sum()) / scale) if scale > 0.0 else math.nan
+
+    @property
+    def mpe(self) -> np.ndarray:
+        """100 (mean prediction − mean truth) / mean truth per axis [%], shape (3,), signed.
+
+        NaN where the mean of the truth is negligible beside the RMS length of the vector.
+        """
+        significant = np.abs(self.truth_sum) / self.samples > NEGLIGIBLE_SHARE * self.rms_truth
+        ratio = np.full(3, np.nan)
+        np.divide(self.prediction_sum - self.truth_sum, self.truth_sum, out=ratio, where=significant)
+        return 100.0 * ratio
+
+
+def skill(mse: Sequence[float], baseline: Sequence[float]) -> float:
+    """1 − Σ MSE / Σ MSE of the baseline over runs: 1 is perfect, 0 no better, negative is worse.
+
+    NaN if the baseline makes no error at all.
+    """
+    reference = float(np.sum(baseline))
+    return 1.0 - float(np.sum(mse)) / reference if reference > 0.0 else math.nan
+
+
+def mean_prediction(histories: Iterable[np.ndarray], history: int) -> np.ndarray:
+    """Mean force (or torque) of the training split, the simplest prediction of one.
+
+    Args:
+        histories: force of every training run [N], shape (T, 3) each.
+        history: frames to leave out at the start, as in every metric.
+
+    Returns:
+        Mean over all frames of all runs [N], shape (3,).
+    """
+    total, count = np.zeros(3), 0
+    for values in histories:
+        values = np.asarray(values, dtype=np.float64)[history:]
+        total, count = total + values.sum(axis=0), count + len(values)
+    return total / max(count, 1)
+
+
+def require_comparable(truth: Any, prediction: Any, history: int) -> None:
+    """Refuses pairs of runs that cannot be compared frame by frame and particle by particle."""
+    for what, a, b in (
+        ("particles", truth.particle_count, prediction.particle_count),
+        ("frames", truth.frame_count, prediction.frame_count),
+        ("arrangement", truth.arrangement_hash, prediction.arrangement_hash),
+    ):
+        if a != b:
+            raise UserError(
+                f"{prediction.path} cannot be compared with {truth.path}: {what} {b} against {a}; "
+                "compare runs of the same scene"
+            )
+    if truth.frame_count <= history:
+        raise UserError(
+            f"{truth.path} has {truth.frame_count} frames, the network needs {history} as its history; "
+            "nothing is left to compare: use a longer run"
+        )
+
+
+def position_errors(
+    truth: Any, prediction: Any, basis: Any, history: int, grid: SurfaceGrid
+) -> PositionErrors:
+    """Position errors of a predicted run at every frame after the history.
+
+    With orthonormal modes the network's error needs no decoding: it is ‖Uᵀ(prediction − truth)‖² / 3n, for a
+    prediction that lies in the subspace.
+
+    Args:
+        truth: the simulated `Run`.
+        prediction: the predicted `Run` of the same scene.
+        basis: `Basis` the prediction was decoded with.
+        history: number of frames d that the prediction was given.
+        grid: columns of the height map.
+    """
+    require_comparable(truth, prediction, history)
+    last = np.asarray(truth.positions(slice(history - 1, history)), dtype=np.float64)[0]
+    before = np.asarray(truth.positions(slice(max(history - 2, 0), max(history - 1, 1))), dtype=np.float64)[0]
+    step = last - before
+    last_heights = height_map(last, grid)
+    names = [f.name for f in fields(PositionErrors) if f.name not in ("time", "particles")]
+    collected: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    by_particle = {name: np.zeros(truth.particle_count) for name in ("reduction", "network")}
+    for frames in frame_chunks(truth.particle_count, truth.frame_count, history):
+        true = np.asarray(truth.positions(frames), dtype=np.float64)
+        predicted = np.asarray(prediction.positions(frames), dtype=np.float64)
+        latent = basis.transform(torch.from_numpy(true))
+        difference = basis.transform(torch.from_numpy(predicted)) - latent
+        elapsed = np.arange(frames.start, frames.stop) - (history - 1)
+        projected = basis.inverse(latent).numpy()
+        collected["reduction"].append(mean_square(projected - true))
+        by_particle["reduction"] += np.einsum("tna,tna->n", projected - true, projected - true)
+        by_particle["network"] += np.einsum("tna,tna->n", predicted - projected, predicted - projected)
+        collected["network"].append(
+            difference.square().sum(dim=(-2, -1)).numpy() / (3 * truth.particle_count)
+        )
+        collected["total"].append(mean_square(predicted - true))
+        collected["frozen"].append(mean_square(last - true))
+        collected["constant_velocity"].append(mean_square(last + elapsed[:, None, None] * step - true))
+        heights = [height_map(frame, grid) for frame in true]
+        guess = [height_map(frame, grid) for frame in predicted]
+        collected["surface"].append(
+            np.array([height_error(a, b) for a, b in zip(guess, heights, strict=True)])
+        )
+        collected["surface_frozen"].append(np.array([height_error(last_heights, b) for b in heights]))
+    values = {name: np.concatenate(parts) for name, parts in collected.items()}
+    entries = 3 * (truth.frame_count - history)
+    particles = ParticleErrors(**{name: total / entries for name, total in by_particle.items()})
+    return PositionErrors(time=np.asarray(truth.time)[history:], **values, particles=particles)
+
+
+def body_errors(truth: Any, prediction: Any, history: int) -> BodyErrors:
+    """Errors of the body's place in a predicted run.
+
+    Args:
+        truth: the simulated `Run`.
+        prediction: the predicted `Run` of the same scene.
+        history: frames at the start that count in no metric.
+    """
+    misplaced = prediction.pose[history:, :3] - truth.pose[history:, :3]
+    return BodyErrors(
+        mse=float(np.mean((misplaced**2).sum(axis=1))),
+        sinkage_mae=float(np.mean(np.abs(misplaced[:, 2]))) if is_wheel(truth.scene) else math.nan,
+    )
+
+
+def mean_square(difference: np.ndarray) -> np.ndarray:
+    """Mean over particles and axes of squared differences (t, n, 3) [m], shape (t,) [m²]."""
+    return np.mean(difference**2, axis=(1, 2))
+
+
+def height_error(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean-square difference [m²] of two height maps (nx, ny) [m] over the columns that both fill."""
+    both = np.isfinite(a) & np.isfinite(b)
+    return float(np.mean((a[both] - b[both]) ** 2)) if both.any() else math.nan

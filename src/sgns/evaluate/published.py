@@ -1,0 +1,141 @@
+"""`sgns evaluate dataset=published`: a network against published reduced runs, as a table.
+
+Only the modes of these runs are known. With an orthonormal basis the mean square over all particles is
+‖ΔS′‖² / 3n all the same; what the reduction leaves out is not in it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mpm_warp.poses import in_body_frame
+from sgns.config import UserError
+from sgns.data.files import require_replaceable
+from sgns.data.published import PARTICLES, fingerprint, published_runs
+from sgns.evaluate.costs import provenance
+from sgns.evaluate.metrics import PositionErrors
+from sgns.evaluate.results import Scores, aggregate, run_scores
+from sgns.evaluate.tables import write_csv, write_json
+from sgns.reduction.reduce import ReducedRun
+from sgns.rollout import single_thread
+
+if TYPE_CHECKING:
+    from sgns.simulator import Simulator
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Series:
+    """What `run_scores` compares."""
+
+    time: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    wall_time_s: float = 0.0
+
+
+def evaluate_published(
+    simulator: Simulator, settings: Mapping[str, Any], split: str, output: Path, checkpoint: Path
+) -> float:
+    """Roll out, print the table, write metrics.csv and metrics.json; returns the skill against frozen.
+
+    Args:
+        simulator: Trained on published runs.
+        settings: The `dataset` group.
+        split: "train": the runs that it was trained on; else all others of the folder.
+        output: Folder of the tables.
+        checkpoint: File of the simulator, for messages.
+    """
+    trained = {name.rsplit(" ", 1)[-1] for name in simulator.basis.fitted_on or []}
+    everything = [run for found in published_runs(settings["path"]).values() for run in found]
+    kind = everything[0].scene["kind"]
+    if simulator.arrangement_hash != f"published-{kind}":
+        raise UserError(
+            f"{checkpoint} was not trained on published {kind} runs; train one: sgns train dataset=published "
+            f"dataset.path={settings['path']}"
+        )
+    runs = [run for run in everything if (fingerprint(run) in trained) == (split == "train")]
+    if not runs:
+        if split == "train":
+            raise UserError(
+                f"{checkpoint} was trained on none of the runs in {settings['path']}; use split=test"
+            )
+        log.warning("%s was trained on all of these runs: errors on new runs will be larger", checkpoint)
+        runs = everything
+    require_replaceable(output / "metrics.csv", output / "metrics.json")
+    mean_force = simulator.mean_force
+    with single_thread():
+        scores = [scored(simulator, run, mean_force) for run in runs]
+    total = aggregate(scores)
+    log.info("%s", "\n".join(score_lines([*scores, total])))
+    output.mkdir(parents=True, exist_ok=True)
+    write_csv(output / "metrics.csv", [*scores, total])
+    write_json(
+        output / "metrics.json",
+        {
+            "aggregate": total.row(),
+            "runs": [score.row() for score in scores],
+            "mean_training_force_N": mean_force,
+            "particles": PARTICLES[kind],
+            "trained_on_these": runs is everything and split != "train",
+            "made": provenance(simulator, checkpoint),
+        },
+    )
+    log.info("tables: %s", output)
+    return total.skill()
+
+
+def scored(simulator: Simulator, run: ReducedRun, mean_force: np.ndarray) -> Scores:
+    """Scores of one run, rolled out from its first d true frames."""
+    d = simulator.history
+    truth = run.latent[:, : simulator.num_modes]
+    rollout = simulator.rollout(
+        run.pose, in_body_frame(run.pose[0], run.body_points[0]), latent_history=truth[:d], values=run.scene
+    )
+    size = 3 * PARTICLES[run.scene["kind"]]
+
+    def mean_square(latent: np.ndarray) -> np.ndarray:
+        return ((latent - truth)[d:] ** 2).sum(axis=(1, 2)) / size
+
+    elapsed = np.arange(len(truth))[:, None, None] - (d - 1)
+    network = mean_square(rollout.latent)
+    unknown = np.full(len(network), np.nan)
+    errors = PositionErrors(
+        time=run.time[d:],
+        reduction=unknown,
+        network=network,
+        total=network,
+        frozen=mean_square(truth[d - 1][None]),
+        constant_velocity=mean_square(truth[d - 1] + elapsed * (truth[d - 1] - truth[d - 2])),
+        surface=unknown,
+        surface_frozen=unknown,
+    )
+    predicted = Series(run.time, rollout.force, rollout.torque)
+    return run_scores(
+        run.name, errors, Series(run.time, run.force, run.torque), predicted, d, mean_force, np.zeros(3)
+    )
+
+
+def score_lines(scores: Sequence[Scores]) -> list[str]:
+    """The table as text: position errors in 1e-4 m², force errors in per cent; x is forward, z up."""
+    lines = [
+        "                      position MSE [1e-4 m2]      skill against      force MPE [%]   force NRMSE",
+        "run               network   frozen  const vel  frozen const vel      x       z     network  mean force",
+    ]
+    for score in scores:
+        mse = [1e4 * score.mse[name] for name in ("network", "frozen", "constant_velocity")]
+        lines.append(
+            f"{score.name:<16} {mse[0]:8.4f} {mse[1]:8.4f} {mse[2]:10.4f} {score.skill():7.3f} "
+            f"{score.skill('constant_velocity'):9.3f} {score.force.mpe[0]:7.1f} {score.force.mpe[2]:7.1f} "
+            f"{score.force.overall_nrmse:9.3f} {score.mean_force.overall_nrmse:11.3f}"
+        )
+    absolute = scores[-1].absolute_mpe
+    lines.append(f"mean |MPE|: x {absolute['draft']:.1f} %, z {absolute['vertical']:.1f} %")
+    return lines

@@ -1,1 +1,0 @@
-"""A trained simulator against true runs: metrics, baselines, figures and the report."""

@@ -1,1 +1,0 @@
-"""The reference without a reduction: the graph network on every particle, edges between near ones."""

@@ -1,1 +1,0 @@
-"""The latent dynamics: graph, network, windows of training data, training and its validation."""

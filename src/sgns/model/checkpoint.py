@@ -1,0 +1,346 @@
+"""What a checkpoint holds: the latent dynamics with all that is needed to step a bed."""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from sgns.config import UserError
+from sgns.data.files import whole_file
+from sgns.data.layout import require_mesh_was_read
+from sgns.data.small_files import read_json
+from sgns.model.dynamics import Dynamics
+from sgns.model.network_dynamics import LatentDynamics
+from sgns.model.polynomial import PolynomialDynamics
+from sgns.model.settings import ModelSettings, PolynomialSettings
+from sgns.model.training_range import TrainingRange
+from sgns.reduction.basis import Basis
+
+# --- Which kind of latent dynamics a `model` describes: a network or polynomials. Everywhere else they are
+
+
+def dynamics_of(card: Mapping[str, Any]) -> Dynamics:
+    """The dynamics that a card describes (see `Dynamics.card`), to be filled from a state dict."""
+    model, num_modes = card["model"], int(card["num_modes"])
+    told = tuple(map(str, card["context"])), bool(card["predicts_body"])
+    # Networks of earlier versions do not say that they are one.
+    if model.get("kind", "network") == "polynomial":
+        return PolynomialDynamics(PolynomialSettings(**model), num_modes, *told, card["used"])
+    return LatentDynamics(ModelSettings(**model), num_modes, *told)
+
+
+# --- What a checkpoint holds: the latent dynamics with all that is needed to step a bed, and nothing to loo
+# elsewhere.
+#
+# A checkpoint is laid out as Lightning's `.ckpt` and loaded with `weights_only`: tensors in its state dict (weights,
+# normalisation, basis, common start, body points) and plain Python values, the card, as its hyperparameters. A
+# network's is written by Lightning and also holds what is needed to go on training.
+
+_FORMAT = "sgns-surrogate"
+_FORMAT_VERSION = 2
+_PREFIX = "surrogate."
+_DEEPEST = 100  # nesting of a card
+_MOST_VALUES = 1_000_000  # of a card
+_MOST_TEXT = 1 << 24  # characters of a card
+# How far the soil's modes may leave the range of the training runs, in widths of that range. Held-out runs leave it by
+# up to 0.57 (of four training runs), rollouts five times as deep as trained by 0.45.
+_MARGIN = 0.75
+# Whatever the bytes are, reading them as a checkpoint may fail in any of these ways.
+_UNREADABLE = (
+    pickle.UnpicklingError,
+    RuntimeError,
+    EOFError,
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    IndexError,
+    ImportError,
+    MemoryError,
+    ArithmeticError,
+    NotImplementedError,
+)
+
+
+class Surrogate(nn.Module):
+    """Latent dynamics, the basis they live in, and where they start.
+
+    Args:
+        dynamics: A network or polynomials, with their statistics.
+        basis: Modes of the soil; as many as the dynamics has.
+        start_positions: Common start of the soil at rest [m], shape (n, 3).
+        body_points: Body points in the body frame [m], shape (M, 3).
+        card: Plain values: frame_rate [Hz], scene, training_range (see `TrainingRange.plain`), slowest_travel (see
+            `sgns.model.features`), and any provenance.
+
+    Attributes:
+        training_range: What the training runs covered; None in a checkpoint from before it was kept.
+        slowest_travel: Of the training runs' tools in a frame [m]; 0 in a checkpoint from before it was kept.
+    """
+
+    basis_mean: Tensor
+    basis_modes: Tensor
+    basis_eigenvalues: Tensor
+    start_positions: Tensor
+    body_points: Tensor
+
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        basis: Basis,
+        start_positions: Tensor,
+        body_points: Tensor,
+        card: dict[str, Any],
+    ) -> None:
+        super().__init__()
+        if basis.num_modes != dynamics.num_modes:
+            raise UserError(
+                f"the basis has {basis.num_modes} modes and the {dynamics.settings.kind} {dynamics.num_modes}; they "
+                "must agree"
+            )
+        self.dynamics = dynamics
+        self.basis = basis
+        state = basis.state()
+        for name in ("mean", "modes", "eigenvalues"):
+            self.register_buffer(f"basis_{name}", state.pop(name))
+        self.register_buffer("start_positions", start_positions.double())
+        self.register_buffer("body_points", body_points.double())
+        known = card.get("training_range")
+        self.training_range = None if known is None else TrainingRange.from_plain(known)
+        if self.training_range is not None:
+            low, high = self.training_range.soil(_MARGIN)
+            dynamics.lowest, dynamics.highest = (
+                torch.as_tensor(bound.reshape(dynamics.num_modes, 3)).to(dynamics.lowest)
+                for bound in (low, high)
+            )
+        self.slowest_travel = float(card.get("slowest_travel", 0.0))
+        if not 0.0 <= self.slowest_travel < math.inf:
+            raise ValueError(f"the slowest travel is {self.slowest_travel}")
+        self.card = dict(card) | {
+            "format": _FORMAT,
+            "format_version": _FORMAT_VERSION,
+            **dynamics.card(),
+            "basis": state,
+        }
+
+    @property
+    def frame_rate(self) -> float:
+        """Steps per second [Hz]."""
+        return float(self.card["frame_rate"])
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint without anything to go on training from."""
+        state = {f"{_PREFIX}{name}": value for name, value in self.state_dict().items()}
+        write_checkpoint({"state_dict": state, "hyper_parameters": self.card}, path)
+
+    @property
+    def start_latent(self) -> Tensor:
+        """The common start in the basis [m], shape (r, 3), float64."""
+        return self.basis.transform(self.start_positions.cpu())
+
+
+def write_checkpoint(content: dict[str, Any], path: Path) -> None:
+    """Write a checkpoint; it appears complete or not at all.
+
+    Raises:
+        OSError: The disk does not take it.
+    """
+    buffer = io.BytesIO()  # torch says of a full disk only that some position is unexpected
+    torch.save(content, buffer)
+    with whole_file(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """A checkpoint's content, with its card under "hyper_parameters".
+
+    Raises:
+        UserError: Missing, truncated, or not a checkpoint of this project, or of a newer one.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(
+            f"no checkpoint at {path}; train one with: sgns train output=<folder>, then use "
+            "<folder>/best.ckpt"
+        )
+    try:
+        _require_plain_archive(path)
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except _UNREADABLE as error:
+        raise UserError(
+            f"{path} cannot be read as a checkpoint; it is truncated or something else; train again"
+        ) from error
+    card = content.get("hyper_parameters") if isinstance(content, dict) else None
+    state = content.get("state_dict") if isinstance(content, dict) else None
+    if not isinstance(card, dict) or card.get("format") != _FORMAT or not isinstance(state, dict):
+        raise UserError(
+            f"{path} is not a checkpoint of sgns; use best.ckpt or last.ckpt of an output of sgns train"
+        )
+    if not isinstance(version := card.get("format_version", 0), int) or version > _FORMAT_VERSION:
+        raise UserError(
+            f"{path} has format {version!r}, newer than this program reads ({_FORMAT_VERSION}); update sgns"
+        )
+    try:
+        _require_tree(card)
+        _require_settings(card.get("settings", {}))
+    except ValueError as error:
+        raise UserError(f"{path} has a card that cannot be used ({error}); train again") from error
+    return content
+
+
+def load_surrogate(path: str | Path) -> Surrogate:
+    """The surrogate in a checkpoint, on the CPU.
+
+    Raises:
+        UserError: As `read_checkpoint`, or its parts do not fit together.
+    """
+    content = read_checkpoint(path)
+    card = content["hyper_parameters"]
+    try:
+        state = {
+            key.removeprefix(_PREFIX): value
+            for key, value in content["state_dict"].items()
+            if key.startswith(_PREFIX)
+        }
+        _require_own_values(state)
+        _require_described(state, card)
+        tensors = {name: state[f"basis_{name}"] for name in ("mean", "modes", "eigenvalues")}
+        basis = Basis.from_state(card["basis"] | tensors, where=str(path))
+        surrogate = Surrogate(dynamics_of(card), basis, state["start_positions"], state["body_points"], card)
+        surrogate.load_state_dict(state)
+        if not 0.0 < surrogate.frame_rate < math.inf:
+            raise ValueError(f"the frame rate is {surrogate.frame_rate} Hz")
+        if not all(bool(value.isfinite().all()) for value in state.values() if value.is_floating_point()):
+            raise ValueError("it holds numbers that are not finite")
+    except UserError as error:
+        raise UserError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    except _UNREADABLE as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(
+            f"{path} is a checkpoint whose parts do not fit together ({reason}); train again"
+        ) from error
+    return surrogate.eval().requires_grad_(False)
+
+
+def _require_plain_archive(path: Path) -> None:
+    """Refuses what `torch.save` does not write: archives with compressed parts, whose size nobody knows before, and
+    the formats of before them."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            parts = archive.infolist()
+            compressed = any(part.compress_type != zipfile.ZIP_STORED for part in parts)
+    except (zipfile.BadZipFile, NotImplementedError) as error:
+        raise ValueError(str(error)) from error
+    if compressed:
+        raise ValueError("its parts are compressed")
+    if sum(part.file_size for part in parts) > path.stat().st_size:
+        raise ValueError("its parts overlap")
+
+
+def _require_tree(card: dict[str, Any]) -> None:
+    """Refuses a card that is not plain values, each in its place, as JSON and YAML hold them.
+
+    Pickles can put a list into itself, or one list into another many times: whoever writes that out never ends.
+    """
+    values = characters = 0
+    unfinished: list[tuple[Any, int]] = [(card, 0)]
+    while unfinished:
+        value, depth = unfinished.pop()
+        values += 1
+        if isinstance(value, str):
+            characters += len(value)
+        elif isinstance(value, (dict, list, tuple)):
+            inside = [*value.keys(), *value.values()] if isinstance(value, dict) else value
+            values += len(inside)
+            unfinished += [(one, depth + 1) for one in inside] if values <= _MOST_VALUES else []
+        elif not (value is None or isinstance(value, (bool, float))) and not (
+            isinstance(value, int) and value.bit_length() < 64
+        ):
+            raise ValueError(f"it holds a {type(value).__name__}")
+        if depth > _DEEPEST:
+            raise ValueError(f"it is nested more than {_DEEPEST} deep, or in itself")
+        if values > _MOST_VALUES or characters > _MOST_TEXT:
+            raise ValueError(f"it stands for more than {_MOST_VALUES} values or {_MOST_TEXT} characters")
+
+
+def _require_settings(settings: Any) -> None:
+    """Refuses settings of a training that the report could not name."""
+    training = settings.get("training", {}) if isinstance(settings, dict) else None
+    runs = settings.get("validation_runs", []) if isinstance(settings, dict) else None
+    if not isinstance(training, dict) or not isinstance(runs, list):
+        raise ValueError("its settings are no group of keys with a group training and a list validation_runs")
+    if not all(isinstance(run, str) for run in runs):
+        raise ValueError("validation_runs are not names")
+    batch = training.get("batch_size", 1)
+    if type(batch) is not int or batch < 1:
+        raise ValueError(f"training.batch_size is {batch!r:.40}")
+
+
+def _require_own_values(state: dict[str, Any]) -> None:
+    """Refuses tensors that claim more values than the file holds, by strides of zero."""
+    for name, value in state.items():
+        if not isinstance(value, Tensor) or value.layout != torch.strided:
+            raise ValueError(f"{name} is not a plain tensor")
+        if value.untyped_storage().nbytes() < value.numel() * value.element_size():
+            raise ValueError(f"{name} claims more values than there are")
+
+
+def _require_described(state: dict[str, Any], card: dict[str, Any]) -> None:
+    """Refuses a card that describes more than there is in the file, before it is built."""
+    model, scene = card["model"], card["scene"]
+    if not isinstance(scene, dict) or not isinstance(scene.get("bed", {}), dict):
+        raise ValueError("its card does not say what the scene is")
+    require_mesh_was_read(scene)
+    if model.get("kind", "network") == "polynomial":
+        inputs, terms = len(card["used"]), state["dynamics.weights"].shape[0]
+        groups = len(state["dynamics.inputs.mean"]) // (3 * int(card["num_modes"]))
+        if (
+            model["history"] > groups
+            or (inputs * (inputs + 1) // 2 if model["degree"] == 2 else inputs) > terms
+        ):
+            raise ValueError("its card describes other polynomials")
+        return
+    for key in ("hidden_layers", "message_passing_steps"):
+        if model[key] > len(state):
+            raise ValueError(f"model.{key} is {model[key]}, but there are {len(state)} tensors")
+    with torch.device("meta"):  # shapes without memory
+        described = dynamics_of(card).state_dict()
+    for name, value in described.items():
+        if state[f"dynamics.{name}"].shape != value.shape:
+            raise ValueError(f"{name} has not the shape {tuple(value.shape)} that its card says")
+
+
+# --- `training.json`, the numbers of a complete training, beside its checkpoint -------------------------
+
+SUMMARY = "training.json"
+_WRONG = "not the summary of a training"
+_ADVICE = "remove it or train again"
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """What the summary in a folder says: at least `seconds` (wall time) and `skill`; of networks `steps`.
+
+    Raises:
+        UserError: It cannot be read, or says something else.
+    """
+    file = folder / SUMMARY
+    summary = read_json(file, _WRONG, _ADVICE)
+    kinds = {"seconds": (int, float), "skill": (int, float), "steps": int}
+    if not isinstance(summary, dict):
+        raise UserError(f"{file} is {_WRONG} (no group of keys); {_ADVICE}")
+    for key, kind in kinds.items():
+        value = summary.get(key, 1 if key == "steps" else None)  # polynomials are fitted without any
+        # The skill is no number where nothing moves; no other may be none.
+        good = isinstance(value, kind) and not isinstance(value, bool)
+        if not good or (key != "skill" and not (key == "steps") <= value < math.inf):
+            raise UserError(f"{file} is {_WRONG} ({key} is {value!r:.40}); {_ADVICE}")
+    return summary

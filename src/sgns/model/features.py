@@ -1,0 +1,342 @@
+"""What the network is told: the graph, the body, the scene's constants, the tool's travel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from numbers import Real
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mpm_warp.poses import rotation_matrices, rotation_vectors
+from sgns.config import UserError
+
+if TYPE_CHECKING:
+    from sgns.reduction.reduce import ReducedRun
+
+
+# --- The graph the network sees: one node per mode, one or more for the body, and edges between them ----
+# Shapes: B batch, V nodes, E edges, d history positions, r modes.
+
+EDGES = ("complete", "star")
+
+
+class Graph(NamedTuple):
+    """A batch of graphs that share one set of edges.
+
+    Attributes:
+        nodes: Node features [1], shape (B, V, node features).
+        edges: Edge features [1], shape (B, E, 3 or 4).
+        edge_index: Sender and receiver of every edge, shape (2, E).
+    """
+
+    nodes: Tensor
+    edges: Tensor
+    edge_index: Tensor
+
+
+def edge_indices(
+    modes: int,
+    body_nodes: int,
+    edges: str = "complete",
+    self_loops: bool = False,
+    device: torch.device | str = "cpu",
+) -> Tensor:
+    """The edges between modes, which come first, and body nodes, receivers ascending.
+
+    Args:
+        modes: r.
+        body_nodes: N.
+        edges: "complete", every ordered pair of different nodes; "star", only those with one mode and one body node.
+        self_loops: Whether every node has an edge to itself.
+        device: Where the indices live.
+
+    Returns:
+        Senders in row 0 and receivers in row 1 (PyG's order), int64, shape (2, E).
+    """
+    index = torch.arange(modes + body_nodes, device=device)
+    receiver, sender = torch.meshgrid(index, index, indexing="ij")
+    keep = receiver != sender if edges == "complete" else (receiver < modes) != (sender < modes)
+    if self_loops:
+        keep = keep | (receiver == sender)
+    return torch.stack([sender[keep], receiver[keep]])
+
+
+def build_graph(
+    mode_features: Tensor,
+    body_features: Tensor,
+    position: Tensor,
+    edge_index: Tensor,
+    edge_length: bool = True,
+) -> Graph:
+    """Put features on the nodes and edges.
+
+    The narrower kind of node is padded with zeros so that one encoder serves both. An edge holds the sender's position
+    relative to the receiver's, and its length.
+
+    Args:
+        mode_features: Of the modes [1], shape (B, r, any).
+        body_features: Of the body nodes [1], shape (B, N, any).
+        position: Of all nodes, modes first, in the unit of edges [1], shape (B, V, 3).
+        edge_index: Senders and receivers, shape (2, E).
+        edge_length: Whether edges hold their length.
+
+    Returns:
+        The graph with modes first and body nodes last.
+    """
+    width = max(mode_features.shape[-1], body_features.shape[-1])
+    nodes = torch.cat(
+        [
+            torch.nn.functional.pad(part, (0, width - part.shape[-1]))
+            for part in (mode_features, body_features)
+        ],
+        dim=-2,
+    )
+    sender, receiver = edge_index
+    edges = position.index_select(-2, sender) - position.index_select(-2, receiver)
+    if edge_length:
+        edges = torch.cat([edges, torch.linalg.vector_norm(edges, dim=-1, keepdim=True)], dim=-1)
+    return Graph(nodes, edges, edge_index)
+
+
+# --- What the network is told about the body: where it is and how it moves, frame by frame --------------
+# A tool's motion is prescribed. A wheel's height follows from the soil: of the node "pose" the network then predicts
+# the height, of the nodes "points" everything.
+#
+# Shapes: T frames, M body points, N body nodes (1 for "pose", M for "points"), K motion components (6 or 3).
+
+BODY_NODES = ("pose", "points")
+
+
+class BodyTrack(NamedTuple):
+    """The body along a path.
+
+    Attributes:
+        position: Centre of mass, or the points [m], shape (..., T, N, 3).
+        orientation: First two columns of the rotation matrix, body -> world [1], shape (..., T, N, 6); for
+            "points", which show it themselves, shape (..., T, N, 0).
+        motion: Movement since the previous frame, zero in the first: displacement [m], followed for "pose" by
+            the rotation vector [rad]; shape (..., T, N, K).
+    """
+
+    position: Tensor
+    orientation: Tensor
+    motion: Tensor
+
+    def frames(self, index: slice | Tensor) -> BodyTrack:
+        """The track at some frames."""
+        return BodyTrack(*(part[..., index, :, :] for part in self))
+
+    def displaced(self, offset: Tensor) -> BodyTrack:
+        """The track with offsets [m] of its positions, shape (..., T + 1, N, 3): those of the frame before the first
+        and of every frame. Motions follow."""
+        motion = self.motion.clone()
+        motion[..., :3] += offset.diff(dim=-3)
+        return self._replace(position=self.position + offset[..., 1:, :, :], motion=motion)
+
+    def moved_last(self, displacement: Tensor) -> BodyTrack:
+        """The track whose last frame lies a displacement [m] (..., N, 3) from the one before."""
+        position = torch.cat(
+            [self.position[..., :-1, :, :], (self.position[..., -2, :, :] + displacement).unsqueeze(-3)],
+            dim=-3,
+        )
+        last = torch.cat([displacement, self.motion[..., -1, :, 3:]], dim=-1).unsqueeze(-3)
+        return self._replace(position=position, motion=torch.cat([self.motion[..., :-1, :, :], last], dim=-3))
+
+
+def body_track(poses: np.ndarray, points: np.ndarray | None, body_nodes: str) -> BodyTrack:
+    """Describe a path as the network sees it.
+
+    Args:
+        poses: Centre of mass [m] and unit quaternion x, y, z, w, shape (T, 7).
+        points: Body points in the world frame [m], shape (T, M, 3); only read for "points".
+        body_nodes: "pose" (one node) or "points" (one node per point).
+
+    Returns:
+        The track, float64.
+    """
+    if body_nodes == "points":
+        if points is None or points.shape[1] == 0:
+            raise UserError(
+                "model.body_nodes=points needs body points and the runs have none; use model.body_nodes=pose"
+            )
+        position = torch.as_tensor(np.array(points, dtype=np.float64))
+        motion = torch.zeros_like(position)
+        motion[1:] = position[1:] - position[:-1]
+        return BodyTrack(position, position[..., :0], motion)
+    poses = np.asarray(poses, dtype=np.float64)
+    columns = rotation_matrices(poses[:, 3:])[:, :, :2]
+    motion = np.zeros((len(poses), 6))
+    motion[1:, :3] = poses[1:, :3] - poses[:-1, :3]
+    motion[1:, 3:] = rotation_vectors(poses[:-1, 3:], poses[1:, 3:])
+    return BodyTrack(
+        torch.tensor(poses[:, None, :3]),
+        torch.tensor(columns.transpose(0, 2, 1).reshape(len(poses), 1, 6)),
+        torch.tensor(motion[:, None]),
+    )
+
+
+def free_axes(predicted: bool, body_nodes: str) -> Tensor:
+    """Which axes of a body node's position the network predicts, shape (3,) of ones and zeros.
+
+    Of a predicted body the node "pose" has a free height, as the axle of a wheel that is driven along a prescribed
+    way; "points" are free particles that know of no way.
+    """
+    if not predicted:
+        return torch.zeros(3, dtype=torch.float64)
+    return torch.tensor([0.0, 0.0, 1.0] if body_nodes == "pose" else [1.0, 1.0, 1.0], dtype=torch.float64)
+
+
+def nearest_rigid(reference: Tensor, points: Tensor) -> Tensor:
+    """The rigidly moved reference that lies nearest to some points (Kabsch 1976), in the sense of least squares.
+
+    Args:
+        reference: Points of the body in any one pose [m], shape (..., M, 3).
+        points: Where they are said to be [m], shape (..., M, 3).
+
+    Returns:
+        Shape (..., M, 3); not finite where the points are not.
+    """
+    here, there = reference.mean(-2, keepdim=True), points.mean(-2, keepdim=True)
+    product = (reference - here).transpose(-1, -2) @ (points - there)
+    # The decomposition fails where one of many is not finite; there `there` is not finite either, and what comes out.
+    sound = product.isfinite().flatten(-2).all(-1)[..., None, None]
+    u, _, vh = torch.linalg.svd(torch.where(sound, product, 0.0))
+    # A reflection is no motion: turn the direction of least extent round.
+    flip = torch.ones_like(u[..., 0])
+    flip[..., 2] = torch.sign(torch.linalg.det(u @ vh))
+    return (reference - here) @ ((u * flip.unsqueeze(-2)) @ vh) + there
+
+
+# --- Constants of a run that the tool's path does not show: gravity, load, the friction angle of the soil,
+
+
+def varying_context(runs: Sequence[ReducedRun], candidates: Sequence[str]) -> list[str]:
+    """Those of the candidates, keys of the scene such as `load` or `material.friction_angle`, whose numbers differ
+    between runs: a constant tells nothing."""
+    values = {key: [_value(run.scene, key) for run in runs] for key in candidates}
+    numbers = {
+        key: found for key, found in values.items() if all(v is not None and math.isfinite(v) for v in found)
+    }
+    return [key for key, found in numbers.items() if len(set(found)) > 1]
+
+
+def context_of(scene: Mapping[str, Any], keys: Sequence[str]) -> np.ndarray:
+    """The numbers of a scene by their keys, in the units of the scene, shape (K,).
+
+    Raises:
+        UserError: The scene lacks one, or it is not finite.
+    """
+    values = [_value(scene, key) for key in keys]
+    if None in values:
+        raise UserError(
+            f"the scene has no number {keys[values.index(None)]}, which this network needs; "
+            f"it was trained with different values of {', '.join(keys)}"
+        )
+    for key, value in zip(keys, values, strict=True):
+        if not math.isfinite(value):
+            raise UserError(f"the scene's {key} is {value}; it must be finite")
+    return np.array(values, dtype=np.float64)
+
+
+def _value(scene: Mapping[str, Any], key: str) -> float | None:
+    found: Any = scene
+    for part in key.split("."):
+        found = found.get(part) if isinstance(found, Mapping) else None
+    return float(found) if isinstance(found, Real) and not isinstance(found, bool) else None
+
+
+# --- Slow dry soil follows the way a tool travels, not the time that it takes ---------------------------
+# Dynamics learn from tools that move by so much per frame, and in every step they err a little: along a
+# path much slower
+# than that, or at rest, the errors of thousands of steps add up to soil that flows on its own. There the soil takes a
+# step only each time that the tool has travelled as far as the slowest trained one does in a frame.
+#
+# Shapes: T frames, M body points.
+
+# A tool that moves less than this in a frame [m] rests: round-off of poses, not motion.
+_STILL = 1e-9
+# Of the training frames in which the tool moves this share may be slower than what is called the slowest: tools stop
+# within a frame. As it is found again in paths of the same kind, it is lowered by more than round-off.
+_STOPPING, _ROUNDING = 0.01, 0.01
+
+
+class Travel(NamedTuple):
+    """How a tool has moved, as far as the next step of the soil depends on it.
+
+    Attributes:
+        least: How far it moves in a frame at least that is not called slow [m].
+        settling: Frames that the soil follows the clock after that: what was thrown up comes down.
+        here: Where its markers are (see `markers`) [m], shape (M + 1, 3).
+        stepped: Where they were when the soil took its last step.
+        slow: Frames since it was last not slow.
+        steps: Whether the soil takes a step into this frame.
+    """
+
+    least: float
+    settling: int
+    here: np.ndarray
+    stepped: np.ndarray
+    slow: int
+    steps: bool
+
+    @classmethod
+    def along(cls, given: np.ndarray, least: float, settling: int) -> Travel:
+        """In the last of some given frames of markers (any, M + 1, 3), before which it rested."""
+        travel = cls(max(least, _STILL), settling, given[0], given[0], settling, True)
+        for here in given[1:]:
+            travel = travel.moved(here)
+        return travel._replace(stepped=given[-1], steps=True)
+
+    def moved(self, here: np.ndarray) -> Travel:
+        """One frame later."""
+        slow = 0 if distance(here, self.here) >= self.least else self.slow + 1
+        steps = slow < self.settling or bool(distance(here, self.stepped) >= self.least)
+        return self._replace(here=here, stepped=here if steps else self.stepped, slow=slow, steps=steps)
+
+
+def stepped_frames(path: np.ndarray, given: int, least: float, settling: int) -> np.ndarray:
+    """Numbers of the frames of a path that the soil takes a step into, and before them of those that are given.
+
+    Args:
+        path: Markers [m], shape (T, M + 1, 3).
+        given: Frames at the start that are given: 1 for a bed at rest, or d.
+        least: See `Travel`.
+        settling: See `Travel`.
+    """
+    travel = Travel.along(path[:given], least, settling)
+    if (distance(path[given:], path[given - 1 : -1]) >= travel.least).all():
+        return np.arange(len(path))  # as most paths; one by one it takes as long as the steps of many paths
+    frames = list(range(given))
+    for t in range(given, len(path)):
+        travel = travel.moved(path[t])
+        if travel.steps:
+            frames.append(t)
+    return np.array(frames)
+
+
+def markers(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """What shows how far a tool moves: its centre of mass and its points, shape (T, M + 1, 3).
+
+    Args:
+        poses: Shape (T, 7).
+        points: World frame [m], shape (T, M, 3).
+    """
+    return np.concatenate([np.asarray(poses)[:, None, :3], points], axis=1)
+
+
+def distance(here: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Of the marker that is furthest from where it was [m], shape (...); markers of shape (..., M + 1, 3)."""
+    with np.errstate(over="ignore"):  # of a tool that is nowhere
+        return np.sqrt(np.square(here - there).sum(axis=-1).max(axis=-1))
+
+
+def slowest_travel(runs: Sequence[ReducedRun]) -> float:
+    """Distance that the tool moves at least in a frame while it moves in some runs [m]; 0 if it never does."""
+    paths = [markers(run.pose, run.body_points) for run in runs]
+    moved = np.concatenate([distance(path[1:], path[:-1]) for path in paths])
+    moving = moved[moved > _STILL]
+    return (1 - _ROUNDING) * float(np.quantile(moving, _STOPPING)) if len(moving) else 0.0

@@ -1,0 +1,455 @@
+"""Latent dynamics as a graph network."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from sgns.model.dynamics import Dynamics, Path, Prediction, Step, unrolled
+from sgns.model.fast_step import GraphStepper
+from sgns.model.features import BodyTrack, build_graph, edge_indices, free_axes, nearest_rigid
+from sgns.model.network import EncodeProcessDecode, Standardiser
+from sgns.model.settings import ModelSettings
+
+# --- The dynamics of the latent soil around a body as a graph network: history and next tool motion in, nex
+# force out.
+#
+# Shapes: B batch, d history positions, r modes, N body nodes, V = r + N nodes, K context numbers, T frames.
+
+
+class LatentDynamics(Dynamics):
+    """Graph network on modes and body nodes, with the statistics that make its inputs and outputs of order
+    one.
+
+    Args:
+        settings: What to build.
+        num_modes: r.
+        context: Keys of the scene whose numbers every node is told, K of them.
+        predicts_body: Whether the body moves as the soil lets it (see `free_axes`).
+    """
+
+    settings: ModelSettings
+    free: Tensor
+
+    def __init__(
+        self,
+        settings: ModelSettings,
+        num_modes: int,
+        context: tuple[str, ...] = (),
+        predicts_body: bool = False,
+    ) -> None:
+        super().__init__(settings, num_modes, context, predicts_body)
+        pose = settings.body_nodes == "pose"
+        motion = 6 if pose else 3
+        place = 3 if settings.positions else 0
+        motions = settings.history if settings.next_motion else settings.history - 1
+        mode_width = place + 3 * (settings.history - 1)
+        body_width = place + (6 if pose else 0) + motion * motions
+        # A learned vector for each mode, or one for all of them, and one for the body's nodes.
+        kinds = num_modes if settings.identity == "mode" else 1
+        self.identity = nn.Embedding(kinds + 1, settings.identity_width)
+        self.network = EncodeProcessDecode(
+            max(mode_width, body_width) + settings.identity_width + len(context),
+            4 if settings.edge_length else 3,
+            9 if settings.torque else 6,
+            settings.hidden_width,
+            settings.hidden_layers,
+            settings.message_passing_steps,
+            settings.layer_norm,
+            settings.residual,
+            settings.activation,
+        )
+        self.position = Standardiser.empty(num_modes, 3)
+        self.velocity = Standardiser.empty(num_modes, 3)
+        self.change = Standardiser.empty(num_modes, 3)
+        self.body_position = Standardiser.empty(3)
+        self.body_orientation = Standardiser.empty(6 if pose else 0)
+        self.body_motion = Standardiser.empty(motion)
+        self.body_change = Standardiser.empty(3)
+        self.force = Standardiser.empty(3)
+        self.torque = Standardiser.empty(3)
+        self.context = Standardiser.empty(len(context))
+        self.register_buffer("free", free_axes(predicts_body, settings.body_nodes), persistent=False)
+        self._edges: dict[tuple[int, torch.device], Tensor] = {}
+
+    def with_modes(self, num_modes: int) -> LatentDynamics:
+        """The same network on the first modes only; the weights are shared.
+
+        Raises:
+            UserError: More modes than it was trained with.
+        """
+        self.check_modes(num_modes)
+        fewer = copy.copy(self)
+        fewer._modules = dict(self._modules)
+        fewer.num_modes, fewer._edges = num_modes, {}
+        for name in ("position", "velocity", "change"):
+            whole = getattr(self, name)
+            setattr(fewer, name, Standardiser(whole.mean[:num_modes], whole.scale[:num_modes]))
+        if self.settings.identity == "mode":
+            weight = torch.cat([self.identity.weight[:num_modes], self.identity.weight[-1:]])
+            fewer.identity = nn.Embedding.from_pretrained(weight, freeze=False)
+        return fewer
+
+    def forward(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Prediction:
+        """Predict one step of every window in a batch.
+
+        Args:
+            latent: The last d latent positions, oldest first [m], float64, shape (B, d, r, 3).
+            body: The d frames that end with the *next* one, the frame to be predicted; (B, d, N, ...). Where it is
+                then, and how it gets there along the free axes, is not looked at.
+            context: Numbers of the runs, shape (B, K); not needed when K is 0.
+        """
+        modes, nodes = latent.shape[-2], body.position.shape[-2]
+        edge_index = self.edge_index(modes, nodes, latent.device)
+        graph = build_graph(
+            self._mode_features(latent),
+            self.body_features(body),
+            self._edge_positions(latent[:, -1], body.position[:, -2]),
+            edge_index,
+            self.settings.edge_length,
+        )
+        told = self.told(modes, nodes, latent.shape[0], context)
+        return self.read(self.network(torch.cat([graph.nodes, told], dim=-1), graph.edges, edge_index))
+
+    def read(self, decoded: Tensor) -> Prediction:
+        """The prediction in what the network decodes, shape (B, V, 6 or 9)."""
+        force = decoded[..., 3:6]
+        torque = decoded[..., 6:] if self.settings.torque else torch.zeros_like(force)
+        if self.settings.force == "mean":
+            force, torque = force / decoded.shape[-2], torque / decoded.shape[-2]
+        return Prediction(decoded[..., :3], force, torque)
+
+    def _mode_features(self, latent: Tensor) -> Tensor:
+        """Past velocities of the modes, and where they are: the bed does not move with the tool, so that places
+        matter. Shape (B, r, any)."""
+        velocity = self.velocity.normalise(latent[:, 1:] - latent[:, :-1]).permute(0, 2, 1, 3).flatten(2)
+        if not self.settings.positions:
+            return velocity
+        return torch.cat([self.position.normalise(latent[:, -1]), velocity], dim=-1)
+
+    def body_features(self, body: BodyTrack) -> Tensor:
+        """Place, past motions and what is prescribed of the next one, shape (B, N, any)."""
+        motion = self.body_motion.normalise(body.motion)
+        if not self.settings.next_motion:
+            motion = motion[:, :-1]
+        elif self.predicts_body:
+            known = torch.nn.functional.pad(1.0 - self.free, (0, motion.shape[-1] - 3), value=1.0)
+            motion = torch.cat([motion[:, :-1], motion[:, -1:] * known.float()], dim=1)
+        parts = [
+            self.body_orientation.normalise(body.orientation[:, -2]),
+            motion.permute(0, 2, 1, 3).flatten(2),
+        ]
+        if self.settings.positions:
+            parts.insert(0, self.body_position.normalise(body.position[:, -2]))
+        return torch.cat(parts, dim=-1)
+
+    def _edge_positions(self, modes: Tensor, body: Tensor) -> Tensor:
+        """Positions of all nodes in the unit of the edges' features, shape (B, V, 3)."""
+        if self.settings.edge_scale is not None:
+            return (torch.cat([modes, body], dim=-2) / self.settings.edge_scale).float()
+        return torch.cat([self.position.normalise(modes), self.body_position.normalise(body)], dim=-2)
+
+    def told(self, modes: int, nodes: int, batch: int, context: Tensor | None) -> Tensor:
+        """What every node is told besides: who it is, and the context; shape (B, V, any)."""
+        weight = self.identity.weight
+        own = weight[:-1] if self.settings.identity == "mode" else weight[:1].expand(modes, -1)
+        told = torch.cat([own, weight[-1:].expand(nodes, -1)]).expand(batch, -1, -1)
+        if not self.context_keys:
+            return told
+        numbers = self.context.normalise(self.known_context(context))[:, None].expand(-1, modes + nodes, -1)
+        return torch.cat([told, numbers], dim=-1)
+
+    def force_contributions(self, prediction: Prediction) -> tuple[Tensor, Tensor]:
+        """Force [N] and torque [N m] that each node adds; their sums over nodes are the force and the torque.
+
+        Every node carries 1/V of the mean, so that the sum, not the average, is the physical quantity.
+
+        Returns:
+            Two float64 tensors of shape (B, V, 3).
+        """
+        count = prediction.force.shape[-2]
+        return tuple(
+            part.double() * standard.scale + standard.mean / count
+            for part, standard in ((prediction.force, self.force), (prediction.torque, self.torque))
+        )  # type: ignore[return-value]
+
+    def advance(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Step:
+        """Take one step: z+ = z + (z - z-) + a, or z + v. A predicted body of points stays rigid if it is to.
+
+        Args:
+            latent: As for `forward`.
+            body: As for `forward`.
+            context: As for `forward`.
+        """
+        return self.stepped(self(latent, body, context), latent, body)
+
+    def stepped(self, prediction: Prediction, latent: Tensor, body: BodyTrack) -> Step:
+        """The step of a prediction, a predicted body of points kept rigid if it is to be."""
+        step = self.taken(prediction, latent, body)
+        if self.predicts_body and self.settings.rigid and self.settings.body_nodes == "points":
+            here = body.position[:, -2]
+            step = step._replace(displacement=nearest_rigid(here, here + step.displacement) - here)
+        return step
+
+    def taken(self, prediction: Prediction, latent: Tensor, body: BodyTrack) -> Step:
+        """The step of a prediction, as it is."""
+        force, torque = self.force_contributions(prediction)
+        following = latent[:, -1] + self.change.denormalise(prediction.change[:, : self.num_modes])
+        if self.settings.predicts == "acceleration":
+            following = following + (latent[:, -1] - latent[:, -2])
+        following = torch.clamp(following, *self.reach())
+        displacement = body.motion[:, -1, :, :3]
+        if self.predicts_body:
+            displacement = torch.where(self.free > 0, self.body_displacement(prediction, body), displacement)
+        return Step(following, force.sum(-2), torque.sum(-2), displacement)
+
+    def latent_statistics(self) -> tuple[Tensor, Tensor]:
+        """As for all `Dynamics`."""
+        return self.position.mean, self.position.scale
+
+    def body_displacement(self, prediction: Prediction, body: BodyTrack) -> Tensor:
+        """How the body nodes move in the network's eyes [m], on all axes, shape (B, N, 3)."""
+        change = self.body_change.denormalise(prediction.change[:, self.num_modes :])
+        return change + body.motion[:, -2, :, :3] if self.settings.predicts == "acceleration" else change
+
+    def stepper(self, body_points: int, context: Tensor | None = None) -> PathStepper:
+        """As for all `Dynamics`, but much faster than `advance`."""
+        return PathStepper(self, 1 if self.settings.body_nodes == "pose" else body_points, context)
+
+    def unroll(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Path:
+        """As for all `Dynamics`; one path alone by the fast stepper."""
+        if latent.shape[0] > 1 or torch.is_grad_enabled():
+            return super().unroll(latent, body, context)
+        stepper = self.stepper(body.position.shape[-2], context)
+        if self.predicts_body:
+            return unrolled(stepper.advance, latent, body, self.predicts_body)
+        d, frames = self.history, body.position.shape[1]
+        states = torch.empty((1, frames, *latent.shape[2:]), dtype=torch.float64, device=latent.device)
+        states[:, :d] = latent
+        force = torch.zeros((1, frames, 3), dtype=torch.float64, device=latent.device)
+        torque = torch.zeros_like(force)
+        loads = stepper.follow(states[0], body)
+        force[0, d:] = loads[:, :3]
+        torque[0, d:] = loads[:, 3:] if self.settings.torque else self.torque.mean
+        return Path(states, force, torque, body)
+
+    def edge_index(self, modes: int, body_nodes: int, device: torch.device) -> Tensor:
+        """Senders and receivers, made once."""
+        key = (body_nodes, device)
+        if key not in self._edges:
+            # What is made in inference mode could not be trained with later.
+            with torch.inference_mode(False):
+                self._edges[key] = edge_indices(
+                    modes, body_nodes, self.settings.edges, self.settings.self_loops, device
+                )
+        return self._edges[key]
+
+
+# --- One path, stepped quickly: the features of `LatentDynamics` written into kept memory, the network by
+# `GraphStepper`.
+#
+# Shapes: d history positions, r modes, N body nodes, V = r + N nodes, E edges, T frames, W = T - d + 1 windows.
+
+# A body whose nodes keep their places among themselves to this share of the positions' unit has only been shifted.
+_SHIFTED = 1e-6
+
+
+class Known(NamedTuple):
+    """What is known of the body, for every window.
+
+    Attributes:
+        features: Of its nodes [1], shape (W, N, any).
+        places: Of its nodes in the unit of the edges' features [1], float64, shape (W, N, 3).
+    """
+
+    features: Tensor
+    places: Tensor
+
+
+class Memory(NamedTuple):
+    """What is kept from one step to the next; never overwritten, only replaced.
+
+    Attributes:
+        shape: Places of the body's nodes from its first when the edges within it were last computed [1], shape (N, 3).
+        kept: What was computed of these edges (see `GraphStepper`), shape (N, any, H).
+    """
+
+    shape: Tensor | None
+    kept: Tensor | None
+
+
+class PathStepper:
+    """`LatentDynamics.advance` and `unroll` for one path and without gradients; to rounding (1e-6) the same.
+
+    Copies, pickled ones too, are built anew from the dynamics as they are then (see `GraphStepper`) and go on to the
+    bit as this one does.
+
+    Args:
+        dynamics: Its weights and statistics are copied.
+        body_nodes: N.
+        context: Numbers of the run, shape (1, K); not needed when K is 0.
+    """
+
+    def __init__(self, dynamics: LatentDynamics, body_nodes: int, context: Tensor | None = None) -> None:
+        self.arguments = dynamics, body_nodes, context
+        self.dynamics = dynamics
+        network, r = dynamics.network, dynamics.num_modes
+        count = r + body_nodes
+        self.edge_index = dynamics.edge_index(r, body_nodes, dynamics.force.mean.device)
+        self.graph: GraphStepper | None = None
+        with torch.inference_mode():
+            if GraphStepper.covers(network):
+                self.graph = GraphStepper(network, self.edge_index, count, body_nodes)
+            self.prepare_features(dynamics.told(r, body_nodes, 1, context)[0])
+            self.prepare_outputs()
+        self.reset()
+
+    def __getstate__(self) -> tuple[tuple[Any, ...], Memory]:
+        return self.arguments, self.memory
+
+    def __setstate__(self, state: tuple[tuple[Any, ...], Memory]) -> None:
+        arguments, memory = state
+        PathStepper.__init__(self, *arguments)
+        self.memory = memory
+
+    @property
+    def memory(self) -> Memory:
+        """All that a step depends on of those before it, besides what it is given."""
+        return Memory(self.shape, None if self.graph is None else self.graph.kept)
+
+    @memory.setter
+    def memory(self, memory: Memory) -> None:
+        self.shape = memory.shape
+        if self.graph is not None:
+            self.graph.kept = memory.kept
+
+    def reset(self) -> None:
+        """Forget the shape of the body seen last: what follows does not depend on what was stepped before."""
+        self.shape: Tensor | None = None
+
+    def prepare_features(self, told: Tensor) -> None:
+        """Memory of the network's inputs; what the nodes are told once, shape (V, any), stays in it."""
+        dynamics, settings = self.dynamics, self.dynamics.settings
+        r, d = dynamics.num_modes, dynamics.history
+        first, count = dynamics.network.encode_nodes.first, len(told)
+        self.nodes = told.new_zeros(count, first.in_features)
+        self.nodes[:, first.in_features - told.shape[1] :] = told
+        place = 3 if settings.positions else 0
+        columns = self.nodes[:r, place : place + 3 * (d - 1)]
+        self.velocity_features = columns.unflatten(1, (d - 1, 3)).transpose(0, 1)
+        self.velocity = dynamics.velocity.mean.new_empty(d - 1, r, 3)
+        # Positions of all nodes and, as a product with them, of every edge's sender relative to its receiver.
+        self.positions = told.new_empty(count, 3)
+        self.mode_positions, self.places = self.positions[:r], self.positions[r:]
+        self.position_features = self.nodes[:r, :3] if settings.positions else None
+        self.body_rows = self.nodes[r:]
+        self.velocity_mean, self.velocity_scale = dynamics.velocity.mean, dynamics.velocity.scale
+        self.position_mean, self.position_scale = dynamics.position.mean, dynamics.position.scale
+        self.edge_scale, self.edge_length = settings.edge_scale, settings.edge_length
+        sender, receiver = torch.nn.functional.one_hot(self.edge_index, count).to(told)
+        self.difference = sender - receiver
+        edges = told.new_empty(4 if settings.edge_length else 3, len(sender))
+        self.edges, self.relative, self.length = edges.t(), edges[:3].t(), edges[3:].flatten()
+        self.squares = edges.new_empty(3, len(sender))
+
+    def prepare_outputs(self) -> None:
+        """Units of what the network decodes: the sum over nodes of forces and torques side by side."""
+        dynamics = self.dynamics
+        share = len(self.nodes) if dynamics.settings.force == "mean" else 1
+        loads = [dynamics.force, *([dynamics.torque] if dynamics.settings.torque else [])]
+        self.load_scale = torch.cat([load.scale for load in loads]) / share
+        self.load_mean = torch.cat([load.mean for load in loads])
+        self.change_mean, self.change_scale = dynamics.change.mean, dynamics.change.scale
+        self.accelerates = dynamics.settings.predicts == "acceleration"
+        self.nearest, self.furthest = dynamics.reach()
+
+    def known(self, body: BodyTrack) -> Known:
+        """What is known of the body (1, T, N, ...) in each of its windows of d frames."""
+        d, dynamics = self.dynamics.history, self.dynamics
+        windows = BodyTrack(*(part[0].unfold(0, d, 1).movedim(-1, 1) for part in body))
+        places = windows.position[:, -2]
+        if dynamics.settings.edge_scale is None:
+            places = (places - dynamics.body_position.mean) / dynamics.body_position.scale
+        else:
+            places = places / dynamics.settings.edge_scale
+        return Known(dynamics.body_features(windows), places)
+
+    def has_only_shifted(self, places: Tensor) -> bool:
+        """Whether the body's nodes (N, 3) lie to each other as they last did when this was not so."""
+        shape = places - places[0]
+        if self.shape is not None and float((shape - self.shape).abs().max()) <= _SHIFTED:
+            return True
+        self.shape = shape
+        return False
+
+    def decoded(self, latent: Tensor, features: Tensor, places: Tensor) -> Tensor:
+        """What the network says, shape (V, 6 or 9); overwritten by the next call.
+
+        Args:
+            latent: Shape (d, r, 3).
+            features: Of the body nodes, shape (N, any).
+            places: Of the body nodes, shape (N, 3).
+        """
+        newest = latent[-1]
+        torch.sub(latent[1:], latent[:-1], out=self.velocity)
+        torch.div(self.velocity - self.velocity_mean, self.velocity_scale, out=self.velocity_features)
+        position = (newest - self.position_mean).div_(self.position_scale)
+        if self.position_features is not None:
+            self.position_features.copy_(position)
+        self.mode_positions.copy_(position if self.edge_scale is None else newest / self.edge_scale)
+        self.places.copy_(places)
+        self.body_rows[:, : features.shape[1]].copy_(features)
+        torch.mm(self.difference, self.positions, out=self.relative)
+        if self.edge_length:
+            torch.mul(self.relative.t(), self.relative.t(), out=self.squares)
+            torch.sum(self.squares, 0, out=self.length).sqrt_()
+        if self.graph is None:
+            return self.dynamics.network(self.nodes[None], self.edges[None], self.edge_index)[0]
+        same_body = len(places) > 1 and self.has_only_shifted(places)
+        return self.graph(self.nodes, self.edges, same_body)
+
+    def outcome(self, decoded: Tensor, latent: Tensor) -> tuple[Tensor, Tensor]:
+        """Next latent positions [m] (r, 3), and force [N] and torque [N m] side by side, (6,) or (3,)."""
+        following = decoded[: len(self.change_scale), :3] * self.change_scale
+        following.add_(self.change_mean).add_(latent[-1])
+        if self.accelerates:
+            following.add_(self.velocity[-1])
+        torch.clamp(following, self.nearest, self.furthest, out=following)
+        return following, decoded[:, 3:].sum(0, dtype=torch.float64).mul_(self.load_scale).add_(
+            self.load_mean
+        )
+
+    def advance(self, latent: Tensor, body: BodyTrack) -> Step:
+        """One step; latent (1, d, r, 3), body (1, d, N, ...) as for `LatentDynamics.forward`."""
+        with torch.inference_mode():
+            known = self.known(body)
+            decoded = self.decoded(latent[0], known.features[0], known.places[0])
+            if self.dynamics.predicts_body:
+                return self.dynamics.stepped(self.dynamics.read(decoded[None]), latent, body)
+            following, load = self.outcome(decoded, latent[0])
+            torque = load[3:] if self.dynamics.settings.torque else self.dynamics.torque.mean
+            return Step(following[None], load[None, :3], torque[None], body.motion[:, -1, :, :3])
+
+    def follow(self, states: Tensor, body: BodyTrack) -> Tensor:
+        """Steps along a prescribed body.
+
+        Args:
+            states: Latent positions [m], float64, shape (T, r, 3), whose first d frames are given; filled.
+            body: Shape (1, T, N, ...).
+
+        Returns:
+            Force [N] and torque [N m] of frames d to T - 1, shape (T - d, 6), or (T - d, 3) of a network without
+            torque.
+        """
+        d = self.dynamics.history
+        self.reset()
+        with torch.inference_mode():
+            known = self.known(body)
+            loads = self.load_mean.new_empty(len(states) - d, len(self.load_mean))
+            for k, (features, places) in enumerate(zip(known.features[1:], known.places[1:], strict=True)):
+                latent = states[k : k + d]
+                states[k + d], loads[k] = self.outcome(self.decoded(latent, features, places), latent)
+            return loads

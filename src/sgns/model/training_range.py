@@ -1,0 +1,185 @@
+"""How far a path leaves what the training runs covered: a network answers there, too, but nobody has taught it.
+
+Letters: T frames, M body points, r modes, K context numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sgns.model.features import body_track, context_of
+
+if TYPE_CHECKING:
+    from sgns.reduction.reduce import ReducedRun
+
+
+NOTEWORTHY = 0.05
+"""Excess above which a path is called unlike the training runs; held-out runs of the same kind stay below it
+(experiments/stability/)."""
+# A component that varies less than the others of its quantity is given this share of their range as its own.
+_FLOOR = 0.1
+_AXES = ("x", "y", "z")
+_POINTS = "the number of the tool's points"
+_SOIL = "the soil's state"
+
+
+class Excess(NamedTuple):
+    """How far every frame lies outside the training range.
+
+    Attributes:
+        amount: Distance of the worst quantity from its range, in widths of that range [1], shape (T,); 0 inside.
+        quantity: Its name in every frame, T of them.
+    """
+
+    amount: np.ndarray
+    quantity: list[str]
+
+    @property
+    def largest(self) -> float:
+        """Over all frames [1]; NaN where a frame is not finite."""
+        return float(self.amount.max())
+
+    def words(self) -> str:
+        """Where a noteworthy excess begins and what it is at its largest; nothing if there is none."""
+        beyond = ~(self.amount <= NOTEWORTHY)
+        if not beyond.any():
+            return ""
+        worst = int(self.amount.argmax())
+        return (
+            f"from frame {int(beyond.argmax())} on the path is unlike the training runs; at frame {worst} "
+            f"{self.quantity[worst]} is {self.amount[worst]:.2g} times its training range outside of it"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingRange:
+    """Smallest and largest values of tool, soil and context in the training runs.
+
+    Attributes:
+        low: Quantity -> smallest value of every component [its unit].
+        high: Quantity -> largest value, likewise.
+    """
+
+    low: dict[str, np.ndarray]
+    high: dict[str, np.ndarray]
+
+    @classmethod
+    def of(
+        cls, runs: Sequence[ReducedRun], num_modes: int, context: Sequence[str], points: bool = False
+    ) -> TrainingRange:
+        """Of the first modes of some runs, and of the numbers of their scenes that the dynamics are told.
+
+        Args:
+            runs: The training runs.
+            num_modes: r.
+            context: Keys of the scene.
+            points: Whether the dynamics see the body's points, so that their number counts, too.
+        """
+        low: dict[str, np.ndarray] = {}
+        high: dict[str, np.ndarray] = {}
+        for run in runs:
+            numbers = dict(zip(context, context_of(run.scene, context), strict=True))
+            found = quantities(run.pose, run.body_points, run.latent[:, :num_modes], numbers)
+            if not points:
+                del found[_POINTS]
+            for name, values in found.items():
+                low[name] = np.minimum(low.get(name, np.inf), values.min(axis=0))
+                high[name] = np.maximum(high.get(name, -np.inf), values.max(axis=0))
+        return cls(low, high)
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Mapping[str, Sequence[float]]]) -> TrainingRange:
+        """Of what `plain` gave.
+
+        Raises:
+            KeyError, TypeError, ValueError, AttributeError: Anything else.
+        """
+        low, high = (
+            {str(name): np.array(values, dtype=np.float64) for name, values in plain[side].items()}
+            for side in ("low", "high")
+        )
+        if [(name, v.shape) for name, v in low.items()] != [(name, v.shape) for name, v in high.items()]:
+            raise ValueError("the training range's two ends differ in what they tell of")
+        if not all(v.ndim == 1 and len(v) and (v <= high[name]).all() for name, v in low.items()):
+            raise ValueError("the training range is not one of numbers in order")
+        return cls(low, high)
+
+    def plain(self) -> dict[str, Any]:
+        """Plain values, for a checkpoint's card."""
+        return {
+            side: {name: values.tolist() for name, values in getattr(self, side).items()}
+            for side in ("low", "high")
+        }
+
+    def soil(self, margin: float) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest modes, one after another [m], so many widths of their range outside of it."""
+        low, high = (side[_SOIL] for side in (self.low, self.high))
+        return low - margin * widths(low, high), high + margin * widths(low, high)
+
+    def excess(
+        self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, context: Mapping[str, float]
+    ) -> Excess:
+        """How far a path is outside.
+
+        Args:
+            poses: Of the tool, shape (T, 7).
+            points: Of its body, world frame [m], shape (T, M, 3).
+            latent: Modes [m], shape (T, r, 3); fewer than those of the training are compared with the first of them.
+            context: Numbers of the scene by their keys.
+        """
+        amounts, names = [], []
+        found = quantities(poses, points, latent, context)
+        for name in self.low:
+            values = found[name]
+            low, high = (side[name][: values.shape[1]] for side in (self.low, self.high))
+            amounts.append(np.maximum(np.maximum(low - values, values - high), 0.0) / widths(low, high))
+            names += [f"{name}{of}" for of in components(name, values.shape[1])]
+        amount = np.concatenate(amounts, axis=1)
+        worst = amount.argmax(axis=1)
+        return Excess(amount[np.arange(len(amount)), worst], [names[i] for i in worst])
+
+
+def quantities(
+    poses: np.ndarray, points: np.ndarray, latent: np.ndarray, context: Mapping[str, float]
+) -> dict[str, np.ndarray]:
+    """What is compared, by name; each of shape (T, components). Motions of frame 0 are zero."""
+    track = body_track(poses, None, "pose")
+    moved, place = track.motion[:, 0].numpy(), np.asarray(poses)[:, :3]
+    heights = points[:, :, 2].min(axis=1) if points.shape[1] else place[:, 2]
+    latent = np.asarray(latent, dtype=np.float64).reshape(len(place), -1)
+    with np.errstate(invalid="ignore"):  # of a soil that is not finite
+        velocity = np.diff(latent, axis=0, prepend=latent[:1])
+    return {
+        "the tool's position": place,
+        "the tool's lowest point": heights[:, None],
+        _POINTS: np.full((len(place), 1), float(points.shape[1])),
+        "the tool's orientation": track.orientation[:, 0].numpy(),
+        "the tool's displacement per frame": moved[:, :3],
+        "the tool's rotation per frame": moved[:, 3:],
+        _SOIL: latent,
+        "the soil's velocity": velocity,
+        **{key: np.full((len(place), 1), value) for key, value in context.items()},
+    }
+
+
+def widths(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Unit of every component's excess: its range, but not much less than the widest of its quantity.
+
+    Where nothing varies it is the size of what is there, or one where all is zero.
+    """
+    extent, size = high - low, float(np.maximum(np.abs(low), np.abs(high)).max())
+    widest = float(extent.max())
+    if widest <= 1e-12 * size:
+        return np.full_like(extent, size or 1.0)
+    return np.maximum(extent, _FLOOR * widest)
+
+
+def components(name: str, count: int) -> list[str]:
+    """What to add to a quantity's name for each of its components."""
+    if name.startswith("the soil's"):
+        return [f" (mode {i // 3 + 1}, {_AXES[i % 3]})" for i in range(count)]
+    return [f" ({axis})" for axis in _AXES] if count == 3 else [""] * count

@@ -1,0 +1,428 @@
+"""Streaming principal component analysis over particles.
+
+The data matrix has one row per (frame, axis) and one column per particle, so one basis serves x, y and z and
+a mode is a "subspace particle" with a 3-vector for a position: S' = (S - mean) U (Haeri et al. 2024,
+dimension reduction).
+
+Letters: t frames of one batch, n particles, k tracked directions (modes and oversampling).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgns.config import UserError
+from sgns.reduction.basis import Basis, check_centring, orthonormality_error
+
+_EPS = torch.finfo(torch.float64).eps
+# A Gram matrix squares the singular values, so eigenvectors under this fraction of the largest eigenvalue
+# need a second look.
+_RESOLVED = 1e-12
+# A block is thinned out before it is merged where at most this share of its rows remains.
+_WORTH_THINNING = 2.0 / 3.0
+_GRAM_ROWS = 72
+_MIN_BLOCK_FRAMES = 32
+_LARGEST = 1e100
+
+
+@dataclass(frozen=True, eq=False)
+class _Moments:
+    """What is remembered of the frames absorbed so far, relative to the reference frame."""
+
+    count: int  # frames
+    mean: Tensor  # (3, n) [m]
+    # Orthogonal rows, (k, n) [m]: sketch^T sketch is the scatter, centred per particle and axis.
+    sketch: Tensor
+    scatter: float  # trace of that scatter [m^2], dropped directions included
+    dropped: (
+        float  # its part in dropped directions [m^2]; the difference of the two would be round-off if small
+    )
+
+
+class _Spectrum(NamedTuple):
+    """Everything a basis is made of, before it is cut to the modes wanted."""
+
+    rank: int  # modes above round-off
+    mean: Tensor  # (n, 3) [m]
+    modes: Tensor  # (n, k)
+    scatter: Tensor  # (k,) [m^2]: along each mode
+    dropped: float  # [m^2]: in directions the stream dropped
+    total: float  # [m^2]: along all modes and dropped
+    displacement: float  # [m^2]: the same when centred per particle and axis
+    rows: int  # (frame, axis) pairs
+
+
+class IncrementalPCA:
+    """Principal component analysis of a stream of frames in one pass and bounded memory.
+
+    Frames are gathered in blocks of fixed size, whatever the size of the batches, so the result does not
+    depend on how the stream was cut. Each block is centred on its own mean and merged with what is known:
+    per axis one row sqrt(N m / (N + m)) (mean_old - mean_block) makes up for the move of the mean (Chan,
+    Golub and LeVeque 1983; Ross et al. 2008). The rows [sketch; block] are turned by the eigenvectors of
+    their small Gram matrix and the weakest dropped. Being a rotation of rows, that loses nothing else,
+    even where the eigenvectors are poor; the modes themselves come from a QR and SVD of the sketch at the
+    end and are orthonormal to round-off.
+
+    Frames that follow each other are alike. Once the stream has had to drop directions, a block is therefore
+    turned by its own eigenvectors first, and rows weaker than the block's share of the weakest tracked
+    direction are left out; several such blocks are merged at once. Over a steady stream, what is left out
+    along any one direction sums to no more than that weakest direction holds.
+
+    All centrings share the stream, which is centred per particle and axis: another mean c adds exactly
+    the rows sqrt(N) (mean_axis - c).
+
+    Memory: about 9 (num_modes + oversampling) n numbers of 8 bytes at most, beside the batch.
+
+    Args:
+        num_modes: The largest number of modes that will be asked for.
+        oversampling: Directions tracked beyond them, which keep the last modes true while trailing
+            ones are dropped. None: an eighth of the modes, at least 16.
+        device: Torch device of the work; it must know float64.
+
+    Raises:
+        UserError: If an argument is out of range.
+    """
+
+    def __init__(
+        self, num_modes: int, oversampling: int | None = None, device: str | torch.device = "cpu"
+    ) -> None:
+        if num_modes < 1:
+            raise UserError(f"num_modes is {num_modes}; it must be at least 1")
+        if oversampling is None:
+            oversampling = max(16, num_modes // 8)
+        if oversampling < 0:
+            raise UserError(f"oversampling is {oversampling}; it must be at least 0")
+        self.device = checked_device(device)
+        self.num_modes = num_modes
+        self.oversampling = oversampling
+        self._tracked = num_modes + oversampling
+        # The first frame (3, n) [m], subtracted from all so that a huge offset costs no digits.
+        self._reference: Tensor | None = None
+        self._pending: Tensor | None = None  # (m + 1, 3, n) [m]: frames waiting for a full block
+        self._pending_count = 0
+        self._moments: _Moments | None = None
+        self._rooms: list[Tensor] = []  # twice (k, n) [m]: where the sketch is and where the next one goes
+        self._queue: Tensor | None = None  # (3 (m + 1), n) [m]: rows of thinned blocks, not in the sketch yet
+        self._queued = 0
+        # Scatter along the weakest tracked direction [m^2]; 0 while nothing had to be dropped.
+        self._weakest = 0.0
+        # Squared Frobenius norm of the largest error that rounding to the input type can have made [m^2].
+        self._input_noise = 0.0
+
+    @property
+    def frame_count(self) -> int:
+        """Frames seen so far."""
+        return self._pending_count + (self._moments.count if self._moments else 0)
+
+    def partial_fit(self, positions: Tensor | np.ndarray) -> IncrementalPCA:
+        """Add frames to the stream.
+
+        Pass positions in the type they were stored in: modes weaker than its rounding are not counted
+        as modes.
+
+        Args:
+            positions: Particle positions [m], (t, n, 3), floating point.
+
+        Returns:
+            This object.
+
+        Raises:
+            UserError: If shape or type is wrong or a value is not finite; the stream is then as it was.
+        """
+        x, norm = self._checked(positions)
+        if self._reference is None and len(x):
+            self._begin(x[0])
+        self._input_noise += (torch.finfo(x.dtype).eps / 2 * norm) ** 2
+        start = 0
+        while start < len(x):
+            # The last frame of the block is room for the move of the mean.
+            stop = min(len(x), start + len(self._pending) - 1 - self._pending_count)
+            frames = self._pending[self._pending_count : self._pending_count + stop - start]
+            frames.copy_(x[start:stop].to(self.device).permute(0, 2, 1)).sub_(self._reference)
+            self._pending_count += stop - start
+            if self._pending_count == len(self._pending) - 1:
+                self._absorb()
+            start = stop
+        return self
+
+    def _begin(self, frame: Tensor) -> None:
+        """The reference and all memory of the stream, from the first frame (n, 3)."""
+        self._reference = frame.to(self.device, torch.float64).T.contiguous()
+        n = len(frame)
+        block = max(_MIN_BLOCK_FRAMES, math.ceil(self._tracked / 3))
+        self._pending = self._reference.new_empty(block + 1, 3, n)
+        self._queue = self._reference.new_empty(3 * (block + 1), n)
+        self._rooms = [self._reference.new_empty(min(self._tracked, n), n) for _ in range(2)]
+        self._moments = _Moments(0, torch.zeros_like(self._reference), self._rooms[0][:0], 0.0, 0.0)
+
+    def rank(self, centring: str = "particle_axis") -> int:
+        """Modes that the stream can give, `num_modes` at most.
+
+        A mode counts if it is stronger than anything that rounding of the input or the arithmetic can make.
+        """
+        return self._solved(centring).rank
+
+    def basis(
+        self,
+        centring: str = "particle_axis",
+        num_modes: int | None = None,
+        *,
+        arrangement_hash: str = "",
+        fitted_on: Iterable[str] = (),
+    ) -> Basis:
+        """The leading modes of all frames so far; the stream may go on afterwards.
+
+        Args:
+            centring: One of `CENTRINGS`.
+            num_modes: Modes wanted; None: the number given at construction.
+            arrangement_hash: Kept in the basis.
+            fitted_on: Names of the runs, kept in the basis.
+
+        Raises:
+            UserError: If no frame was seen, the centring is unknown or more modes are asked for
+            than the data has.
+        """
+        wanted = self.num_modes if num_modes is None else num_modes
+        if not 1 <= wanted <= self.num_modes:
+            raise UserError(
+                f"num_modes is {wanted}; this stream tracked {self.num_modes}; allowed: 1 to {self.num_modes}"
+            )
+        found = self._solved(centring)
+        if wanted > found.rank:
+            cure = f"ask for at most {found.rank} modes or add" if found.rank else "add"
+            raise UserError(
+                f"num_modes is {wanted} but the data has rank {found.rank} ({self.frame_count} frames of "
+                f"{len(found.mean)} particles, centring {centring}); {cure} runs that move differently"
+            )
+        modes = found.modes[:, :wanted]
+        # The first of the (nearly) largest entries, so that a tie is not decided by round-off.
+        magnitude = modes.abs()
+        first = (magnitude >= (1.0 - 1e-6) * magnitude.amax(0)).to(torch.uint8).argmax(0)
+        modes = modes * modes.gather(0, first[None]).sign()
+        return Basis(
+            mean=found.mean.cpu(),
+            modes=modes.cpu().contiguous(),
+            eigenvalues=(found.scatter[:wanted] / found.rows).cpu(),
+            total_variance=found.total / found.rows,
+            displacement_variance=found.displacement / found.rows,
+            centring=centring,
+            arrangement_hash=arrangement_hash,
+            fitted_on=list(fitted_on),
+            residual_variance=(float(found.scatter[wanted:].sum()) + found.dropped) / found.rows,
+        )
+
+    def _solved(self, centring: str) -> _Spectrum:
+        """All directions of the stream so far under one centring."""
+        check_centring(centring)
+        if self.frame_count == 0:
+            raise UserError("no basis without frames; call partial_fit with at least one frame first")
+        moments = self._absorbed()
+        sketch = moments.sketch
+        mean = self._reference + moments.mean
+        centre = mean
+        if centring == "particle":
+            centre = mean.mean(0, keepdim=True).expand(3, -1)
+        elif centring == "scalar":
+            centre = mean.mean().expand_as(mean)
+        total = moments.scatter
+        if centring != "particle_axis":
+            layout = math.sqrt(moments.count) * (mean - centre)
+            total += float(layout.square().sum())
+            # The largest rows first: QR then keeps the accuracy of the small ones.
+            sketch = torch.cat([layout, sketch])
+        q, r = torch.linalg.qr(sketch.T)
+        left, singular, _ = torch.linalg.svd(r, full_matrices=False)
+        modes = q @ left
+        error = orthonormality_error(modes)
+        if error > 1e-9:
+            raise ArithmeticError(f"modes are orthonormal to {error:.1e} only")
+        rows = 3 * moments.count
+        largest = float(singular[0]) if len(singular) else 0.0
+        # Rounding moves no singular value by more than the Frobenius norm of all rounding errors
+        # (Weyl): input, then arithmetic.
+        floor = math.sqrt(self._input_noise) + _EPS * math.sqrt(max(rows, len(modes))) * largest
+        rank = min(int((singular > floor).sum()), self.num_modes)
+        mean = centre.T.contiguous()
+        # Only the stream drops directions, so what is missing there is missing whatever the centring.
+        return _Spectrum(rank, mean, modes, singular.square(), moments.dropped, total, moments.scatter, rows)
+
+    def _absorb(self) -> None:
+        """Take the full block of pending frames into the moments."""
+        before = self._moments.count
+        rows, self._moments = _centred(self._pending, self._moments)
+        self._pending_count = 0
+        gram = _gram(rows)
+        values, vectors = torch.linalg.eigh(gram)
+        limit = self._weakest * (1.0 - before / self._moments.count)
+        # Round-off may hide that a weak direction holds more than its eigenvalue says.
+        first = int((values.clamp_min(_RESOLVED * float(values[-1])) <= limit).sum())
+        kept = len(rows) - first
+        if kept > _WORTH_THINNING * len(rows):
+            self._merge(rows, gram)
+            return
+        if self._queued + kept > len(self._queue):
+            self._merge(self._queue[: self._queued])
+            self._queued = 0
+        left_out = self._moments.dropped + float(values[:first].clamp_min(0.0).sum())
+        self._moments = replace(self._moments, dropped=left_out)
+        torch.mm(vectors[:, first:].T, rows, out=self._queue[self._queued : self._queued + kept])
+        self._queued += kept
+
+    def _merge(self, rows: Tensor, gram: Tensor | None = None) -> None:
+        """Rows (b, n) into the sketch; `gram` is their Gram matrix if it is known."""
+        self._moments, self._weakest = _merged(self._moments, rows, self._rooms[1], gram)
+        self._rooms.reverse()
+
+    def _absorbed(self) -> _Moments:
+        """The moments with everything that waits merged in; changes nothing."""
+        found = self._moments
+        waiting = [self._queue[: self._queued]]
+        if self._pending_count:
+            rows, found = _centred(self._pending[: self._pending_count + 1].clone(), found)
+            waiting.append(rows)
+        room = self._rooms[1]  # empty between merges
+        for rows in waiting:
+            if len(rows):
+                found, _ = _merged(found, rows, room)
+                room = torch.empty_like(room)
+        return found
+
+    def _checked(self, positions: Tensor | np.ndarray) -> tuple[Tensor, float]:
+        """`positions` as a tensor in its own precision, after every check, and its norm [m]."""
+        if isinstance(positions, Tensor):
+            x = positions.detach()
+            floating = x.is_floating_point()
+        else:
+            array = np.asarray(positions)
+            floating = array.dtype.kind == "f"
+            if floating:
+                # torch takes neither foreign byte order nor read-only arrays nor more than 8 bytes.
+                array = np.require(array, dtype=f"=f{min(array.dtype.itemsize, 8)}", requirements="CAW")
+                x = torch.from_numpy(array)
+        if not floating:
+            found = positions.dtype if isinstance(positions, Tensor) else array.dtype
+            raise UserError(
+                f"positions are of type {found}; they must be real floating-point numbers, float32 or float64"
+            )
+        if x.dim() != 3 or x.shape[2] != 3 or x.shape[1] == 0:
+            raise UserError(f"positions have shape {tuple(x.shape)}; they must be (frames, particles, 3)")
+        if self._reference is not None and x.shape[1] != self._reference.shape[1]:
+            raise UserError(
+                f"positions have {x.shape[1]} particles but the frames before had "
+                f"{self._reference.shape[1]}; one basis serves one particle arrangement"
+            )
+        norm = float(torch.linalg.vector_norm(x))
+        if norm < _LARGEST:
+            return x, norm
+        # In float64 a finite number may still have a square that is not.
+        bad = ~(x.abs() < _LARGEST) if x.dtype == torch.float64 else ~x.isfinite()
+        if bad.any():
+            frame, particle, axis = (int(i) for i in bad.nonzero()[0])
+            raise UserError(
+                f"position is {float(x[frame, particle, axis])} at frame {frame} of this batch (frame "
+                f"{self.frame_count + frame} of the stream), particle {particle}, axis {'xyz'[axis]}; "
+                "positions must be finite lengths in metres; check the run with `sgns check`"
+            )
+        return x, float(torch.linalg.vector_norm(x, dtype=torch.float64))
+
+
+def checked_device(device: str | torch.device) -> torch.device:
+    """The torch device of that name; a UserError if it is not here or does not know float64."""
+    try:
+        torch.zeros(1, dtype=torch.float64, device=device)
+        return torch.device(device)
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(
+            f"cannot compute in float64 on device {device!r}: {reason}; use device=cpu"
+        ) from error
+
+
+def _centred(frames: Tensor, old: _Moments) -> tuple[Tensor, _Moments]:
+    """Rows of a block for the sketch, and the moments with its frames in all but the sketch.
+
+    Args:
+        frames: (m + 1, 3, n) [m], relative to the reference; the last is not one but room for the move of
+            the mean. Overwritten.
+        old: Moments so far.
+
+    Returns:
+        Rows whose scatter is to be added, (3 m or 3 (m + 1), n), a view of `frames`; new moments.
+    """
+    m = len(frames) - 1
+    mean = frames[:m].mean(0)
+    move = mean - old.mean
+    frames[:m] -= mean
+    count = old.count + m
+    if old.count:
+        torch.mul(move, math.sqrt(old.count * m / count), out=frames[m])
+    rows = frames[: m + (old.count > 0)].flatten(0, 1)
+    scatter = old.scatter + float(torch.linalg.vector_norm(rows)) ** 2
+    return rows, replace(old, count=count, mean=old.mean + move * (m / count), scatter=scatter)
+
+
+def _merged(old: _Moments, rows: Tensor, room: Tensor, gram: Tensor | None = None) -> tuple[_Moments, float]:
+    """The moments with rows in the sketch: of both, the strongest orthogonal directions.
+
+    Args:
+        old: Moments so far, which count these rows already in all but the sketch.
+        rows: Any rows, (b, n).
+        room: Where the new sketch goes, (largest number of rows wanted, n).
+        gram: rows rows^T, if it is known.
+
+    Returns:
+        The moments; scatter along the weakest row of the new sketch, 0 if only round-off was dropped.
+    """
+    sketch = old.sketch
+    # The sketch's rows are orthogonal already, so its own Gram matrix is known.
+    cross = sketch @ rows.T
+    top = torch.cat([torch.diag(torch.linalg.vector_norm(sketch, dim=1).square()), cross], 1)
+    gram = torch.cat([top, torch.cat([cross.T, _gram(rows) if gram is None else gram], 1)])
+    done, largest, weakest, dropped = 0, None, 0.0, old.dropped
+    while True:
+        values, vectors = (x.flip(-1) for x in torch.linalg.eigh(gram))
+        largest = float(values[0]) if largest is None else largest
+        if float(values[0]) <= (16 * _EPS) ** 2 * largest:
+            break  # round-off of the rotations before
+        resolved = int((values > _RESOLVED * values[0]).sum())
+        take = min(resolved, len(room) - done)
+        _rotated(vectors[:, :take], sketch, rows, room[done : done + take])
+        done += take
+        if resolved > take:
+            weakest = float(values[take - 1])
+        if done == len(room):
+            dropped += float(values[take:].clamp_min(0.0).sum())
+        if done == len(room) or take == len(values):
+            break
+        # Eigenvectors this weak are mixed by round-off: rotate everything strong away and look at
+        # the rest by itself.
+        rows = _rotated(vectors[:, take:], sketch, rows)
+        sketch = rows[:0]
+        if done + len(rows) <= len(room):
+            room[done : done + len(rows)] = rows
+            done += len(rows)
+            break
+        gram = _gram(rows)
+    return replace(old, sketch=room[:done], dropped=dropped), weakest
+
+
+def _rotated(vectors: Tensor, sketch: Tensor, rows: Tensor, out: Tensor | None = None) -> Tensor:
+    """vectors^T [sketch; rows] without stacking the two."""
+    k = len(sketch)
+    return torch.mm(vectors[:k].T, sketch, out=out).addmm_(vectors[k:].T, rows)
+
+
+def _gram(rows: Tensor) -> Tensor:
+    """rows rows^T, with little of the half that symmetry gives: (b, n) -> (b, b)."""
+    if len(rows) <= _GRAM_ROWS:
+        return rows @ rows.T
+    upper, lower = rows.split((len(rows) + 1) // 2)
+    cross = upper @ lower.T
+    return torch.cat([torch.cat([_gram(upper), cross], 1), torch.cat([cross.T, _gram(lower)], 1)])

@@ -1,0 +1,1 @@
+"""`sgns simulate`: scenes and campaigns of them, with the material point method."""

@@ -1,0 +1,303 @@
+"""A campaign: a dataset's runs drawn from a grid of scenes, and what they cost."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from omegaconf import OmegaConf
+
+from mpm_warp import Decision, Effects, Scene, SceneError, substeps_per_frame
+from sgns.config import UserError, flattened
+from sgns.data.dataset import SPLITS, _read
+from sgns.data.files import claimed, write_whole
+from sgns.simulate.scene import decided
+
+# --- What runs cost in work, time and disk, before and while they are made ------------------------------
+
+# A recorded particle is a position and a velocity in float32, a body point a position in float64. The others are those
+# of files: pose, force, torque, time and HDF5's own for each frame; scene and structure.
+_BYTES_PER_PARTICLE = 24
+_BYTES_PER_FRAME = 240
+_BYTES_PER_BODY_POINT = 24
+_BYTES_PER_FILE = 30_000
+
+
+@dataclass(frozen=True)
+class RunCost:
+    """What a run takes, whatever the machine."""
+
+    particles: int
+    """That the solver computes."""
+    substeps: int
+    """Between two frames."""
+    frames: int
+    """T."""
+    size: int
+    """Of the run file [bytes], to a few per cent."""
+
+    @property
+    def work_per_frame(self) -> int:
+        """Particle-steps between two frames."""
+        return self.particles * self.substeps
+
+    @property
+    def work(self) -> int:
+        """Particle-steps of the run."""
+        return self.work_per_frame * (self.frames - 1)
+
+
+def run_cost(scene: Scene) -> RunCost:
+    """The cost of a scene's run.
+
+    Raises:
+        SceneError: it is too large to be computed.
+    """
+    substeps = substeps_per_frame(scene)  # before its particles are made
+    particles, stored = len(scene.filled[0]), len(scene.stored)
+    per_frame = (
+        stored * _BYTES_PER_PARTICLE + len(scene.body_points()) * _BYTES_PER_BODY_POINT + _BYTES_PER_FRAME
+    )
+    return RunCost(
+        particles=particles,
+        substeps=substeps,
+        frames=scene.frame_count,
+        size=scene.frame_count * per_frame + _BYTES_PER_FILE,
+    )
+
+
+def finishing_time(waiting: Sequence[float], running: Sequence[float], workers: int) -> float:
+    """When the last job ends if every worker that becomes free takes the next one, in the unit of the jobs' lengths.
+
+    Args:
+        waiting: lengths of the jobs not begun, in their order.
+        running: what is left of the jobs under way, at most one for each worker.
+        workers: how many jobs go on at once.
+    """
+    free_at = [*running, *[0.0] * (workers - len(running))]
+    heapq.heapify(free_at)
+    for length in waiting:
+        heapq.heapreplace(free_at, free_at[0] + length)
+    return max(free_at)
+
+
+def require_space(folder: Path, size: int) -> None:
+    """Refuses to begin what the disk cannot take.
+
+    Args:
+        folder: where files will be written; it need not exist yet.
+        size: of the files [bytes].
+
+    Raises:
+        UserError: less than that is free.
+    """
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    free = shutil.disk_usage(there).free
+    if size > free:
+        raise UserError(
+            f"{folder} needs {size_words(size)} of disk and {size_words(free)} are free; free some space, choose "
+            "another folder, or record fewer particles: scene.bed.store_every=5"
+        )
+
+
+def duration_words(seconds: float) -> str:
+    """A duration to two places at most: 40 s, 12 min, 3 h 20 min, 2 d 5 h."""
+    minutes, hours = round(seconds / 60), round(seconds / 3600)
+    if seconds < 99.5:
+        return f"{max(1, round(seconds))} s"
+    if minutes < 100:
+        return f"{minutes} min"
+    if hours < 48:
+        return f"{minutes // 60} h {minutes % 60} min"
+    return f"{hours // 24} d {hours % 24} h"
+
+
+def size_words(size: float) -> str:
+    """A number of bytes in decimal units, to two digits or more: 56 MB, 1.4 GB."""
+    units = ["kB", "MB", "GB", "TB"]
+    size /= 1000
+    while size >= 999.5 and len(units) > 1:
+        size /= 1000
+        units.pop(0)
+    return f"{size:.1f} {units[0]}" if size < 9.95 else f"{size:.0f} {units[0]}"
+
+
+# --- A dataset: a folder of runs that share a bed, drawn from a grid of scenes and split by run ---------
+# <folder>/dataset.yaml      what the runs are: base scene, draws, seed, split; written before the first run
+# <folder>/runs/<name>.h5    one run each; a run that is there is complete
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Runs to be made."""
+
+    name: str
+    path: Path
+    scenes: dict[str, Scene]
+    """Run name → scene."""
+    split: dict[str, str]
+    """Run name → train, validation or test."""
+    effects: dict[str, Any]
+    """What was asked for; scenes decide about what is `auto`, each for itself."""
+    precision: str
+    seed: int
+
+    @cached_property
+    def physics(self) -> dict[str, tuple[Effects, dict[str, Decision]]]:
+        """Run name → its effects and the decision about each."""
+        return {name: decided(scene, self.effects) for name, scene in self.scenes.items()}
+
+    def describe(self) -> dict[str, Any]:
+        """The contents of dataset.yaml."""
+        return {
+            "name": self.name,
+            "seed": self.seed,
+            "effects": dict(self.effects),
+            "precision": self.precision,
+            "split": {s: [n for n, where in self.split.items() if where == s] for s in SPLITS},
+            "scenes": {name: scene.to_dict() for name, scene in self.scenes.items()},
+        }
+
+    def file(self, name: str) -> Path:
+        """Where a run goes."""
+        return self.path / "runs" / f"{name}.h5"
+
+    def record(self) -> None:
+        """Write dataset.yaml, or check that the folder's own says the same."""
+        file = self.path / "dataset.yaml"
+        try:
+            while not file.exists():
+                with claimed(
+                    file
+                ) as ours:  # of two campaigns that begin at once the second finds the first's
+                    if ours and not file.exists():
+                        write_whole(file, yaml.safe_dump(self.describe(), sort_keys=False))
+                        return
+                time.sleep(0.05)
+        except OSError as error:
+            raise UserError(f"cannot write {file}: {error.strerror}") from None
+        there, here = _read(file), self.describe()
+        if there == here:
+            return
+        advice = "give another dataset.path, or remove the folder to make this one"
+        if isinstance(there, dict) and {**there, "effects": here["effects"]} == here:
+            others = self._decided_otherwise(there.get("effects"))
+            if others == 0:
+                return
+            if others:
+                changed = _overrides(there["effects"], here["effects"])
+                raise UserError(
+                    f"{self.path} holds a dataset whose effects were asked for otherwise, so that {others} of its "
+                    f"{len(self.scenes)} runs have other physics; {advice}"
+                    + (f"; to go on with it: {changed}" if changed else "")
+                )
+        raise UserError(f"{self.path} holds a dataset made with other settings; {advice}")
+
+    def _decided_otherwise(self, asked: Any) -> int | None:
+        """How many runs would have other effects if `asked` decided; None where it cannot.
+
+        A dataset is its runs: a tolerance that has changed since, and decides all of them alike, makes no other one.
+        """
+        if not isinstance(asked, Mapping):
+            return None
+        try:
+            return sum(
+                decided(scene, asked)[0] != self.physics[name][0] for name, scene in self.scenes.items()
+            )
+        except (UserError, SceneError):
+            return None
+
+
+def plan(
+    settings: Mapping[str, Any], base: Mapping[str, Any], effects: dict[str, Any], precision: str, seed: int
+) -> Campaign:
+    """The runs of a campaign.
+
+    Args:
+        settings: the `dataset` group: name, path, draw, runs, split.
+        base: a scene as nested data; `draw` replaces values in it.
+        effects: which physics is asked for: effect → true, false or auto, and the group `tolerance`.
+        precision: float32 or float64.
+        seed: of the drawn combinations and the split.
+    """
+    for key in ("name", "path", "draw"):
+        if settings.get(key) is None:
+            raise UserError(f"dataset.{key} is missing; a campaign needs name, path and draw")
+    combinations = _combinations(settings["draw"])
+    count = settings.get("runs") or len(combinations)
+    if not 3 <= count <= len(combinations):
+        raise UserError(
+            f"dataset.runs is {count}; allowed: 3 to {len(combinations)}, the combinations of dataset.draw"
+        )
+    rng = np.random.default_rng(seed)
+    chosen = sorted(rng.choice(len(combinations), size=count, replace=False).tolist())
+    scenes: dict[str, Scene] = {}
+    grids: dict[int, list[str]] = {}
+    for index in chosen:
+        grid, values = combinations[index]
+        data = OmegaConf.create(dict(base))
+        for key, value in values.items():
+            OmegaConf.update(data, key, value, force_add=True)
+        plain = OmegaConf.to_container(data, resolve=True)
+        if isinstance(plain.get("tool"), dict):
+            plain["tool"].pop("digest", None)  # `draw` may name another file; these are the person's settings
+        name = f"{index:04d}_" + "_".join(f"{key.split('.')[-1]}-{value}" for key, value in values.items())
+        scenes[name] = Scene.from_dict(plain)
+        grids.setdefault(grid, []).append(name)
+    return Campaign(
+        name=settings["name"],
+        path=Path(settings["path"]),
+        scenes=scenes,
+        split=_split(list(grids.values()), settings.get("split", [0.8, 0.1, 0.1]), rng),
+        effects=effects,
+        precision=precision,
+        seed=seed,
+    )
+
+
+def _combinations(draw: Any) -> list[tuple[int, dict[str, Any]]]:
+    """Number of the grid and combination, for every combination of one grid (key → values) or of several."""
+    combinations = []
+    for number, grid in enumerate(draw if isinstance(draw, list) else [draw]):
+        if not isinstance(grid, Mapping) or not grid:
+            raise UserError(
+                f"dataset.draw holds {grid!r}; it must be a grid, key: [values], or a list of such grids"
+            )
+        for key, values in grid.items():
+            if not isinstance(values, list) or not values:
+                raise UserError(f"dataset.draw.{key} is {values!r}; it must be a list of at least one value")
+        products = itertools.product(*grid.values())
+        combinations += [(number, dict(zip(grid, values, strict=True))) for values in products]
+    return combinations
+
+
+def _split(grids: list[list[str]], shares: list[float], rng: np.random.Generator) -> dict[str, str]:
+    """Each name's part, by chance within each grid, so that every part has its share of every grid."""
+    if len(shares) != 3 or min(shares) < 0 or abs(sum(shares) - 1.0) > 1e-6:
+        raise UserError(
+            f"dataset.split is {shares}; it needs three shares (train, validation, test) that sum to 1"
+        )
+    part = {}
+    for names in grids:
+        validation, test = (max(round(s * len(names)), 1 if s > 0 else 0) for s in shares[1:])
+        for rank, index in enumerate(rng.permutation(len(names))):
+            part[names[index]] = (
+                "validation" if rank < validation else "test" if rank < validation + test else "train"
+            )
+    return {name: part[name] for names in grids for name in names}
+
+
+def _overrides(wanted: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """What on the command line turns the effects asked for here into those wanted."""
+    now = flattened(dict(here))
+    changed = {key: value for key, value in flattened(dict(wanted)).items() if now.get(key) != value}
+    return " ".join(f"effects.{key}={str(value).lower()}" for key, value in changed.items())

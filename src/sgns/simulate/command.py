@@ -1,0 +1,128 @@
+"""`sgns simulate`: one scene, or every scene of a dataset, with the material point method."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+from hydra import compose
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from mpm_warp import Scene
+from sgns.config import UserError
+from sgns.data.files import only_here
+from sgns.data.run import Run, require_run_place
+from sgns.simulate.campaign import plan, require_space, run_cost
+from sgns.simulate.run import continued, simulate_scene
+from sgns.simulate.scene import asked_effects, decided, decision_line, recorded, scene_from_config
+from sgns.simulate.workers import simulate_campaign
+
+log = logging.getLogger(__name__)
+
+
+def _base_scene(settings: dict[str, Any]) -> dict[str, Any]:
+    """The scene a campaign names and changes, with the command's own overrides of scene.* and material.* on top."""
+    if settings.get("scene") is None:
+        raise UserError(
+            f"dataset={settings['name']} has no scene: its runs come from elsewhere and are not simulated"
+        )
+    overrides = HydraConfig.get().overrides.task
+    if any(o.startswith("scene=") for o in overrides):
+        raise UserError(f"dataset={settings['name']} brings its own scene; leave out scene=")
+    kept = [o for o in overrides if not o.lstrip("+~").startswith("dataset")]
+    if not isinstance(settings.get("change") or {}, dict):
+        raise UserError(f"dataset.change is {settings['change']!r}; it must be a group of keys of the scene")
+    change = [f"scene.{key}={json.dumps(value)}" for key, value in (settings.get("change") or {}).items()]
+    cfg = compose("simulate", [f"scene={settings['scene']}", *change, *kept])
+    return scene_from_config(cfg).to_dict()
+
+
+def main(cfg: DictConfig) -> float | None:
+    """Simulate `cfg.scene` into `cfg.output`, or the campaign `cfg.dataset`.
+
+    Returns:
+        Wall seconds per simulated second of a single scene.
+    """
+    if cfg.continue_from is not None:
+        if cfg.get("dataset") is not None:
+            raise UserError("continue_from goes on with one run; leave out dataset=")
+        going_on = continued(cfg, HydraConfig.get().overrides.task)
+        return _simulate_one(
+            going_on.scene,
+            cfg,
+            effects=going_on.effects,
+            reasons=going_on.reasons,
+            seed=going_on.seed,
+            precision=going_on.precision,
+            going_on=going_on,
+        )
+    asked, batch = asked_effects(cfg), cfg.solver.batch
+    if type(batch) is not int or batch < 1:
+        raise UserError(f"solver.batch is {batch!r}; it must be a whole number, 1 or more")
+    if cfg.get("dataset") is not None:  # `dataset: null` in a defaults list leaves no key
+        settings = OmegaConf.to_container(cfg.dataset, resolve=True)
+        if settings.get("where"):
+            raise UserError(
+                "dataset.where picks among runs that are there; to simulate fewer change dataset.draw"
+            )
+        campaign = plan(settings, _base_scene(settings), asked, cfg.solver.precision, cfg.seed)
+        simulate_campaign(
+            campaign,
+            device=cfg.device,
+            batch=1 if cfg.device == "cpu" else batch,
+            shard=cfg.shard,
+            shards=cfg.shards,
+        )
+        return None
+    if (cfg.shard, cfg.shards) != (0, 1):
+        raise UserError("shard and shards divide the runs of a dataset; give dataset=... or leave them out")
+    scene = scene_from_config(cfg)
+    for warning in scene.warnings():
+        log.warning("%s", warning)
+    effects, decisions = decided(scene, asked)
+    for name, decision in decisions.items():
+        log.info("%s", decision_line(name, decision))
+    return _simulate_one(
+        scene,
+        cfg,
+        effects=effects,
+        reasons=recorded(decisions),
+        seed=cfg.seed,
+        precision=cfg.solver.precision,
+    )
+
+
+def _simulate_one(scene: Scene, cfg: DictConfig, **settings: Any) -> float:
+    """Simulate a scene into `cfg.output` with a bar and a few words about it; see `scene_stages`."""
+    output = Path(cfg.output)
+    with only_here(output):
+        require_run_place(output)
+        require_space(output.parent, run_cost(scene).size)
+        with tqdm(total=scene.frame_count, unit="frame", desc=scene.name, disable=None) as bar:
+            timing = simulate_scene(
+                scene,
+                output,
+                device=cfg.device,
+                progress=bar.update,
+                **settings,
+            )
+    with Run(output) as run:
+        every = scene.bed.store_every
+        kept = f" (one of every {every} recorded)" if every > 1 else ""
+        count = run.extra["particles_simulated"]
+        log.info("%s: %d particles%s, %d frames", output, count, kept, run.frame_count)
+        if words := scene.summary(run.force, run.torque, run.pose):
+            log.info("%s", words)
+    log.info(
+        "%.1f s for %.2f simulated s: %.2f s per simulated second, %.2f M particle-steps/s on %s",
+        timing.wall_time,
+        timing.simulated,
+        timing.per_simulated_second,
+        timing.rate / 1e6,
+        cfg.device,
+    )
+    return timing.per_simulated_second

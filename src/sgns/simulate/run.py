@@ -1,0 +1,315 @@
+"""A scene simulated into a run file, from its start or from where its solver stopped."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from mpm_warp import Effects, MeshBody, Scene, Solver, SolverStopped, State
+from mpm_warp.batch import all_together
+from mpm_warp.launch import Work
+from sgns.clock import elapsed
+from sgns.config import UserError
+from sgns.data.run import Run, read_state
+from sgns.data.writer import RunWriter
+
+# --- Going on with a run whose solver stopped -----------------------------------------------------------
+
+CHANGES = (
+    "courant",
+    "remap_time",
+    "remap_distance",
+    "velocity_memory",
+    "elastic_damping",
+    "volume_averaging",
+    "bed.headroom",
+)
+"""Keys of the scene that may change half-way: how it is computed, not what it is."""
+_FILE = "scene.tool.file"
+_OTHERS = ("continue_from", "output", "device", "solver.precision", "hydra")
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """A stopped run and what it goes on with."""
+
+    path: Path
+    scene: Scene
+    """What was asked for at first; the run file says this."""
+    changes: dict[str, Any]
+    """Keys of `CHANGES` with new values, those of earlier continuations included."""
+    effects: Effects
+    reasons: dict[str, dict[str, Any]]
+    """Of the effects, as in the file."""
+    precision: str
+    seed: int
+    state: State
+    wall_time: float
+    """What its frames took [s]."""
+    before: list[dict[str, Any]]
+    """What the file says of earlier continuations."""
+
+    @property
+    def changed_scene(self) -> Scene:
+        """What is computed from here on."""
+        data = self.scene.to_dict()
+        for key, value in self.changes.items():
+            *groups, last = key.split(".")
+            place = data
+            for group in groups:
+                place = place[group]
+            place[last] = value
+        return Scene.from_dict(data, self.scene.mesh)
+
+    @property
+    def record(self) -> list[dict[str, Any]]:
+        """For the run file: at which frames the solver went on, and with what changed."""
+        return [*self.before, {"frame": self.state.frame, "changed": dict(self.changes)}]
+
+    def frames(self) -> Iterator[tuple[np.ndarray, ...]]:
+        """The frames that are there, as `RunWriter.append` takes them."""
+        with Run(self.path) as run:
+            small = (run.body_points, run.pose, run.force, run.torque)
+            for index, time in enumerate(run.time):
+                soil = run.positions(index)[0], run.velocities(index)[0]
+                yield (time, *soil, *(series[index] for series in small))
+
+
+def continued(cfg: DictConfig, overrides: Sequence[str]) -> Continuation:
+    """What `cfg.continue_from` holds, with the changes among the command's `overrides`.
+
+    Raises:
+        UserError: the file is no stopped run, or something else is to be changed than how it is computed.
+    """
+    path = Path(str(cfg.continue_from))
+    asked_changes = _changes(cfg, overrides)
+    with Run(path) as run:
+        reason = run.stopped
+        if reason is None:
+            raise UserError(f"continue_from: {path} is a whole run; there is nothing to go on with")
+        scene, reasons, extra = run.scene, run.effects, run.extra
+        seed, count, wall_time = run.seed, run.frame_count, run.wall_time_s
+        mesh = _mesh(run, cfg, overrides)
+    state = read_state(path)
+    if state.frame != count - 1:
+        raise UserError(f"{path} holds {count} frames but the state of frame {state.frame}; repeat the run")
+    effects, before = _effects(reasons, path), _earlier(extra, path)
+    changes = {key: value for earlier in before for key, value in earlier["changed"].items()} | asked_changes
+    if effects.nonlocality and "bed.headroom" in changes:
+        raise UserError(
+            "with effects.nonlocality the grid keeps what flows, so scene.bed.headroom cannot change half-way; "
+            "simulate the scene anew"
+        )
+    asked = any(o.startswith("solver.precision=") for o in overrides)
+    return Continuation(
+        path=path,
+        scene=Scene.from_dict(scene, mesh),
+        changes=changes,
+        effects=effects,
+        reasons=reasons,
+        precision=cfg.solver.precision if asked else str(extra.get("precision", cfg.solver.precision)),
+        seed=seed,
+        state=state,
+        wall_time=wall_time,
+        before=before,
+    )
+
+
+def _mesh(run: Run, cfg: DictConfig, overrides: Sequence[str]) -> tuple[np.ndarray, np.ndarray] | None:
+    """The tool's mesh: what the run holds, or for a run from before it was kept the file that the command names."""
+    tool = run.scene.get("tool")
+    is_mesh = isinstance(tool, dict) and tool.get("shape") == "mesh"
+    given = any(o.lstrip("+").startswith(f"{_FILE}=") for o in overrides)
+    if is_mesh and run.mesh is None:
+        if not given:
+            raise UserError(
+                f"{run.path} does not hold the mesh of its tool, as runs of before did not, and no file is read "
+                f"because a run names it; give the file: '+{_FILE}=...'"
+            )
+        asked = {"shape": "mesh", "file": str(OmegaConf.select(cfg, _FILE)), "digest": tool["digest"]}
+        return MeshBody(**asked, scale=_scale(tool, run.path)).mesh[:2]
+    if given:
+        raise UserError(f"{run.path} brings its own tool; leave out {_FILE}")
+    return run.mesh
+
+
+def _scale(tool: Mapping[str, Any], path: Path) -> float:
+    scale = tool.get("scale", 1.0)
+    if isinstance(scale, bool) or not isinstance(scale, (int, float)):
+        raise UserError(f"{path}: scene.tool.scale is {scale!r}, which is no number; repeat the run")
+    return float(scale)
+
+
+def _effects(reasons: Mapping[str, Any], path: Path) -> Effects:
+    try:  # some of what is recorded follows from the scene and is no choice
+        return Effects(**{effect.name: bool(reasons[effect.name]["on"]) for effect in fields(Effects)})
+    except (TypeError, KeyError) as error:
+        raise UserError(f"{path}: its effects are damaged ({error}); repeat the run") from None
+
+
+def _earlier(extra: Mapping[str, Any], path: Path) -> list[dict[str, Any]]:
+    found = extra.get("continued", [])
+    try:
+        known = all(set(one["changed"]) <= set(CHANGES) for one in found)
+    except (TypeError, KeyError):
+        known = False
+    if not known:
+        raise UserError(f"{path}: what it says of earlier continuations is damaged; repeat the run")
+    return found
+
+
+def _changes(cfg: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
+    changes = {}
+    for override in overrides:
+        key = override.split("=")[0].lstrip("+~")
+        if re.split(r"[@./]", key)[0] == "hydra" or key in (*_OTHERS, _FILE):
+            continue
+        if key.removeprefix("scene.") not in CHANGES or not key.startswith("scene."):
+            raise UserError(
+                f"continue_from brings its own scene, soil and effects; leave out {key}; allowed besides output, "
+                f"device and solver.precision: {', '.join(f'scene.{name}' for name in CHANGES)}"
+            )
+        changes[key.removeprefix("scene.")] = OmegaConf.select(cfg, key)
+    return changes
+
+
+# --- A scene simulated into a run file ------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What a run cost; compilation and set-up are not in it, recording the frames is."""
+
+    wall_time: float
+    """[s]; of scenes that are computed side by side, each has its share; the shares add up to the time that passed."""
+    simulated: float
+    """[s]"""
+    particle_steps: int
+
+    @property
+    def per_simulated_second(self) -> float:
+        """Wall seconds per simulated second."""
+        return self.wall_time / self.simulated
+
+    @property
+    def rate(self) -> float:
+        """Particle-steps per second."""
+        return self.particle_steps / self.wall_time
+
+
+def simulate_scene(scene: Scene, output: Path, **settings: Any) -> Timing:
+    """Compute a scene and write its run file; arguments as in `scene_stages`."""
+    ((_, timing),) = all_together([scene_stages(scene, output, **settings)], 1, settings.get("device", "cpu"))
+    return timing
+
+
+def scene_stages(
+    scene: Scene,
+    output: Path,
+    *,
+    effects: Effects,
+    reasons: Mapping[str, Mapping[str, Any]] | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    precision: str = "float32",
+    progress: Any = None,
+    going_on: Continuation | None = None,
+) -> Generator[Timing | Work, None, None]:
+    """Compute a scene and write its run file, with the particles that `scene.bed.store_every` leaves in it.
+
+    Args:
+        reasons: effect → on, reason, number, for the run file; by default what `effects` says of itself.
+        progress: called once after every frame.
+        going_on: a stopped run of this scene; its frames are copied and the solver begins after them.
+
+    Yields:
+        All work that the device has to do (mpm_warp's work.py), and at the end what it cost.
+
+    Raises:
+        SolverStopped: the line says where the frames before it are kept and how to go on.
+    """
+    computed, state = (scene, None) if going_on is None else (going_on.changed_scene, going_on.state)
+    solver = Solver(computed, effects, device, precision, start=state)
+    stored = scene.stored
+    with RunWriter(
+        output,
+        scene=scene.to_dict(),
+        effects=reasons or effects.described(),
+        arrangement_hash=scene.arrangement_hash,
+        particle_count=len(stored),
+        body_points=len(scene.body_points()),
+        frame_rate=scene.frame_rate,
+        seed=seed,
+        producer="mpm",
+        extra={
+            "device": device,
+            "precision": precision,
+            "time_step_s": solver.time_step,
+            "substeps_per_frame": solver.substeps_per_frame,
+            "particles_simulated": solver.particle_count,
+        }
+        | ({"continued": going_on.record} if going_on is not None else {}),
+        mesh=scene.mesh,
+    ) as writer:
+        for frame in going_on.frames() if going_on is not None else ():
+            writer.append(*frame)
+            if progress is not None:
+                progress()
+        there = writer.frame_count
+        # Loading kernels is not part of the cost of a run: the clock starts with the first frame, or with the first
+        # work where the first frames are there already.
+        before = going_on.wall_time if going_on is not None else 0.0
+        wall_time, seen, shared_by = before, None, 1
+        try:
+            for stage in solver.stages():
+                if isinstance(stage, Work):
+                    if there and stage.steps and seen is None:
+                        seen = time.perf_counter()
+                    yield stage
+                    shared_by = stage.shared_by
+                    if seen is not None:
+                        now = time.perf_counter()
+                        wall_time, seen = wall_time + elapsed(seen, now) / shared_by, now
+                    continue
+                seen = seen if seen is not None else time.perf_counter()
+                writer.append(
+                    stage.time,
+                    stage.position[stored],
+                    stage.velocity[stored],
+                    stage.body_points,
+                    stage.body_pose,
+                    stage.force,
+                    stage.torque,
+                )
+                if progress is not None:
+                    progress()
+        except SolverStopped as stopped:
+            if stopped.state is None or stopped.state.frame != writer.frame_count - 1:
+                raise
+            kept = writer.stop(wall_time, str(stopped), stopped.state)
+            raise SolverStopped(f"{stopped}. {_way_on(str(stopped), kept, output, computed)}") from stopped
+        wall_time += elapsed(seen, time.perf_counter()) / shared_by if seen is not None else 0.0
+        writer.finish(wall_time)
+    frames = scene.frame_count - max(1, there)
+    yield Timing(
+        elapsed(before, wall_time),
+        frames / scene.frame_rate,
+        frames * solver.substeps_per_frame * solver.computed_count,
+    )
+
+
+def _way_on(cause: str, kept: Path, output: Path, computed: Scene) -> str:
+    """Where the frames are, and how to go on if a continuation can do what the cause asks for."""
+    command = f"They are kept: sgns simulate continue_from={kept} output={output}"
+    if "scene.courant" in cause:
+        return f"{command} scene.courant={0.5 * computed.courant:g} goes on from there with half the step"
+    if "scene.bed.headroom" in cause:
+        return f"{command} scene.bed.headroom={2.0 * computed.bed.headroom:g} goes on from there"
+    return f"They are kept in {kept}"

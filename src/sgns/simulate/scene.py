@@ -1,0 +1,107 @@
+"""From the settings to a scene, and to the effects that it calls for."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mpm_warp import Decision, Effects, Scene, Tolerances, effects_for
+from mpm_warp.inputs import read_text
+from sgns.config import UserError, check_fields
+
+# --- From conf to a scene of mpm_warp -------------------------------------------------------------------
+
+_MOST_BYTES = 1 << 26
+"""Of a path file: a minute in steps of a millisecond takes a tenth of that."""
+
+
+def scene_from_config(cfg: DictConfig) -> Scene:
+    """The scene in `cfg.scene` with the soil in `cfg.material`; a path file is read into the scene."""
+    data = OmegaConf.to_container(cfg.scene, resolve=True)
+    data["material"] = OmegaConf.to_container(cfg.material, resolve=True)
+    if isinstance(data.get("path"), str):
+        data["path"] = read_path(Path(data["path"]))
+    return Scene.from_dict(data)
+
+
+def read_path(file: Path) -> list[list[float]]:
+    """Rows t, x, y, z, qx, qy, qz, qw of a CSV file with a header line."""
+    wanted = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
+    try:
+        rows = csv.reader(io.StringIO(read_text(file, _MOST_BYTES), newline=""))
+        first = next(rows, [])
+    except (OSError, ValueError, csv.Error) as error:
+        raise UserError(f"scene.path: cannot read {file}: {error}") from None
+    if [name.strip() for name in first] != wanted:
+        raise UserError(f"scene.path: the first line of {file} must be {','.join(wanted)}")
+    values: list[list[float]] = []
+    number = 1
+    try:
+        for number, row in enumerate(rows, start=2):
+            if len(row) != len(wanted):
+                raise UserError(
+                    f"scene.path: line {number} of {file} has {len(row)} values instead of {len(wanted)}"
+                )
+            values.append([float(v) for v in row])
+    except csv.Error as error:
+        raise UserError(f"scene.path: cannot read {file} after line {number}: {error}") from None
+    except ValueError:
+        raise UserError(f"scene.path: line {number} of {file} holds something that is not a number") from None
+    return values
+
+
+# --- From the group `effects` of the settings to the physics of one scene -------------------------------
+
+
+def asked_effects(cfg: DictConfig) -> dict[str, Any]:
+    """`cfg.effects` as plain data: each effect true, false or auto, and the group `tolerance`."""
+    asked = OmegaConf.to_container(cfg.effects, resolve=True)
+    asked.pop("nonlocal", None)  # its other name has its value
+    return asked
+
+
+def decided(scene: Scene, asked: Mapping[str, Any]) -> tuple[Effects, dict[str, Decision]]:
+    """The effects of a scene, and the decision about each, for effects asked for as `asked_effects` gives them.
+
+    Raises:
+        UserError: the tolerances are not what they should be.
+        SceneError: the effects are not, or the scene cannot have them.
+    """
+    switches = dict(asked)
+    tolerance = switches.pop("tolerance", None)
+    if tolerance is None:
+        return effects_for(scene, switches)
+    if not isinstance(tolerance, Mapping):
+        raise UserError(f"effects.tolerance is {tolerance!r}; it must be a group of keys")
+    check_fields(Tolerances, tolerance, "effects.tolerance")
+    return effects_for(scene, switches, Tolerances(**tolerance))
+
+
+def recorded(decisions: Mapping[str, Decision]) -> dict[str, dict[str, Any]]:
+    """Decisions as a run file keeps them."""
+    return {name: decision._asdict() for name, decision in decisions.items()}
+
+
+def decision_line(name: str, decision: Decision) -> str:
+    """A decision for people to read."""
+    return f"{name} {'on' if decision.on else 'off'}: {decision.reason}"
+
+
+def decision_summary(every: Iterable[Mapping[str, Decision]]) -> list[str]:
+    """One line for each effect over all runs of a dataset: how often it is on, and the most frequent reason."""
+    lines, every = [], list(every)
+    for name in every[0]:
+        made = [decisions[name] for decisions in every]
+        on = sum(decision.on for decision in made)
+        if on in (0, len(made)):
+            lines.append(f"{decision_line(name, made[0])}{' (the first run)' if len(made) > 1 else ''}")
+        else:
+            reasons = Counter(decision.reason for decision in made if not decision.on)
+            lines.append(f"{name} on in {on} of {len(made)} runs; else off: {reasons.most_common(1)[0][0]}")
+    return lines

@@ -1,0 +1,370 @@
+"""The runs of a campaign, made by one process per core, or many at once on a GPU."""
+
+from __future__ import annotations
+
+import logging
+import math
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Generator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
+from mpm_warp.batch import all_together
+from mpm_warp.launch import Work
+from sgns.clock import elapsed
+from sgns.config import UserError, flattened
+from sgns.data.files import claimed, remove_leftovers
+from sgns.data.run import Run
+from sgns.simulate.campaign import (
+    Campaign,
+    RunCost,
+    duration_words,
+    finishing_time,
+    require_space,
+    run_cost,
+    size_words,
+)
+from sgns.simulate.run import scene_stages
+from sgns.simulate.scene import decision_summary, recorded
+
+log = logging.getLogger(__name__)
+
+_MEASURED = 0.3  # seconds of stepping, at least, that the first estimate rests on
+_MEMORY = 600.0  # seconds after which what was seen of the speed counts 1/e
+_LOG_EVERY = 60.0  # seconds between lines about the progress where there is no terminal for a bar
+
+
+def simulate_campaign(
+    campaign: Campaign,
+    *,
+    device: str,
+    workers: int | None = None,
+    batch: int = 1,
+    shard: int = 0,
+    shards: int = 1,
+) -> None:
+    """Make every run of a campaign that is not there yet, one process per core, the longest first.
+
+    Several calls, on several machines too, may work on the same folder: no run is made twice at the same time.
+
+    Args:
+        campaign: what to make, and where.
+        device: cpu or cuda.
+        workers: processes at once; by default one for each core of a CPU, and one on a GPU.
+        batch: runs that a process has under way at once; more than one pays on a GPU only.
+        shard: which share of the runs to make, 0 to `shards` - 1.
+        shards: into how many shares of like work the runs are divided.
+
+    Raises:
+        UserError: before anything is made, when the disk is too full; after all other runs are done, when some could
+            not be made.
+    """
+    if type(shards) is not int or shards < 1:
+        raise UserError(f"shards is {shards!r}; it must be a whole number, 1 or more")
+    if type(shard) is not int or not 0 <= shard < shards:
+        raise UserError(
+            f"shard is {shard!r}; with shards={shards} it must be a whole number from 0 to {shards - 1}"
+        )
+    physics = campaign.physics  # before anything is written: what was asked for may be impossible
+    campaign.record()
+    costs = {name: run_cost(scene) for name, scene in campaign.scenes.items()}
+    by_length = sorted(costs, key=lambda name: costs[name].work, reverse=True)
+    share = by_length[shard::shards]
+    missing = [name for name in share if not _done(campaign.file(name), campaign.scenes[name])]
+    for name in set(share) - set(missing):  # nobody will write these again
+        remove_leftovers(campaign.file(name))
+    part = f", {len(share)} of them in shard {shard} of {shards}" if shards > 1 else ""
+    total = f"{len(campaign.scenes)} runs{part}"
+    log.info("dataset %s in %s: %s, %d to do", campaign.name, campaign.path, total, len(missing))
+    if not missing:
+        return
+    for line in decision_summary(physics[name][1] for name in missing):
+        log.info("%s", line)
+    size = sum(costs[name].size for name in missing)
+    require_space(campaign.path, size)
+    _compile(campaign, missing, device)
+    workers = min(workers or (1 if device != "cpu" else len(os.sched_getaffinity(0))), len(missing))
+    batch = min(batch, math.ceil(len(missing) / workers))
+    production = _Production(campaign, {name: costs[name] for name in missing}, device, workers, batch)
+    failed = production.make_all(f"about {size_words(size)} of disk")
+    if failed:
+        name, message = next(iter(failed.items()))
+        raise UserError(
+            f"{len(failed)} of {len(missing)} runs could not be made (the others are); the first is {name}: {message}"
+        )
+
+
+def _compile(campaign: Campaign, names: list[str], device: str) -> None:
+    """Compile the kernels of every kind of scene, once; the processes find them in Warp's cache.
+
+    Kernels can differ only where scenes differ in their effects or in something else than the size of a number.
+    """
+    kinds = {}
+    for name in names:
+        scene = campaign.scenes[name]
+        chosen = {
+            key: value
+            if isinstance(value, str)
+            else bool(value)
+            if isinstance(value, (int, float))
+            else type(value)
+            for key, value in flattened(scene.to_dict()).items()
+            if key != "name"
+        }
+        kinds.setdefault((frozenset(chosen.items()), campaign.physics[name][0]), scene)
+    for (_, physics), scene in kinds.items():
+        next(Solver(scene, physics, device, campaign.precision).frames())
+
+
+class _Production:
+    """Worker processes, what they have done, and how long the rest will take."""
+
+    def __init__(
+        self, campaign: Campaign, costs: dict[str, RunCost], device: str, workers: int, batch: int = 1
+    ) -> None:
+        self.campaign, self.costs, self.workers, self.batch = campaign, costs, workers, batch
+        self.at_once = workers * batch
+        self._settings = (campaign.seed, device, campaign.precision)
+        context = multiprocessing.get_context("spawn")
+        # Frames done of every run, and whether it has ended; each entry has one writer, so there is no lock.
+        self._frames_done, self._ended = context.RawArray("q", len(costs)), context.RawArray("b", len(costs))
+        shared = (self._frames_done, self._ended, context.Barrier(workers))
+        self._pool = ProcessPoolExecutor(workers, context, _start_worker, shared)
+        self._jobs: dict[str, Future[dict[str, tuple[str, str]]]] = {}
+        # What the estimates rest on: particle-steps made, and the seconds that they took, of each run for itself.
+        self._work_seen, self._seconds_seen = 0.0, 0.0
+
+    def make_all(self, disk: str) -> dict[str, str]:
+        """Make the runs; returns the message of each that could not be made."""
+        with self._pool:
+            try:
+                self._measure()
+                log.info("about %s with %d at once, %s", self._left(), self.at_once, disk)
+                self._submit()
+                self._follow()
+                outcomes = {name: job.result()[name] for name, job in self._jobs.items()}
+            except BrokenProcessPool:
+                raise UserError(
+                    f"a process that simulated died, perhaps for lack of memory; the complete runs are kept in "
+                    f"{self.campaign.path}; the same command goes on"
+                ) from None
+            except BaseException:
+                self._pool.shutdown(wait=False, cancel_futures=True)
+                for process in multiprocessing.active_children():
+                    process.terminate()
+                raise
+        elsewhere = sum(kind == "elsewhere" for kind, _ in outcomes.values())
+        if elsewhere:
+            log.info("runs left to another process that is making them or has made them: %d", elsewhere)
+        return {name: message for name, (kind, message) in outcomes.items() if kind == "failed"}
+
+    def _measure(self) -> None:
+        """Let all workers step runs from all over the list for a moment, at the same time."""
+        names = list(self.costs)
+        sample = [names[i * len(names) // self.at_once] for i in range(self.at_once)]
+        _, device, precision = self._settings
+        shares = [sample[worker :: self.workers] for worker in range(self.workers)]
+        trials = []
+        for share in shares:
+            scenes = [_described(self.campaign.scenes[name]) for name in share]
+            effects = [self.campaign.physics[name][0] for name in share]
+            trials.append(self._pool.submit(_try, scenes, effects, device, precision))
+        for share, trial in zip(shares, trials, strict=True):
+            frames, seconds = trial.result()
+            for name, count in zip(share, frames, strict=True):
+                self._work_seen += count * self.costs[name].work_per_frame
+                self._seconds_seen += seconds
+
+    def _submit(self) -> None:
+        """Every run is a job, but a worker that makes several at once gets its share of the runs as one job."""
+        jobs = []
+        for index, name in enumerate(self.costs):
+            scene, file = _described(self.campaign.scenes[name]), self.campaign.file(name)
+            effects, decisions = self.campaign.physics[name]
+            jobs.append((name, index, scene, file, effects, recorded(decisions)))
+        if self.batch > 1:
+            shares = [jobs[worker :: self.workers] for worker in range(self.workers)]
+        else:
+            shares = [[job] for job in jobs]
+        for share in shares:
+            future = self._pool.submit(_make_share, share, self.batch, *self._settings)
+            self._jobs.update((name, future) for name, *_ in share)
+
+    def _follow(self) -> None:
+        """Wait for all runs, keeping the bar and the estimate up to date."""
+        total = sum(cost.work for cost in self.costs.values())
+        made, last, last_line = 0, time.monotonic(), time.monotonic()
+        layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
+        with tqdm(total=total, desc=f"{self.at_once} at once", bar_format=layout, disable=None) as bar:
+            while rest := self._rest():
+                time.sleep(0.2)
+                now, work = time.monotonic(), self._work_made()
+                self._see(work - made, elapsed(last, now), busy=min(self.at_once, len(rest)))
+                made, last = work, now
+                done = f"{len(self._jobs) - len(rest)} of {len(self._jobs)} runs"
+                bar.set_postfix_str(f"{done}, {self._left()} left", refresh=False)
+                bar.update(total - sum(rest.values()) - bar.n)
+                if bar.disable and now - last_line > _LOG_EVERY:
+                    log.info("%s, %s left", done, self._left())
+                    last_line = now
+            bar.set_postfix_str(f"{len(self._jobs)} of {len(self._jobs)} runs", refresh=False)
+            bar.update(total - bar.n)
+
+    def _see(self, work: float, elapsed: float, busy: int) -> None:
+        """Add the particle-steps of `busy` runs in the last `elapsed` seconds; a machine's speed may change."""
+        kept = math.exp(-elapsed / _MEMORY)
+        self._work_seen = kept * self._work_seen + work
+        self._seconds_seen = kept * self._seconds_seen + elapsed * busy
+
+    def _work_made(self) -> int:
+        """Particle-steps in all frames so far; a run's first frame takes none."""
+        counts = zip(self._frames_done, self.costs.values(), strict=True)
+        return sum(max(0, frames - 1) * cost.work_per_frame for frames, cost in counts)
+
+    def _rest(self) -> dict[str, int]:
+        """Particle-steps that are left of every run that is not finished."""
+        runs = zip(self.costs.items(), self._frames_done, self._ended, strict=True)
+        return {
+            name: cost.work - max(0, frames - 1) * cost.work_per_frame
+            for (name, cost), frames, ended in runs
+            if name not in self._jobs or not (ended or self._jobs[name].done())
+        }
+
+    def _left(self) -> str:
+        """Time to the end of the last run at the speed seen so far, in words."""
+        if not self._work_seen:
+            return "an unknown time"
+        rest = self._rest()
+        begun = {name for name, frames in zip(self.costs, self._frames_done, strict=True) if frames}
+        running = [work for name, work in rest.items() if name in begun][: self.at_once]
+        waiting = [work for name, work in rest.items() if name not in begun]
+        rate = self._work_seen / self._seconds_seen
+        return duration_words(finishing_time(waiting, running, self.at_once) / rate)
+
+
+# --- in the worker processes ------------------------------------------------------------------------------
+
+_frames_done: Any = None  # shared with the first process and set once, like the other two
+_ended: Any = None
+_barrier: Any = None
+
+
+def _start_worker(frames_done: Any, ended: Any, barrier: Any) -> None:
+    global _frames_done, _ended, _barrier
+    _frames_done, _ended, _barrier = frames_done, ended, barrier
+    # Ctrl-C reaches all processes of the terminal; the first one ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def leave_with_parent() -> None:
+        # Without this a worker would go on alone after its parent was killed.
+        multiprocessing.parent_process().join()
+        os._exit(1)
+
+    threading.Thread(target=leave_with_parent, daemon=True).start()
+
+
+_Described = tuple[dict[str, Any], tuple[np.ndarray, np.ndarray] | None]
+
+
+def _described(scene: Scene) -> _Described:
+    """A scene as it is sent to another process: its plain data and its mesh, for `Scene.from_dict`."""
+    return scene.to_dict(), scene.mesh
+
+
+def _try(
+    scenes: list[_Described], effects: list[Effects], device: str, precision: str
+) -> tuple[list[int], float]:
+    """Frames made of each scene and the seconds they took all together, while the other workers do the same."""
+    found = [Scene.from_dict(*scene) for scene in scenes]
+    frames = frames_together(found, effects, device, precision, at_once=len(found))
+    for _ in found:
+        next(frames)  # the state at the start
+    with suppress(threading.BrokenBarrierError):
+        _barrier.wait(timeout=120.0)
+    start, counts = time.perf_counter(), [0] * len(found)
+    for number, frame in frames:
+        counts[number] += isinstance(frame, Frame)  # if it is an error, whoever makes the run says so
+        if elapsed(start, time.perf_counter()) > _MEASURED:
+            break
+    return counts, elapsed(start, time.perf_counter())
+
+
+def _make_share(
+    jobs: list[tuple[str, int, _Described, Path, Effects, dict[str, Any]]],
+    batch: int,
+    seed: int,
+    device: str,
+    precision: str,
+) -> dict[str, tuple[str, str]]:
+    """Make the runs (name, number in the campaign, scene, file, effects and their reasons), `batch` at once; gives what
+    `_make` says of each."""
+    tasks = (_make(*job, seed, device, precision) for _, *job in jobs)
+    outcomes = {}
+    for number, outcome in all_together(tasks, batch, device):
+        name, index, *_ = jobs[number]
+        outcomes[name] = outcome
+        _ended[index] = True
+    return outcomes
+
+
+def _make(
+    index: int,
+    described: _Described,
+    output: Path,
+    effects: Effects,
+    reasons: dict[str, dict[str, Any]],
+    seed: int,
+    device: str,
+    precision: str,
+) -> Generator[tuple[str, str] | Work, None, None]:
+    """Make one run unless another process does, passing on the work for the device; gives made, elsewhere or failed,
+    and what went wrong in words."""
+
+    def count_frame() -> None:
+        _frames_done[index] += 1
+
+    outcome = "made", ""
+    try:
+        scene = Scene.from_dict(*described)
+        with claimed(output) as ours:
+            if not ours or _done(output, scene):
+                outcome = "elsewhere", ""
+            else:
+                for stage in scene_stages(
+                    scene,
+                    output,
+                    effects=effects,
+                    reasons=reasons,
+                    seed=seed,
+                    device=device,
+                    precision=precision,
+                    progress=count_frame,
+                ):
+                    if isinstance(stage, Work):
+                        yield stage
+    except (UserError, SceneError, SolverStopped) as error:
+        outcome = "failed", str(error)
+    yield outcome
+
+
+def _done(file: Path, scene: Scene) -> bool:
+    """Whether the run is there and is of this scene; a file that cannot be read is made again."""
+    if not file.exists():
+        return False
+    try:
+        with Run(file) as run:
+            return run.scene == scene.to_dict()
+    except UserError as error:
+        log.info("%s; it is made again", error)
+        return False

@@ -1,0 +1,1 @@
+"""`sgns train`: windows, loss, validation, and the fit of polynomials."""

@@ -1,0 +1,365 @@
+"""How `sgns train model=polynomial` comes to its coefficients."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from sgns.config import UserError
+from sgns.model.features import varying_context
+from sgns.model.network import Standardiser
+from sgns.model.polynomial import PolynomialDynamics, normalised
+from sgns.model.settings import FitSettings, PolynomialSettings
+from sgns.train.callbacks import RolloutScore, ValidationRollouts
+from sgns.train.windows import Batch, TrainingWindows, generator, random_walk
+
+if TYPE_CHECKING:
+    from sgns.reduction.reduce import ReducedRun
+    from sgns.train.callbacks import RolloutScore, ValidationRollouts
+
+log = logging.getLogger(__name__)
+
+
+# --- Coefficients of `PolynomialDynamics`: ridge regression (dynamic mode decomposition with control: Proct
+# Kutz 2016, doi:10.1137/15M1013857) and sequentially thresholded least squares (SINDy: Brunton, Proctor, Kutz 2016,
+# doi:10.1073/pnas.1517384113).
+#
+# Both need only the moments of monomials and outputs, summed once over all windows and noise draws. What one step
+# cannot tell, the noise and the penalty, is chosen by rollouts of validation runs.
+#
+# Letters: B batch, r modes, p inputs, m monomials, f free axes of the body, o = 3r + f + 6 outputs.
+
+# Windows whose monomials are in memory at once.
+_CHUNK = 2048
+# An input with less deviation than this after normalisation is fixed, or zero by symmetry: no use as a factor.
+_STILL = 0.01
+
+
+class Setting(NamedTuple):
+    """How coefficients are found.
+
+    Attributes:
+        noise: Deviation of the velocity noise on the history, share of each mode's velocity scale [1].
+        penalty: Of the squares of the coefficients, beside the mean square of the normalised outputs [1].
+        threshold: Smallest RMS of a term in a normalised output [1]; 0 keeps all terms.
+        linear: Whether products of inputs are left out.
+    """
+
+    noise: float
+    penalty: float
+    threshold: float = 0.0
+    linear: bool = False
+
+
+class Choice(NamedTuple):
+    """How the coefficients of each group of outputs are found.
+
+    Attributes:
+        motion: Of the modes.
+        body: Of a body's free axes.
+        force: Of force and torque.
+    """
+
+    motion: Setting
+    body: Setting
+    force: Setting
+
+
+class Moments(NamedTuple):
+    """Means over windows.
+
+    Attributes:
+        gram: Products of monomials [1], shape (m, m).
+        target: Products of monomials and normalised outputs [1], shape (m, o).
+        linear: How many monomials, the first ones, are no products of inputs: p + 1.
+    """
+
+    gram: Tensor
+    target: Tensor
+    linear: int
+
+
+def unfitted(
+    windows: TrainingWindows,
+    settings: PolynomialSettings,
+    context: tuple[str, ...] = (),
+    predicts_body: bool = False,
+    floor: float = 0.01,
+) -> PolynomialDynamics:
+    """Polynomials with the statistics of the training windows and all coefficients zero.
+
+    They predict that nothing moves and that the force is the training runs' mean.
+
+    Args:
+        windows: The training windows.
+        settings: What to build.
+        context: Keys of the scene whose numbers the windows hold.
+        predicts_body: Whether the body's height is predicted.
+        floor: Smallest scale as a share of the quantity's largest.
+    """
+    batch = windows.windows(windows.targets)
+    modes = batch.latent.shape[2]
+    blank = PolynomialDynamics(settings, modes, context, predicts_body, ())
+    groups = blank.raw_inputs(batch.history, batch.body, batch.context)
+    # Velocities and motions keep their zero, which means rest. What is free of a body moves little beside what is
+    # prescribed, and the numbers of the context have nothing in common: no floor for these.
+    centred = (True, False, True, True, False, False, True, False, True)
+    floors = (floor,) * 6 + (0.0,) * 3
+    inputs = joined([Standardiser.fit(*of_group) for of_group in zip(groups, floors, centred, strict=True)])
+    values = normalised(inputs, groups)
+    used = (values.std(0) > _STILL).nonzero()[:, 0]
+    model = PolynomialDynamics(settings, modes, context, predicts_body, used.tolist())
+    model.inputs = inputs
+    model.bounds = torch.stack([values[:, used].amin(0), values[:, used].amax(0)])
+    velocity, rise, force, torque = true_outputs(model, batch)
+    model.velocity = Standardiser.fit(velocity, floor, centred=False)
+    model.body_displacement = Standardiser.fit(rise, centred=False)
+    model.force = Standardiser.fit(force, floor)
+    model.torque = Standardiser.fit(torque, floor)
+    return model
+
+
+def true_outputs(model: PolynomialDynamics, batch: Batch) -> list[Tensor]:
+    """Velocities [m], the body's displacement along free axes [m], force [N] and torque [N m], each (B, width).
+
+    The true velocity whatever error the history has: errors of the velocity are corrected and those of the position
+    left, as the network is taught.
+    """
+    velocity = batch.latent[:, -1] - batch.latent[:, -2]
+    rise = batch.body.motion[:, -1, 0, :3][:, model.free]
+    return [velocity.flatten(1), rise, batch.force[:, 0], batch.torque[:, 0]]
+
+
+def joined(parts: Sequence[Standardiser]) -> Standardiser:
+    """Statistics of quantities side by side."""
+    return Standardiser(torch.cat([p.mean for p in parts]), torch.cat([p.scale for p in parts]))
+
+
+def moments(
+    model: PolynomialDynamics, windows: TrainingWindows, noise: float = 0.0, draws: int = 2
+) -> Moments:
+    """Moments of a model's monomials and outputs; its coefficients do not matter.
+
+    Args:
+        model: Whose library and statistics to use.
+        windows: The training windows.
+        noise: As in `Setting`.
+        draws: How often all windows are taken, with other noise each time.
+    """
+    scale = noise * model.velocity.scale.unflatten(0, (-1, 3))
+    body_scale = torch.zeros(1, 3, dtype=torch.float64)
+    body_scale[:, model.free] = noise * model.body_displacement.scale
+    outputs = joined(model.outputs())
+    gram = torch.zeros(2 * model.weights.shape[:1], dtype=torch.float64)
+    target = torch.zeros_like(model.weights)
+    for draw in range(draws):
+        source, body_source = (generator(windows.seed, draw, stream) for stream in (1, 2))
+        for rows in windows.targets.split(_CHUNK):
+            shape = len(rows), windows.history
+            walks = random_walk(scale, shape, source), random_walk(body_scale, shape, body_source)
+            batch = windows.windows(rows, walks)
+            monomials = model.monomials(batch.history, batch.shown_body, batch.context)
+            gram += monomials.T @ monomials
+            target += monomials.T @ normalised(outputs, true_outputs(model, batch))
+    count = draws * len(windows)
+    return Moments(gram / count, target / count, len(model.used) + 1)
+
+
+def ridge(known: Moments, penalty: float) -> Tensor:
+    """Least squares with a penalty on the squares of all coefficients but the constants', shape (m, o)."""
+    gram = known.gram.clone()
+    gram.diagonal()[1:] += penalty
+    return solved(gram, known.target)
+
+
+def solved(gram: Tensor, target: Tensor) -> Tensor:
+    """Solution of the normal equations; the smallest one where they do not determine it."""
+    factor, failed = torch.linalg.cholesky_ex(gram)
+    if int(failed):
+        return torch.linalg.lstsq(gram, target, driver="gelsd").solution
+    return torch.cholesky_solve(target, factor)
+
+
+def sparse(known: Moments, penalty: float, threshold: float, rounds: int = 10) -> Tensor:
+    """Ridge regression of each output, repeated without the terms that add little until none does.
+
+    Args:
+        known: Moments of the library.
+        penalty: As in `Setting`.
+        threshold: As in `Setting`.
+        rounds: Most repetitions.
+
+    Returns:
+        Coefficients, shape (m, o), most of them zero.
+    """
+    size = known.gram.diagonal().sqrt()
+    weight = torch.full_like(size, penalty)
+    weight[0] = 0.0
+    full = ridge(known, penalty)
+    found = torch.zeros_like(full)
+    for column, values in enumerate(full.unbind(1)):
+        kept = torch.arange(len(full))
+        for _ in range(rounds):
+            large = values.abs() * size[kept] > threshold
+            if bool(large.all()):
+                break
+            kept = kept[large]
+            gram = known.gram[kept][:, kept] + weight[kept].diag()
+            values = solved(gram, known.target[kept, column, None])[:, 0]
+        found[kept, column] = values
+    return found
+
+
+def coefficients(known: Moments, setting: Setting) -> Tensor:
+    """`sparse` where the setting has a threshold, else `ridge`, shape (m, o)."""
+    if setting.linear:
+        n = known.linear
+        found = torch.zeros_like(known.target)
+        found[:n] = ridge(Moments(known.gram[:n, :n], known.target[:n], n), setting.penalty)
+        return found
+    if setting.threshold:
+        return sparse(known, setting.penalty, setting.threshold)
+    return ridge(known, setting.penalty)
+
+
+def candidates(
+    known: Mapping[float, Moments], penalties: Sequence[float], threshold: float = 0.0, linear: bool = False
+) -> dict[Setting, Tensor]:
+    """Coefficients for every penalty and noise.
+
+    Args:
+        known: Moments of one model by noise.
+        penalties: As in `Setting`.
+        threshold: As in `Setting`.
+        linear: Whether those without products of inputs are among them, too.
+    """
+    settings = [Setting(noise, penalty, threshold) for noise in known for penalty in penalties]
+    if linear:
+        settings += [setting._replace(linear=True) for setting in settings]
+    return {setting: coefficients(known[setting.noise], setting) for setting in settings}
+
+
+def choose(
+    model: PolynomialDynamics, found: Mapping[Setting, Tensor], rollouts: ValidationRollouts
+) -> Choice:
+    """Give a model the best coefficients: of the modes by the skill of rollouts, then of a free body by its error
+    along the rollouts of these modes, then of force and torque by the force error along those of both.
+
+    Args:
+        model: Its coefficients are replaced.
+        found: From `candidates`.
+        rollouts: Of the validation runs.
+    """
+
+    def score(*choice: Setting) -> RolloutScore:
+        take(model, *(found[setting] for setting in choice))
+        return rollouts.measure(model)
+
+    motion = body = max(found, key=lambda setting: score(setting, setting, setting).skill)
+    if model.predicts_body:
+        body = min(found, key=lambda setting: score(motion, setting, motion).body_rmse)
+    force = min(found, key=lambda setting: score(motion, body, setting).force_nrmse)
+    take(model, found[motion], found[body], found[force])
+    return Choice(motion, body, force)
+
+
+def take(model: PolynomialDynamics, motion: Tensor, body: Tensor, force: Tensor) -> None:
+    """Coefficients of the modes, of a free body, and of force and torque from a matrix each."""
+    modes = 3 * model.num_modes
+    model.weights.copy_(torch.cat([motion[:, :modes], body[:, modes:-6], force[:, -6:]], dim=1))
+
+
+def refitted(model: PolynomialDynamics, windows: TrainingWindows, choice: Choice, draws: int = 2) -> None:
+    """Give a model the coefficients of settings that `choose` found on a part of these windows."""
+    known = {noise: moments(model, windows, noise, draws) for noise in {setting.noise for setting in choice}}
+    take(model, *(coefficients(known[setting.noise], setting) for setting in choice))
+
+
+# --- How `sgns train model=polynomial` comes to its coefficients ----------------------------------------
+
+
+class Fitted(NamedTuple):
+    """Fitted polynomials.
+
+    Attributes:
+        dynamics: The polynomials.
+        choice: Noise and penalty of each group of outputs.
+        score: On the runs that chose these.
+    """
+
+    dynamics: PolynomialDynamics
+    choice: Choice
+    score: RolloutScore
+
+    def about(self) -> dict[str, Any]:
+        """What training.json says of it beside the score."""
+        groups = ("motion", "body", "force") if self.dynamics.predicts_body else ("motion", "force")
+        found: dict[str, Any] = {"coefficients": self.dynamics.num_terms}
+        for group in groups:
+            setting = getattr(self.choice, group)
+            degree = 1 if setting.linear else self.dynamics.settings.degree
+            found[group] = {"degree": degree, "noise": setting.noise, "penalty": setting.penalty}
+        return found
+
+
+def fit_polynomial(
+    runs: Sequence[ReducedRun],
+    choosing: Sequence[ReducedRun],
+    num_modes: int,
+    model: PolynomialSettings,
+    settings: FitSettings,
+    predicts_body: bool,
+    seed: int = 0,
+) -> Fitted:
+    """Fit polynomials for every noise and penalty and take what follows some runs best.
+
+    Args:
+        runs: For training.
+        choosing: Runs whose rollouts choose noise and penalty. Where they are among those for training, they are first
+            left out of the fit; the score is that of the fit without them, the result that of the fit with them.
+        num_modes: r.
+        model: What to fit.
+        settings: How.
+        predicts_body: Whether the body's height is predicted.
+        seed: Of the noise.
+    """
+    context = tuple(varying_context(runs, model.context))
+
+    def windows_of(some: Sequence[ReducedRun]) -> TrainingWindows:
+        return TrainingWindows(some, num_modes, model.history, model.body_nodes, seed, context=context)
+
+    def blank(windows: TrainingWindows) -> PolynomialDynamics:
+        return unfitted(windows, model, context, predicts_body, settings.normalisation_floor)
+
+    names = {run.name for run in choosing}
+    # A single run has to do for both.
+    fitting = [run for run in runs if run.name not in names] or list(runs)
+    windows = windows_of(fitting)
+    dynamics = blank(windows)
+    known = {noise: moments(dynamics, windows, noise, settings.draws) for noise in settings.noises}
+    log.info("%d windows, %d monomials of %d inputs", len(windows), len(dynamics.terms), len(dynamics.used))
+    rollouts = ValidationRollouts(choosing, num_modes, model.history, model.body_nodes, context)
+    linear = settings.linear and model.degree > 1
+    found = candidates(known, settings.penalties, linear=linear)
+    choice = choose(dynamics, found, rollouts)
+    score = rollouts.measure(dynamics)
+    if len(fitting) < len(runs):
+        windows = windows_of(runs)
+        dynamics = blank(windows)
+        refitted(dynamics, windows, choice, settings.draws)
+    return Fitted(dynamics, choice, score)
+
+
+def check_start(start_from: str | Path | None, device: str) -> None:
+    """Refuses what polynomials have no use for."""
+    if start_from is not None:
+        raise UserError(
+            f"checkpoint is {start_from}, but polynomials start from nothing; use checkpoint=null"
+        )
+    if device != "cpu":
+        raise UserError(f"device is {device}, but polynomials are fitted on the CPU; use device=cpu")

@@ -1,0 +1,420 @@
+"""The cooperative term on the grid, against exact answers."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.optimize import brentq
+
+from mpm_warp import Bed, Effects, Material, Scene, Solver
+from mpm_warp.kernels.ghost_nodes import Images
+from mpm_warp.kernels.nonlocal_fluidity import NonlocalFluidity, wall_sink
+
+STEADY = Effects(nonlocality=True)
+DYNAMIC = Effects(fluidity=True, nonlocality=True)
+PRESSURE = 1000.0
+
+
+class Column:
+    """A block of soil whose stress and fluidity are imposed. Its floor is the only wall."""
+
+    def __init__(self, effects, material, height=0.2, spacing=0.01, real="float64", wide=4, **bed):
+        size = (wide * spacing, wide * spacing, height)
+        bed = Bed(size=size, spacing=spacing, initial_stress="none", headroom=2 * spacing, **bed)
+        self.solver = solver = Solver(
+            Scene(bed=bed, material=material, gravity=0.0, duration=0.1), effects, precision=real
+        )
+        grid = solver._grid
+        floor = wall_sink((grid.nx, grid.ny, grid.nz), (-1, -1, grid.low[2]), (2**30,) * 3)
+        self.term = NonlocalFluidity(
+            solver._real,
+            effects,
+            solver.device,
+            floor * (material.fluidity_at_walls == "zero"),
+            [solver._home, solver._e, solver._ln_j],
+            grid,
+            solver._soil,
+            Images(solver._real, solver.device, grid, {}, mirrored=False),
+            solver._cooperation,
+        )
+        wp.copy(solver._home, solver._x)  # as a remap does
+        self.height = solver._x.numpy()[:, 2] + height  # of the particles [m]
+        self.bottom = grid.low[2]
+        self.nodal_height = spacing * (np.arange(grid.nz) - self.bottom)
+        self.shape = (grid.nx, grid.ny, grid.nz)
+
+    def impose(self, mu, pressure=PRESSURE):
+        """Shear stress mu p in the xz plane."""
+        solver, material, n = self.solver, self.solver.scene.material, self.solver.particle_count
+        e = np.zeros((n, 6))
+        e[:, 4] = np.broadcast_to(mu, n) * pressure / (2.0 * material.shear_modulus)
+        solver._e.assign(e)
+        solver._ln_j.assign(np.full(n, -pressure / material.bulk_modulus))
+
+    def solve(self, times):
+        for _ in range(times):
+            for launch in self.term.launches:
+                launch.launch()
+
+    def nodes(self, name):
+        """filled, source, slowing or g in the middle of the column, from the floor to the surface."""
+        at = ("filled", "source", "slowing", "g").index(name)
+        field = self.term.field.numpy()[:-1, at].reshape(self.shape)
+        inside = (self.nodal_height > -1e-9) & (self.nodal_height < self.height.max() + 1e-9)
+        return field[self.shape[0] // 2, self.shape[1] // 2][inside]
+
+    @property
+    def z(self):
+        """Heights of these nodes above the floor [m]."""
+        return self.nodal_height[(self.nodal_height > -1e-9) & (self.nodal_height < self.height.max() + 1e-9)]
+
+    def move(self):
+        """The particles' part of the step with the velocities that are on the grid."""
+        for launch in self.solver._step[-2:]:
+            launch.launch()
+
+    @property
+    def mu(self):
+        strain = np.sqrt(2.0) * np.linalg.norm(
+            self.solver._e.numpy() * [1, 1, 1, 2**0.5, 2**0.5, 2**0.5], axis=1
+        )
+        material = self.solver.scene.material
+        return material.shear_modulus * strain / (-material.bulk_modulus * self.solver._ln_j.numpy())
+
+
+def soil(xi, mu=0.8, **kw):
+    """A material whose cooperativity length at mu is xi [m]."""
+    material = Material(**kw)
+    return replace(material, grain_diameter=material.grain_diameter * xi / material.cooperativity_length(mu))
+
+
+BOTH_LAWS = pytest.mark.parametrize("law", ["saturating", "linear"])
+
+
+@BOTH_LAWS
+def test_fluidity_decays_to_a_rough_floor_as_a_cosh(law):
+    """Uniform stress above mu_s: g = g_loc (1 - cosh((H - z) / xi) / cosh(H / xi)), flat at the free surface."""
+    xi = 0.04
+    column = Column(STEADY, soil(xi, rate_law=law))
+    column.impose(0.8)
+    column.solve(60)
+    g_loc = column.nodes("source")
+    np.testing.assert_allclose(g_loc, g_loc[0], rtol=1e-9)
+    exact = 1.0 - np.cosh((0.2 - column.z) / xi) / math.cosh(0.2 / xi)
+    assert np.abs(column.nodes("g") / g_loc - exact).max() < 0.02
+
+
+@pytest.mark.parametrize("effects", [STEADY, DYNAMIC])
+def test_nodes_that_hardly_hold_soil_do_no_harm(effects):
+    """A particle just beyond the middle of its cell gives the next nodes so little that float32 has hardly a number for
+    it: the answer is that for a particle in the middle."""
+
+    def answer(beyond):
+        column = Column(effects, soil(0.04), real="float32", height=0.05)
+        solver = column.solver
+        solver._home.assign(solver._x.numpy() + beyond * solver.scene.bed.spacing)
+        column.impose(0.8)
+        if effects.fluidity:
+            solver._soil.g.assign(10.0 * column.height)
+        column.solve(30 if effects is STEADY else 3)
+        assert np.isfinite(column.term.field.numpy()).all()
+        return column.nodes("g")
+
+    middle = answer(0.0)
+    assert middle.max() > 0.1
+    for beyond in np.geomspace(1e-7, 1e-5, 9):
+        np.testing.assert_allclose(answer(beyond), middle, rtol=1e-3)
+
+
+def test_flow_reaches_into_soil_below_its_friction():
+    """A flowing layer under a solid one: cosh profiles on both sides, joined in value and slope."""
+    material = replace(soil(0.03, 0.7), fluidity_at_walls="free")
+    column = Column(STEADY, material)
+    column.impose(np.where(column.height < 0.1, 0.8, 0.7))
+    column.solve(100)
+    z, g = column.z, column.nodes("g")
+    below, above = material.cooperativity_length(0.8), material.cooperativity_length(0.7)
+    g_loc = column.nodes("source")[0]
+    # g = g_loc - a cosh(z / below) and g = b cosh((H - z) / above), equal value and slope at z = 0.1.
+    matrix = [
+        [math.cosh(0.1 / below), math.cosh(0.1 / above)],
+        [math.sinh(0.1 / below) / below, -math.sinh(0.1 / above) / above],
+    ]
+    a, b = np.linalg.solve(matrix, [g_loc, 0.0])
+    exact = np.where(z < 0.1, g_loc - a * np.cosh(z / below), b * np.cosh((0.2 - z) / above))
+    assert exact[-1] < 0.15 * g_loc < exact.max()  # there is a decay to be seen
+    assert np.abs(g - exact).max() < 0.02 * g_loc
+
+
+def test_laplacian_is_of_second_order():
+    """One implicit step on cos(k z): the grid's change against -kappa / (1 + kappa) cos(k z)."""
+    errors = []
+    for spacing in (0.04, 0.02, 0.01):
+        material = Material(grain_diameter=0.01, fluidity_at_walls="free")
+        column = Column(DYNAMIC, material, spacing=spacing)
+        k = math.pi / 0.2
+        column.impose(0.5)
+        column.solver._soil.g.assign(1.0 + np.cos(k * column.height))
+        column.solve(1)
+        cooperative = material.nonlocal_amplitude * material.grain_diameter
+        kappa = (cooperative * k) ** 2 * column.solver.time_step / material.fluidity_time
+        change = column.nodes("g") - column.nodes("source")
+        errors.append(np.abs(change + kappa / (1 + kappa) * np.cos(k * column.z)).max() / kappa)
+    assert errors[0] < 0.2
+    assert errors[1] < 0.35 * errors[0]
+    assert errors[2] < 0.35 * errors[1]
+
+
+@pytest.mark.parametrize(
+    "bed",
+    [
+        {"particles_per_cell": 1},
+        {"particles_per_cell": 4, "arrangement": "jittered"},
+        {"arrangement": "poisson"},
+    ],
+)
+@pytest.mark.parametrize("effects", [STEADY, DYNAMIC])
+def test_constants_stay_constant(effects, bed):
+    """Uniform fluidity and nothing that takes it away: the same on every node, however the particles lie."""
+    column = Column(effects, Material(grain_diameter=0.005, fluidity_at_walls="free"), **bed)
+    column.impose(0.8)
+    if effects.fluidity:
+        column.solver._soil.g.fill_(3.0)
+    column.solve(3)
+    field = column.term.field.numpy()
+    soil_nodes = field[:, 0] > 0.0
+    assert np.ptp(field[soil_nodes, 0]) > 0.5  # nodes at the surface are partly filled
+    expected = 3.0 if effects.fluidity else column.nodes("source")[5]
+    np.testing.assert_allclose(field[soil_nodes, 3], expected, rtol=1e-9)
+    # Particles get nothing, or exactly the share that they are to give up.
+    placed = column.solver._cooperation.numpy()[soil_nodes, 0]
+    np.testing.assert_allclose(
+        placed, lost_share(column) * expected if effects.fluidity else 0.0, atol=1e-9 * expected
+    )
+
+
+def lost_share(column):
+    """Of what the grid cannot see of g, per step."""
+    solver = column.solver
+    material, spacing = solver.scene.material, solver.scene.bed.spacing
+    number = 4.0 * (material.nonlocal_amplitude * material.grain_diameter / spacing) ** 2
+    return 1.0 - 1.0 / (1.0 + number * solver.time_step / material.fluidity_time)
+
+
+def test_particles_of_a_cell_keep_together():
+    """Rows that differ by turns, which the grid cannot see: the difference fades, a smooth profile does not."""
+    column = Column(DYNAMIC, Material(grain_diameter=0.01, nonlocal_amplitude=0.5, fluidity_at_walls="free"))
+    g, k = column.solver._soil.g, math.pi / 0.2
+    rows = np.round(column.height / 0.01 - 0.5).astype(int)
+    material, dt = column.solver.scene.material, column.solver.time_step
+    turns, smooth = [], []
+    for start in (1.0 + 0.3 * (-1.0) ** rows, 1.0 + 0.3 * np.cos(k * column.height)):
+        g.assign(0.01 * start)
+        column.impose(material.static_friction, 1000.0 * PRESSURE)  # no growth, no decay of its own
+        column.solve(1)
+        column.move()
+        found = 100.0 * g.numpy()
+        inner = np.abs(column.height - 0.1) < 0.07
+        turns.append(np.mean(((found - 1.0) * (-1.0) ** rows)[inner]) / 0.3)
+        smooth.append(np.mean((found - 1.0) * np.cos(k * column.height)) / 0.15)
+    assert turns[0] == pytest.approx(1.0 - lost_share(column), rel=0.01)
+    kappa = (0.5 * 0.01 * k) ** 2 * dt / material.fluidity_time
+    assert smooth[1] == pytest.approx(1.0 / (1.0 + kappa), rel=0.1 * kappa)
+
+
+def test_fluidity_is_kept_by_the_step():
+    """Natural boundaries all around: the volume-weighted sum of g does not change."""
+    column = Column(
+        DYNAMIC,
+        Material(grain_diameter=0.01, fluidity_at_walls="free"),
+        particles_per_cell=2,
+        arrangement="jittered",
+    )
+    column.impose(0.5)
+    column.solver._soil.g.assign(np.exp(-(((column.height - 0.05) / 0.03) ** 2)))
+    column.solve(1)
+    filled, source, _, g = column.term.field.numpy().T
+    assert np.abs(g - source).max() > 0.02
+    # What the Jacobi sweeps leave undone is not conserved: a per cent of the change.
+    assert abs(np.sum(filled * (g - source))) < 0.01 * np.sum(filled * np.abs(g - source))
+
+
+@BOTH_LAWS
+def test_growth_rate_of_a_mode(law):
+    """Small fluidity at fixed stress: cos(k z) grows as m (mu - mu_s) - A^2 d^2 k^2 over t_0."""
+    xi, k = 0.03, math.pi / 0.2
+    material = replace(soil(xi, rate_law=law), fluidity_at_walls="free")
+    assert growth(material, lambda z: 1.0 + 0.5 * np.cos(k * z), lambda z: np.cos(k * z)) == pytest.approx(
+        rate(material) * (1.0 - (xi * k) ** 2), rel=0.02
+    )
+
+
+def rate(material, mu=0.8):
+    """m (mu - mu_s) / t_0 = A^2 d^2 / (xi^2 t_0) [1/s]."""
+    cooperative = material.nonlocal_amplitude * material.grain_diameter
+    return (cooperative / material.cooperativity_length(mu)) ** 2 / material.fluidity_time
+
+
+def growth(material, start, mode, mu=0.8, steps=20):
+    """Growth rate of the part of g along `mode` over some steps of the particles' own g [1/s]."""
+    column = Column(DYNAMIC, material)
+    g = column.solver._soil.g
+    g.assign(0.01 * start(column.height))
+    size = []
+    for _ in range(steps + 1):
+        column.impose(mu, 10.0 * PRESSURE)  # stiff against the flow, so that g stays small in every respect
+        size.append(np.sum(g.numpy() * mode(column.height)))
+        column.solve(1)
+        column.move()
+    return math.log(size[-1] / size[0]) / (steps * column.solver.time_step)
+
+
+@BOTH_LAWS
+def test_stopping_height(law):
+    """A layer with g = 0 at its base flows if it is higher than (pi / 2) xi: growth changes its sign there."""
+
+    def found(height):
+        k = 0.5 * math.pi / 0.2
+        # The layer is `height` times the critical one; mu close to mu_s, so that xi is many grains.
+        material = soil(0.2 / height / (0.5 * math.pi), 0.77, rate_law=law)
+        return growth(material, lambda z: np.sin(k * z), lambda z: np.sin(k * z), 0.77) / rate(material, 0.77)
+
+    for height in (0.9, 1.0, 1.25, 2.0):
+        assert found(height) == pytest.approx(1.0 - 1.0 / height**2, abs=0.03)
+
+
+def sheared(effects, material, profile, speed=1.0, total=0.03, spacing=0.01):
+    """Heights and mu of the particles of a sheared column, without the last centimetre at both ends.
+
+    The grid's velocity is imposed: v_x(z) with dv_x/dz = speed profile(z) [1/s]. The particles are put back where
+    they were, or the column would lean.
+    """
+    column = Column(effects, material, spacing=spacing, wide=2)
+    solver = column.solver
+    x = solver._x.numpy().copy()
+    fine = np.linspace(-0.05, 0.3, 3501)
+    slope = speed * profile(fine)
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * np.diff(fine))])
+    velocity = np.zeros((*column.shape, 4))
+    velocity[..., 0] = np.interp(column.nodal_height, fine, integral)
+    solver._velocity[:-1].assign(velocity.reshape(-1, 4))
+    column.impose(material.static_friction)
+    for _ in range(round(total / speed / solver.time_step)):
+        column.solve(1)
+        column.move()
+        solver._x.assign(x)
+    middle = np.abs(column.height - 0.1) < 0.09
+    return column.height[middle], column.mu[middle]
+
+
+def steady_friction(material, profile, speed=1.0):
+    """Heights and the mu with g_loc(mu) = g - xi(mu)^2 g'', g = speed profile / mu, no slope at both ends."""
+    z, numbers = np.linspace(0.0, 0.2, 41), math.pi / 0.2 * np.arange(5)
+    modes = np.cos(np.outer(z, numbers))
+    mu_s, mu_2, span = material.static_friction, material.limit_friction, material.limit_friction - 0.76
+    c = math.sqrt(PRESSURE / material.grain_density) * 0.278 / material.grain_diameter
+
+    def missing(mu, g, bend):
+        m = span / (mu_2 - mu) if material.rate_law == "saturating" else 1.0
+        return c * m * (mu - mu_s) / (span * mu) - (g - material.cooperativity_length(mu) ** 2 * bend)
+
+    mu = np.full(z.shape, mu_s)
+    for _ in range(12):
+        g = speed * profile(z) / mu
+        bend = -modes @ (numbers**2 * np.linalg.lstsq(modes, g, rcond=None)[0])
+        for i in range(len(z)):
+            local = brentq(missing, mu_s * (1 + 1e-7), mu_2 * (1 - 1e-9), (g[i], 0.0))
+            mu[i] = brentq(missing, 0.5 * (mu_s + local), mu_2 * (1 - 1e-9), (g[i], bend[i]))
+    return z, mu
+
+
+@pytest.mark.parametrize("effects", [STEADY, DYNAMIC])
+@BOTH_LAWS
+def test_uniform_shear_is_the_local_law(effects, law):
+    """Without walls the Laplacian of uniform flow is nothing: mu(I) exactly, whatever xi."""
+    material = Material(grain_diameter=0.01, rate_law=law, fluidity_at_walls="free")
+    _, mu = sheared(effects, material, np.ones_like)
+    _, expected = steady_friction(material, np.ones_like)
+    np.testing.assert_allclose(mu, expected[0], atol=2e-4)
+
+
+@BOTH_LAWS
+def test_shear_that_varies_meets_the_nonlocal_law(law):
+    """Imposed rate 1 + 0.1 cos(k z): friction settles where g_loc(mu) = g - xi(mu)^2 g''. The excess is taken from
+    the step before and follows from mu, so this also shows that the two come to agree."""
+    material = Material(grain_diameter=0.02, rate_law=law, fluidity_at_walls="free")
+
+    def profile(z):
+        return 1.0 + 0.1 * np.cos(math.pi / 0.2 * z)
+
+    at, found = sheared(STEADY, material, profile)
+    z, expected = steady_friction(material, profile)
+    _, local = steady_friction(replace(material, nonlocal_amplitude=0.0), profile)
+    change = np.abs(expected - local).max()
+    assert change > 0.002  # the term matters here
+    assert np.abs(found - np.interp(at, z, expected)).max() < 0.05 * change
+
+
+@BOTH_LAWS
+def test_far_below_the_grid_it_is_inert(law):
+    """A d a hundredth of the spacing, walls included: less than a thousandth of the friction."""
+    material = Material(grain_diameter=2e-4, rate_law=law)
+    _, mu = sheared(STEADY, material, np.ones_like)
+    _, local = sheared(STEADY, replace(material, nonlocal_amplitude=0.0), np.ones_like)
+    np.testing.assert_allclose(mu, local, rtol=1e-3)
+
+
+@pytest.mark.parametrize("effects", [STEADY, DYNAMIC])
+def test_fluidity_never_falls_below_zero(effects):
+    """Patches of flow beside soil at rest, sharp edges: 0 <= g <= the largest source."""
+    column = Column(effects, Material(grain_diameter=0.01), wide=6, arrangement="jittered")
+    rng = np.random.default_rng(0)
+    flowing = rng.random(column.solver.particle_count) < 0.1
+    column.impose(np.where(flowing, 0.95, 0.3))
+    if effects.fluidity:
+        column.solver._soil.g.assign(np.where(flowing, 100.0, 0.0))
+    for _ in range(5):
+        column.solve(1)
+        _, source, _, g = column.term.field.numpy().T
+        assert 0.0 <= g.min() <= g.max() <= source.max() * (1 + 1e-12)
+        column.move()
+    if effects.fluidity:
+        assert column.solver._soil.g.numpy().min() >= 0.0
+
+
+@pytest.mark.parametrize("effects", [STEADY, DYNAMIC])
+@pytest.mark.parametrize("change", [{"grain_diameter": 1e-12}, {"nonlocal_amplitude": 0.0}])
+@pytest.mark.parametrize("mu", [0.0, 0.76, 0.9616, 5.0])
+def test_limits_are_finite(effects, change, mu):
+    column = Column(effects, replace(Material(), **change), real="float32")
+    for pressure in (1e-20, 1e3):
+        column.impose(mu, pressure)
+        column.solve(2)
+        column.move()
+        assert np.isfinite(column.term.field.numpy()).all()
+        assert np.isfinite(column.solver._e.numpy()).all()
+
+
+def test_precisions_agree():
+    fields = []
+    for real in ("float32", "float64"):
+        column = Column(STEADY, soil(0.04), real=real)
+        column.impose(0.8)
+        column.solve(60)
+        fields.append(column.nodes("g"))
+    np.testing.assert_allclose(fields[0], fields[1], rtol=1e-4)
+
+
+def test_separated_soil_has_no_part_in_it():
+    column = Column(STEADY, soil(0.04))
+    column.impose(0.8)
+    apart = column.height > 0.1
+    ln_j = column.solver._ln_j.numpy().copy()
+    ln_j[apart] = 0.01
+    column.solver._ln_j.assign(ln_j)
+    column.solve(1)
+    filled = column.nodes("filled")
+    assert filled[5] > 0.9
+    assert not filled[column.z > 0.12].any()

@@ -1,0 +1,304 @@
+"""Effects decided from the scene: by which numbers, what may be asked for, and that what is left out is not missed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from beds import cut
+from test_nonlocal_solver import compiled_source, launches
+
+from mpm_warp import (
+    Bed,
+    Column,
+    Effects,
+    Excavation,
+    Incline,
+    Material,
+    Plate,
+    Scene,
+    SceneError,
+    Solver,
+    Tolerances,
+    Walls,
+    Wheel,
+    effects_for,
+)
+from mpm_warp.auto_effects import EFFECTS, expected_flow
+from mpm_warp.poses import about_y, multiply, rotate
+
+BEADS = Material(
+    youngs_modulus=1e5,
+    grain_density=2450.0,
+    packing=0.6,
+    grain_diameter=0.003,
+    static_friction=0.3819,
+    limit_friction=0.6435,
+)
+SLOPE = Bed(size=(0.006, 0.006, 0.03), spacing=0.0015, headroom=0.006, walls=Walls("periodic", "periodic"))
+WHEEL = Wheel(
+    bed=Bed(size=(0.4, 0.2, 0.08), spacing=0.02, headroom=0.1), duration=0.3, settle=0.1, rim_speed=0.06
+)
+COLUMN = Column(bed=Bed(size=(0.3, 0.3, 0.06), spacing=0.015, headroom=0.03), radius=0.06, duration=0.3)
+FINE_COLUMN = replace(COLUMN, material=replace(COLUMN.material, grain_diameter=2e-4))
+
+
+def slope(tilt: float = 26.0, **kw) -> Incline:
+    return Incline(bed=SLOPE, material=BEADS, tilt=tilt, **({"flowing": False} | kw))
+
+
+# --- the flow that a scene is expected to have ---------------------------------------------------------------
+
+
+def test_inertial_number_of_a_cut():
+    """I = (V / l) d sqrt(rho_s / (rho g l)), here for a path at constant speed and depth."""
+    pose = (0.0, 0.0, 0.0, 1.0)
+    path = [(0.0, 0.1, 0.2, 0.04, *pose), (1.0, 0.3, 0.2, 0.04, *pose)]
+    flow = expected_flow(cut(motion="path", path=path))  # tip at -0.06 m, 0.2 m/s
+    assert (flow.speed, flow.thickness) == pytest.approx((0.2, 0.06))
+    expected = 0.2 / 0.06 * 3e-4 * np.sqrt(2583.0 / (2583.0 * 0.67 * 9.81 * 0.06))
+    assert flow.inertial_number == pytest.approx(expected)
+
+
+def test_depth_of_a_turned_plate():
+    """A plate of 0.2 x 0.044 m that leans by 30 degrees about y and by 20 about x, deepest with one corner."""
+    q = multiply(
+        about_y(np.radians(30.0)), np.array([np.sin(np.radians(10.0)), 0.0, 0.0, np.cos(np.radians(10.0))])
+    )
+    path = [(0.0, 0.2, 0.2, 0.05, *q), (1.0, 0.3, 0.2, 0.05, *q)]
+    scene = cut(motion="path", path=path)
+    deepest = rotate(q, scene.blade.outline())[:, 2].min() + 0.05
+    assert -0.15 < deepest < -0.02
+    assert expected_flow(scene).thickness == pytest.approx(-deepest)
+
+
+def test_a_body_above_the_soil_drives_nothing():
+    assert expected_flow(cut(motion="rest")) is None
+    pose = (0.0, 0.0, 0.0, 1.0)
+    path = [(0.0, 0.1, 0.2, 0.11, *pose), (1.0, 0.3, 0.2, 0.11, *pose)]
+    assert expected_flow(cut(motion="path", path=path)) is None
+
+
+def test_a_column_falls_at_the_speed_of_its_height():
+    flow = expected_flow(COLUMN)
+    assert (flow.speed, flow.thickness) == pytest.approx((np.sqrt(9.81 * 0.06), 0.06))
+
+
+@pytest.mark.parametrize(("law", "expected"), [("saturating", 0.1889), ("linear", 0.1125)])
+def test_a_slope_flows_at_bagnolds_inertial_number(law, expected):
+    scene = replace(slope(), material=replace(BEADS, rate_law=law))
+    flow = expected_flow(scene)
+    assert flow.inertial_number == pytest.approx(expected, rel=1e-3)
+    if law == "saturating":
+        assert flow.speed == pytest.approx(0.5017, rel=1e-3)  # at the surface
+    assert scene.material.friction_at(flow.inertial_number) == pytest.approx(np.tan(np.radians(26.0)))
+
+
+def test_slopes_that_rest_and_that_accelerate():
+    assert expected_flow(slope(20.0)) is None
+    assert expected_flow(slope(40.0)).inertial_number == np.inf
+    _, decisions = effects_for(slope(40.0))
+    assert decisions["rate_dependence"].on
+    assert decisions["rate_dependence"].number == pytest.approx(0.6435 / 0.3819 - 1.0)
+    assert not decisions["nonlocality"].on  # xi vanishes at mu_2
+
+
+# --- what auto decides ------------------------------------------------------------------------------------------
+
+
+def test_a_cut_in_the_papers_sand():
+    effects, decisions = effects_for(cut(duration=0.5))
+    assert effects == Effects(rate_dependence=False, symmetry=True)
+    assert list(decisions) == list(EFFECTS)
+    assert decisions["nonlocality"].number == pytest.approx(0.48 * 3e-4 / 0.02)
+    assert "A d is 0.0072 grid spacings, below tolerance.grid 3 %" in decisions["nonlocality"].reason
+    assert 0.0 < decisions["rate_dependence"].number < Tolerances().friction
+    assert 0.1 < decisions["fluidity"].number < 1.0
+    assert not decisions["free_body"].on
+
+
+def test_scenes_that_call_for_more():
+    effects, decisions = effects_for(slope())
+    assert effects.rate_dependence and effects.nonlocality and not effects.symmetry and not effects.torque
+    assert decisions["nonlocality"].number == pytest.approx(0.1139, rel=1e-3)  # xi / thickness
+    assert decisions["symmetry"].reason == "the bed is periodic in y (bed.walls.y)"
+    effects, decisions = effects_for(WHEEL)
+    assert decisions["free_body"].on and "100 N" in decisions["free_body"].reason
+    assert effects.torque and effects.symmetry
+    assert effects_for(cut(speed=2.0, duration=0.05))[0].rate_dependence
+
+
+def test_tolerances_decide():
+    scene = slope()
+    assert not effects_for(scene, tolerances=Tolerances(grid=1.0))[0].nonlocality
+    assert not effects_for(scene, tolerances=Tolerances(reach=0.2))[0].nonlocality
+    assert not effects_for(scene, tolerances=Tolerances(reach=0.2, friction=0.5))[0].rate_dependence
+    none = Tolerances(friction=0.0, grid=0.0, reach=0.0)
+    assert effects_for(cut(duration=0.5), tolerances=none)[0].nonlocality
+    with pytest.raises(SceneError, match=r"effects.tolerance.grid is -1; it must be a number, 0 or more"):
+        Tolerances(grid=-1)
+
+
+def test_what_needs_another_brings_it_or_goes_with_it():
+    asked = {"nonlocality": True}
+    effects, decisions = effects_for(cut(duration=0.5), asked)
+    assert effects.rate_dependence
+    assert decisions["rate_dependence"].reason.startswith("effects.nonlocality needs it")
+    effects, decisions = effects_for(slope(), {"rate_dependence": False})
+    assert not effects.nonlocality
+    assert decisions["nonlocality"].reason == "it needs effects.rate_dependence, which is off"
+    assert effects_for(slope(), {"yielding": False})[0] == Effects(
+        yielding=False, rate_dependence=False, torque=False
+    )
+
+
+def test_what_is_asked_for_is_done_and_says_what_auto_would_do():
+    effects, decisions = effects_for(cut(duration=0.5), {"rate_dependence": True, "symmetry": True})
+    assert effects.rate_dependence
+    assert decisions["rate_dependence"].reason.startswith("asked for; auto would turn it off: ")
+    assert decisions["symmetry"].reason.startswith("asked for; so would auto: ")
+
+
+@pytest.mark.parametrize(
+    ("scene", "asked", "words"),
+    [
+        (slope(), {"symmetry": True}, "effects.symmetry needs .*periodic in y"),
+        (COLUMN, {"torque": True}, "effects.torque needs a body"),
+        (
+            cut(),
+            {"free_body": True},
+            "effects.free_body needs a body whose height is free, as in scene=wheel",
+        ),
+        (WHEEL, {"free_body": False}, "kind wheel is always free"),
+        (
+            cut(),
+            {"rate_dependence": False, "fluidity": True},
+            "effects.fluidity needs effects.rate_dependence",
+        ),
+        (cut(), {"gravity": True}, "effects has no key 'gravity'; allowed: yielding, "),
+        (cut(), {"symmetry": "yes"}, "effects.symmetry is 'yes'; allowed: auto, true, false"),
+        (cut(), {"symmetry": 1}, "effects.symmetry is 1; allowed: auto, true, false"),
+    ],
+)
+def test_what_a_scene_cannot_have_is_refused(scene, asked, words):
+    with pytest.raises(SceneError, match=words):
+        effects_for(scene, asked)
+
+
+# --- what is off costs nothing ----------------------------------------------------------------------------------
+
+SHEARED = cut(duration=0.05)
+
+
+def source(effects: Effects, kernel: str, scene: Scene = SHEARED) -> str:
+    found = next(k for k in launches(Solver(scene, effects)) if k.kernel.name == kernel)
+    return compiled_source(found)
+
+
+@pytest.mark.parametrize(
+    ("on", "off", "kernel", "function"),
+    [
+        (Effects(rate_dependence=False), Effects(False, False), "material", "yield_stress"),
+        (Effects(), Effects(rate_dependence=False), "material", "sqrt"),
+        (Effects(fluidity=True), Effects(), "material", "fluidity_step"),
+        (Effects(nonlocality=True), Effects(), "material", "friction_with_excess"),
+        (Effects(), Effects(separation=False), "material", "where"),
+        (Effects(), Effects(torque=False), "scatter", "cross"),
+    ],
+)
+def test_no_instruction_of_what_is_off(on, off, kernel, function):
+    """A kernel without an effect calls that effect's function less often: never, unless others call it, too."""
+    with_it, without = (source(effects, kernel) for effects in (on, off))
+    calls = [text.count(f"{function}(") + text.count(f"{function}_0(") for text in (with_it, without)]
+    assert calls[1] < calls[0]
+    assert without.count("\n") < with_it.count("\n")
+    if function not in ("sqrt", "where", "cross"):
+        assert calls[1] == 0
+
+
+def test_no_instruction_of_a_free_height_in_a_prescribed_body():
+    driven, pushed = (source(Effects(), "scatter", scene) for scene in (WHEEL, SHEARED))
+    assert pushed.count("axle") < driven.count("axle")
+    names = [k.kernel.name for k in launches(Solver(SHEARED))]
+    assert len(names) + 1 == len(launches(Solver(WHEEL)))
+
+
+def test_no_array_of_what_is_off():
+    """Sizes of what the solver allocates for each effect, on and off. Fluidity and nonlocality:
+    test_nonlocal_solver.py."""
+    plain, halved, driven = Solver(SHEARED), Solver(SHEARED, Effects(symmetry=True)), Solver(WHEEL)
+    silent = Solver(SHEARED, Effects(torque=False))
+    assert (len(plain._body.data.impulse), len(silent._body.data.impulse)) == (2, 1)
+    assert plain._body._axle is None and len(driven._body._axle) == 3
+    assert (len(halved._x), len(plain._x)) == (1920, 3840)
+    names = {k.kernel.name for k in launches(plain)}
+    assert not names & {"fold", "unfold", "wrap", "project", "sweep", "place"}
+    assert {"fold", "unfold"} <= {k.kernel.name for k in launches(halved)}
+    column = Solver(COLUMN, effects_for(COLUMN)[0])
+    assert column._body is None
+
+
+def test_without_torque_zeros_are_recorded_and_the_force_is_the_same():
+    scene = cut(duration=0.1, clearance=0.0)
+    plain, silent = (list(Solver(scene, Effects(torque=on)).frames()) for on in (True, False))
+    assert np.abs(plain[-1].torque).max() > 0.1
+    assert all(not frame.torque.any() for frame in silent)
+    np.testing.assert_array_equal([f.force for f in silent], [f.force for f in plain])
+
+
+# --- what auto leaves out is not missed -------------------------------------------------------------------------
+
+STATED = 0.03
+"""Change of force and displacement below which an effect is meant to be left out (docs/solver.md)."""
+
+
+def changes(scene: Scene, effect: str) -> tuple[float, float]:
+    """RMS change of the force over frames and of the last positions, with `effect` and without, as shares."""
+    chosen = replace(effects_for(scene)[0], rate_dependence=True, nonlocality=False)
+    one, two = (list(Solver(scene, replace(chosen, **{effect: on})).frames()) for on in (False, True))
+    force, other = (np.array([frame.force for frame in run]) for run in (one, two))
+    moved = np.linalg.norm(one[-1].position - one[0].position)
+    share = np.linalg.norm(other - force) / np.linalg.norm(force) if scene.body else 0.0
+    return share, np.linalg.norm(two[-1].position - one[-1].position) / moved
+
+
+@pytest.mark.parametrize("effect", ["rate_dependence", "nonlocality"])
+@pytest.mark.parametrize("scene", [cut(duration=0.3, clearance=0.0), WHEEL, FINE_COLUMN])
+def test_what_auto_leaves_out_changes_less_than_stated(scene, effect):
+    assert not effects_for(scene)[1][effect].on
+    force, displacement = changes(scene, effect)
+    assert 0.0 < displacement < STATED
+    assert force < STATED
+
+
+def test_a_cut_of_coarse_sand_is_not_left_without_what_it_feels():
+    """Grains of 1 mm in the quick cut, which answers to friction sharply: with a tolerance of 0.01 auto left out both
+    effects, and soil went another way by 6 %."""
+    scene = Excavation(
+        bed=Bed(size=(0.8, 0.6, 0.15), spacing=0.02, particles_per_cell=2.3703703704, headroom=0.12),
+        blade=Plate(length=0.305, width=0.457, thickness=0.042),
+        material=Material(youngs_modulus=1e6, grain_diameter=1e-3),
+        depth=0.05,
+        speed=0.1,
+        rake=10.0,
+        start=0.1,
+        clearance=0.01,
+        duration=0.75,
+    )
+    chosen = effects_for(scene)[0]
+    assert not chosen.nonlocality
+    everything = replace(chosen, rate_dependence=True, nonlocality=True)
+    one, two = (list(Solver(scene, effects).frames()) for effects in (everything, chosen))
+    forces = np.array([[frame.force for frame in run] for run in (one, two)])
+    apart = np.linalg.norm(two[-1].position - one[-1].position)
+    moved = np.linalg.norm(one[-1].position - one[0].position)
+    assert 0.0 < apart < STATED * moved
+    assert np.linalg.norm(forces[1] - forces[0]) < STATED * np.linalg.norm(forces[0])
+
+
+@pytest.mark.parametrize("effect", ["rate_dependence", "nonlocality"])
+def test_what_auto_turns_on_changes_more(effect):
+    scene = slope(flowing=True, duration=0.2)
+    assert effects_for(scene)[1][effect].on
+    assert changes(scene, effect)[1] > STATED

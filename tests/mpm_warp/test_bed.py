@@ -1,0 +1,214 @@
+"""Floor and walls: sticking, sliding, friction, periodic ends, and a tilted bin."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import warp as wp
+from beds import BlockBed, block, cut
+from scipy.spatial import cKDTree
+
+from mpm_warp import Bed, Effects, Incline, Scene, SceneError, Solver, Walls, arrange
+from mpm_warp.bed import POISSON_RADIUS
+from mpm_warp.kernels.grid import grid_step
+
+# --- Floor and walls: sticking, sliding, friction, periodic ends, and a tilted bin ----------------------
+
+ELASTIC = Effects(yielding=False, rate_dependence=False, separation=False)
+
+
+def box_on_floor(walls: Walls, tilt: float = 0.0, duration: float = 0.1) -> Scene:
+    """A block of 10 x 10 x 5 particles that stands on the floor and touches no wall."""
+    bed = BlockBed(
+        size=(0.3, 0.2, 0.1),
+        spacing=0.01,
+        low=(0.05, 0.05, -0.1),
+        high=(0.15, 0.15, -0.05),
+        initial_stress="none",
+        headroom=0.1,
+        walls=walls,
+    )
+    return Scene(bed=bed, tilt=tilt, duration=duration, frame_rate=100.0)
+
+
+def mean_speeds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Times and mean velocity of the soil at the frames."""
+    frames = list(Solver(scene, ELASTIC, precision="float64").frames())
+    return scene.times(), np.array([f.velocity.mean(axis=0) for f in frames])
+
+
+def test_soil_slides_down_a_slope_without_friction():
+    """a = g sin(tilt), and it stays on the floor."""
+    time, speed = mean_speeds(box_on_floor(Walls(floor="slip"), tilt=20.0))
+    np.testing.assert_allclose(speed[:, 0], 9.81 * math.sin(math.radians(20.0)) * time, rtol=1e-5, atol=1e-9)
+    assert np.abs(speed[:, 1]).max() < 1e-9
+    assert abs(speed[-5:, 2].mean()) < 0.01
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.3])
+def test_soil_slides_against_friction(friction):
+    """a = g (sin(tilt) - friction cos(tilt)) once it slides."""
+    time, speed = mean_speeds(box_on_floor(Walls(floor=friction), tilt=30.0, duration=0.2))
+    tilt = math.radians(30.0)
+    expected = 9.81 * (math.sin(tilt) - friction * math.cos(tilt))
+    slope = np.polyfit(time[5:], speed[5:, 0], 1)[0]
+    assert slope == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize("floor", ["no_slip", 0.5])
+def test_a_layer_on_a_slope_below_its_friction_angle_stays_still(floor):
+    """An endless layer on a slope of 20 degrees (tan = 0.36) starts in balance and stays."""
+    bed = Bed(size=(0.08, 0.08, 0.1), spacing=0.02, headroom=0.04, walls=Walls("periodic", "periodic", floor))
+    frame = list(Solver(Scene(bed=bed, tilt=20.0, duration=0.3)).frames())[-1]
+    assert np.abs(frame.velocity).max() < 1e-3
+    np.testing.assert_allclose(frame.position, bed.filled[0], atol=2e-4)
+
+
+@pytest.mark.parametrize(("floor", "leaves"), [("no_slip", False), ("slip", False), (0.3, True)])
+def test_only_a_wall_with_friction_lets_soil_go(floor, leaves):
+    scene = replace(box_on_floor(Walls(floor=floor), duration=0.02), gravity=0.0)
+    solver = Solver(scene, ELASTIC, precision="float64")
+    solver._v.assign(np.tile([0.0, 0.0, 0.5], (solver.particle_count, 1)))
+    last = list(solver.frames())[-1]
+    lowest = last.position[:, 2].min() - scene.initial_positions()[:, 2].min()
+    assert (lowest > 0.5 * 0.5 * 0.02) == leaves
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_periodic_seam_is_nowhere(axis):
+    """A block that crosses the seam moves as one in the middle of the bin does."""
+    bed = replace(block().bed, walls=Walls(**{"xy"[axis]: "periodic"}))
+    far = np.zeros(3)
+    far[axis] = 0.07
+    across = replace(bed, low=tuple(bed.low + far), high=tuple(bed.high + far))
+    start, last = [], []
+    for b in (bed, across):
+        scene = Scene(bed=b, gravity=0.0, duration=0.1, frame_rate=100.0)
+        solver = Solver(scene, precision="float64")
+        x = solver._x.numpy()
+        middle = x.mean(axis=0)
+        pushed = -2.0 * (x - middle)
+        pushed[:, axis] += 0.6
+        solver._v.assign(pushed)
+        frames = list(solver.frames())
+        start.append(frames[0].position)
+        last.append(frames[-1].position)
+    assert last[1][:, axis].max() > 0.3  # it did cross, and its positions go on counting
+    np.testing.assert_allclose(last[1] - start[1], last[0] - start[0], atol=1e-7)
+
+
+def test_momentum_along_periodic_axes_is_conserved():
+    """On a slippery floor nothing takes momentum along x and y, however the soil is shaken."""
+    bed = Bed(
+        size=(0.06, 0.06, 0.06), spacing=0.01, headroom=0.05, walls=Walls("periodic", "periodic", "slip")
+    )
+    solver = Solver(Scene(bed=bed, duration=0.05, frame_rate=200.0), precision="float64")
+    kick = np.random.default_rng(0).normal(size=(solver.particle_count, 3)) * 0.1
+    solver._v.assign(kick)
+    for _ in solver.frames():
+        pass
+    after = solver._v.numpy().sum(axis=0)
+    np.testing.assert_allclose(after[:2], kick.sum(axis=0)[:2], atol=1e-12 * np.abs(kick).sum())
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"x": "sticky"}, "bed.walls.x is 'sticky'; allowed: no_slip, slip, periodic or a friction"),
+        ({"floor": "periodic"}, "bed.walls.floor is 'periodic'; allowed: no_slip, slip or a friction"),
+        ({"y": -0.1}, "bed.walls.y is -0.1; allowed"),
+        ({"y": True}, "bed.walls.y is True; allowed"),
+    ],
+)
+def test_what_walls_refuse(values, words):
+    with pytest.raises(SceneError, match=words):
+        Walls(**values)
+
+
+def test_a_period_is_a_whole_number_of_cells():
+    with pytest.raises(SceneError, match=r"bed.walls.x is periodic but .* 7.500 grid spacings"):
+        Bed(size=(0.15, 0.2, 0.1), spacing=0.02, walls=Walls(x="periodic"))
+
+
+def test_walls_survive_plain_data():
+    scene = cut(bed=Bed(size=(0.48, 0.4, 0.16), spacing=0.02, walls=Walls("slip", 0.3, 0.5)))
+    assert Scene.from_dict(scene.to_dict()) == scene
+    assert scene.bed.walls.kinds == ("slip", "friction", "friction")
+
+
+def test_no_two_kinds_of_walls_share_a_kernel():
+    """Warp takes kernels for the same, here and in its cache, whose text and functions are the same, whatever the names
+    under which the text calls the functions."""
+    kinds = ("no_slip", "slip", "friction", "periodic")
+    walls = list(product(kinds, kinds, kinds[:3]))
+    for form in ("alone", "together"):
+        kernels = [getattr(grid_step(wp.float32, kinds).step, form) for kinds in walls]
+        assert len({kernel.module.get_module_hash() for kernel in kernels}) == len(walls) == 48
+
+
+def test_slippery_walls_hold_no_flow_whatever_ran_before():
+    """Soil flows down a slope between walls: after one where they stick, one where they do not."""
+    slowest = []
+    for y in ("no_slip", "slip"):
+        bed = Bed(size=(0.06, 0.06, 0.05), spacing=0.01, walls=Walls("periodic", y))
+        *_, frame = Solver(Incline(bed=bed, tilt=40.0, flowing=True, duration=0.05)).frames()
+        at_top = np.isclose(frame.position[:, 2], frame.position[:, 2].max(), atol=0.002)
+        slowest.append(frame.velocity[at_top, 0].min() / frame.velocity[at_top, 0].max())
+    assert slowest[0] < 0.8
+    assert slowest[1] > 0.99
+
+
+def test_plain_walls_cost_nothing():
+    """Without ghost nodes a step is scatter, grid, gather and material, and nothing counts turns."""
+    plain, periodic = (
+        Solver(cut(bed=Bed(size=(0.48, 0.4, 0.16), spacing=0.02, walls=Walls(y=y))))
+        for y in ("no_slip", "periodic")
+    )
+    assert len(plain._step) == 4
+    assert plain._turns == {}
+    assert len(periodic._step) == 6
+
+
+# --- Beds: full, inside, reproducible -------------------------------------------------------------------
+
+SIZE = (0.2, 0.15, 0.07)
+
+
+@pytest.mark.parametrize("kind", ["lattice", "jittered", "poisson"])
+def test_particles_are_in_the_bin_and_reproducible(kind):
+    points, volume = arrange(kind, SIZE, 0.01, seed=3)
+    assert np.all(points >= [0, 0, -SIZE[2]])
+    assert np.all(points <= [SIZE[0], SIZE[1], 0])
+    assert volume > 0
+    arrange.cache_clear()
+    np.testing.assert_array_equal(points, arrange(kind, SIZE, 0.01, seed=3)[0])
+
+
+@pytest.mark.parametrize("kind", ["lattice", "jittered"])
+def test_a_full_bed_has_the_bins_volume(kind):
+    points, volume = arrange(kind, SIZE, 0.013, seed=0)
+    assert len(points) * volume == pytest.approx(np.prod(SIZE), rel=1e-12)
+
+
+def test_the_papers_bed_has_29700_particles():
+    assert len(arrange("lattice", (0.8, 0.6, 0.15), 0.8 / 60, 0)[0]) == 29700
+
+
+def test_poisson_points_keep_their_distance_and_are_as_dense_as_the_published():
+    """The published bed holds 0.797 of a full one; the share near walls and surface is the same as inside."""
+    spacing = 0.01
+    points, volume = arrange("poisson", SIZE, spacing, seed=0)
+    nearest = cKDTree(points).query(points, k=2)[0][:, 1]
+    assert nearest.min() >= POISSON_RADIUS * spacing * (1 - 1e-9)
+    assert len(points) * volume / np.prod(SIZE) == pytest.approx(0.797, abs=0.02)
+    top = np.mean(points[:, 2] > -2 * spacing) / (2 * spacing / SIZE[2])
+    assert top == pytest.approx(1.0, abs=0.06)
+
+
+def test_unknown_arrangement():
+    with pytest.raises(SceneError, match="allowed: lattice, jittered, poisson"):
+        arrange("heap", SIZE, 0.01, 0)

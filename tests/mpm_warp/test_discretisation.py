@@ -1,0 +1,120 @@
+"""Mirror symmetry: half the bed computed is the whole bed computed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from beds import cut
+
+from mpm_warp import Bed, Column, Effects, Scene, SceneError, Solver, Walls, asymmetry
+from mpm_warp.discretisation import half
+
+BED = Bed(size=(0.48, 0.40, 0.16), spacing=0.02, headroom=0.12)
+
+
+@pytest.mark.parametrize(
+    ("bed", "on_plane"),
+    [
+        (BED, 0),  # the plane is a layer of nodes
+        (replace(BED, size=(0.48, 0.42, 0.16)), 192),  # half way between two, with particles on it
+        (replace(BED, size=(0.48, 0.41, 0.16)), 0),  # not a whole number of cells
+        (replace(BED, arrangement="poisson", mirrored=True), None),
+        (replace(BED, size=(0.48, 0.42, 0.16), arrangement="jittered", mirrored=True), 192),
+        (replace(BED, walls=Walls("periodic", "slip", 0.3)), 0),
+    ],
+)
+def test_half_is_whole(bed, on_plane):
+    """Force, torque, positions and velocities agree to round-off, in the same order."""
+    scene = cut(bed=bed, duration=0.1, depth=0.08, clearance=0.0)
+    whole, mirrored = (Solver(scene, Effects(symmetry=on), precision="float64") for on in (False, True))
+    assert mirrored.computed_count == (whole.computed_count + half(scene).on_plane) / 2
+    assert mirrored.particle_count == whole.particle_count == whole.computed_count
+    assert on_plane in (half(scene).on_plane, None)
+    size = 0.0
+    for one, other in zip(whole.frames(), mirrored.frames(), strict=True):
+        size = max(size, np.linalg.norm(one.force))
+        np.testing.assert_allclose(other.force, one.force, atol=1e-10 * size)
+        np.testing.assert_allclose(other.torque, one.torque, atol=1e-10 * size)
+        np.testing.assert_allclose(other.position, one.position, atol=1e-9)
+        np.testing.assert_allclose(other.velocity, one.velocity, atol=1e-8)
+    assert size > 10.0
+
+
+@pytest.mark.parametrize("width", [0.30, 0.31])  # without and with particles on the plane
+def test_a_column_is_symmetric_too(width):
+    # The time between remaps is bounded so that it does not hang on the last digit of the top speed.
+    bed = Bed(size=(0.3, width, 0.05), spacing=0.01, headroom=0.03)
+    scene = Column(bed=bed, radius=0.05, duration=0.1, remap_time=1e-3)
+    one, two = (
+        list(Solver(scene, Effects(symmetry=on), precision="float64").frames())[-1] for on in (False, True)
+    )
+    assert np.abs(one.velocity).max() > 0.1
+    np.testing.assert_allclose(two.position, one.position, atol=1e-8)
+
+
+@pytest.mark.parametrize("nonlocality", [False, True])
+def test_a_bed_that_lies_on_its_plane_of_symmetry(nonlocality):
+    """One layer of particles: no half is left out, and all of them count half."""
+    bed = Bed(size=(0.2, 0.04, 0.12), spacing=0.02, particles_per_cell=0.125, walls=Walls(y="slip"))
+    scene = Scene(bed=bed, duration=0.05)
+    assert np.unique(scene.initial_positions()[:, 1]) == pytest.approx(0.02)
+    whole, half = (
+        list(Solver(scene, Effects(symmetry=on, nonlocality=nonlocality), precision="float64").frames())[-1]
+        for on in (False, True)
+    )
+    assert np.abs(whole.position - scene.initial_positions()).max() > 1e-6
+    np.testing.assert_allclose(half.position, whole.position, atol=1e-9)
+
+
+def test_symmetry_computes_half():
+    assert Solver(cut(), Effects(symmetry=True)).computed_count == Solver(cut()).computed_count // 2
+    nodes = [Solver(cut(), Effects(symmetry=on))._velocity.size for on in (False, True)]
+    assert nodes[1] < 0.65 * nodes[0]
+    assert cut().arrangement_hash == cut(name="again").arrangement_hash
+
+
+def test_a_mirrored_bed_is_as_dense_as_others():
+    for kind in ("jittered", "poisson"):
+        beds = [replace(BED, size=(0.24, 0.4, 0.12), arrangement=kind, mirrored=m) for m in (False, True)]
+        plain, mirrored = (b.filled[0] for b in beds)
+        assert len(mirrored) == pytest.approx(len(plain), rel=0.03)
+        y = mirrored[:, 1] - 0.2
+        assert np.sum(np.abs(y) < 0.04) == pytest.approx(0.2 * len(mirrored), rel=0.1)
+        assert beds[0].arrangement_hash != beds[1].arrangement_hash
+
+
+def path(y: float = 0.2, roll: float = 0.0):
+    """Straight but for one moment between two frames, when it is off the plane or turned about x."""
+    straight = (0.2, 0.2, 0.04, 0.0, 0.0, 0.0, 1.0)
+    off = (0.2, y, 0.04, np.sin(roll / 2), 0.0, 0.0, np.cos(roll / 2))
+    return ((0.0, *straight), (0.005, *off), (0.01, *straight))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (
+            {"motion": "path", "path": path(y=0.21)},
+            r"the body is at y = 0.2100 m at 0.005 s, not at mid-width",
+        ),
+        (
+            {"motion": "path", "path": path(roll=0.1)},
+            "at 0.005 s the body is turned about another axis than y",
+        ),
+        ({"bed": replace(BED, arrangement="jittered")}, "use bed.arrangement=lattice or bed.mirrored=true"),
+        ({"bed": replace(BED, walls=Walls(y="periodic"))}, "periodic in y"),
+    ],
+)
+def test_what_is_not_symmetric_is_refused_with_the_reason(change, reason):
+    scene = cut(**({"duration": 0.05, "frame_rate": 100.0} | change))
+    with pytest.raises(SceneError, match=f"effects.symmetry needs .*{reason}"):
+        Solver(scene, Effects(symmetry=True))
+    assert asymmetry(scene) is not None
+
+
+def test_what_is_symmetric():
+    assert asymmetry(cut()) is None
+    assert asymmetry(cut(motion="path", path=path(), duration=0.05)) is None
+    assert asymmetry(Scene(bed=replace(BED, arrangement="jittered", mirrored=True))) is None

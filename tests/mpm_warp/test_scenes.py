@@ -1,0 +1,445 @@
+"""Motion laws and paths."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from beds import BlockBed, block, cut
+from scipy.spatial.transform import Rotation
+from test_solver import momenta
+
+from mpm_warp import (
+    Bed,
+    Box,
+    Material,
+    Push,
+    Scene,
+    SceneError,
+    Solver,
+    SolverStopped,
+    Wheel,
+    substeps_per_frame,
+)
+from mpm_warp.auto_effects import expected_flow
+from mpm_warp.limits import Guard, top_body_speed
+from mpm_warp.material import static_friction
+from mpm_warp.poses import about_y, angular_velocity, multiply, rotate, sampled_poses, slerp
+from mpm_warp.rigid_body import stable_step
+from mpm_warp.scenes import curved, ramp
+
+# --- Motion laws and paths ------------------------------------------------------------------------------
+
+
+def test_curved_motion_is_half_an_ellipse():
+    t = np.linspace(0.0, 4.0, 401)
+    x, z = curved(t, 0.08, 0.1).T
+    inside = t <= 0.95 * 4.0
+    np.testing.assert_allclose(((x[inside] - 0.2) / 0.2) ** 2 + (z[inside] / 0.08) ** 2, 1.0, atol=1e-12)
+    assert z.min() == pytest.approx(-0.08)
+    np.testing.assert_allclose(np.diff(x[~inside]), 0.0)  # it stops at 95 %
+
+
+def test_fastest_cut_lasts_the_published_2_6_seconds():
+    """0.4 m / 0.15 m/s is 2.67 s; the published scripts say 2.6."""
+    z = curved(np.linspace(0, 3, 3001), 0.05, 0.15)[:, 1]
+    assert np.argmin(z) == pytest.approx(1300, abs=1)
+
+
+def test_ramp_goes_down_across_and_up():
+    t = np.array([0.0, 1.0, 2.0, 4.0, 6.0, 7.0, 8.0, 20.0])
+    x, z = ramp(t, 0.05, 0.1).T
+    np.testing.assert_allclose(z, [0, -0.025, -0.05, -0.05, -0.05, -0.025, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(x, [0, 0.025, 0.05, 0.25, 0.45, 0.475, 0.5, 0.5], atol=1e-12)
+
+
+def test_sampled_path_interpolates_and_rests_at_its_ends():
+    quarter = about_y(np.pi / 2)
+    path = [[1.0, 0, 0, 0, 0, 0, 0, 1], [3.0, 2, 0, -1, *quarter]]
+    poses = sampled_poses(np.array(path), np.array([0.0, 1.0, 2.0, 3.0, 9.0]))
+    np.testing.assert_allclose(poses[:, 0], [0, 0, 1, 2, 2])
+    np.testing.assert_allclose(poses[2, 3:], about_y(np.pi / 4), atol=1e-12)
+    np.testing.assert_allclose(poses[0], path[0][1:])
+    np.testing.assert_allclose(poses[4], path[1][1:], atol=1e-12)
+
+
+def test_a_path_of_one_pose_rests():
+    poses = sampled_poses(np.array([[0.0, 1, 2, 3, 0, 0, 0, 1]]), np.array([0.0, 5.0]))
+    np.testing.assert_allclose(poses, [[1, 2, 3, 0, 0, 0, 1]] * 2)
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([[0.0, 1, 2, 3]], "rows of 8 numbers"),
+        ([[0.0, 1, 2, float("nan"), 0, 0, 0, 1]], "not finite in row 1, column 4"),
+        ([[0.0, 1, 2, 3, 0, 0, 0, 1], [0.0, 1, 2, 3, 0, 0, 0, 1]], "row 2 does not come after"),
+        ([[0.0, 1, 2, 3, 0, 0, 0, 2]], "quaternion in row 1 is not of length 1"),
+    ],
+)
+def test_bad_paths(rows, words):
+    with pytest.raises(SceneError, match=words):
+        sampled_poses(np.array(rows), np.array([0.0]))
+
+
+def test_quaternions_agree_with_scipy():
+    a, b = (
+        Rotation.random(20, rng=np.random.default_rng(0)),
+        Rotation.random(20, rng=np.random.default_rng(1)),
+    )
+    v = np.random.default_rng(2).normal(size=(20, 3))
+    np.testing.assert_allclose(rotate(a.as_quat(), v), a.apply(v), atol=1e-12)
+    product = multiply(a.as_quat(), b.as_quat())
+    np.testing.assert_allclose(rotate(product, v), (a * b).apply(v), atol=1e-12)
+    np.testing.assert_allclose(angular_velocity(b.as_quat(), product, 1.0), a.as_rotvec(), atol=1e-9)
+    half = slerp(b.as_quat(), product, np.full(20, 0.5))
+    turned = (Rotation.from_rotvec(0.5 * a.as_rotvec()) * b).apply(v)
+    np.testing.assert_allclose(rotate(half, v), turned, atol=1e-9)
+
+
+def turning(*rows: tuple[float, float], **kw) -> Push:
+    """A box in the bed of `cut`, turned about its middle by angles [degrees] at times [s]."""
+    path = tuple((t, 0.24, 0.2, 0.02, *about_y(math.radians(angle))) for t, angle in rows)
+    return Push(bed=cut().bed, tool=Box(size=(0.1, 0.1, 0.06)), path=path, **({"duration": 0.1} | kw))
+
+
+def test_the_fastest_point_counts():
+    """Sixty turns a second, each from one frame to the next, where nothing is seen of them."""
+    scene = turning(*((quarter / 240.0, 90.0 * quarter) for quarter in range(25)))
+    np.testing.assert_allclose(scene.body_poses()[0], np.abs(scene.body_poses()[3]), atol=1e-12)
+    rim = 120.0 * math.pi * scene.tool.reach
+    assert top_body_speed(scene) == pytest.approx(rim)
+    assert substeps_per_frame(scene) > 2 * substeps_per_frame(turning((0.0, 0.0)))
+    assert Guard(scene, 1e-4).speed_bound > 4.0 * rim
+    np.testing.assert_allclose(expected_flow(scene).speed, rim)
+
+
+def test_a_guard_knows_how_fast_a_path_is_between_frames():
+    """A tenth of a turn within a millisecond, in a frame of 17 ms."""
+    scene = turning((0.0, 0.0), (0.051, 0.0), (0.052, 36.0), (0.1, 36.0))
+    way = math.radians(36.0) * scene.tool.reach
+    assert top_body_speed(scene) == pytest.approx(60.0 * way)
+    for step, fastest in ((1e-4, 1e3 * way), (1e-3, 1e3 * way), (2e-3, 5e2 * way)):
+        assert top_body_speed(scene, step) == pytest.approx(fastest)
+
+
+def test_motion_without_rotation_counts_as_before():
+    scene = cut()
+    step = np.linalg.norm(np.diff(scene.body_poses()[:, :3], axis=0), axis=1)
+    assert top_body_speed(scene) == step.max() * scene.frame_rate
+    assert top_body_speed(Scene()) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([(0.0, 0.0), (0.02, 0.0), (0.020000001, 90.0)], "turns by 90 degrees within substep"),
+        (
+            [(0.0, 0.0), *((0.02 + 1e-10 * k, 90.0 * k) for k in range(5))],
+            "turns by 360 degrees within substep",
+        ),
+    ],
+    ids=["quarter", "whole"],
+)
+def test_a_body_that_turns_at_once_stops_the_solver(rows, words):
+    """Also when it is back where it was before the substep ends."""
+    frames = Solver(turning(*rows)).frames()
+    assert [next(frames).index, next(frames).index] == [0, 1]
+    with pytest.raises(
+        SolverStopped, match=words + r" .* of frame 2, .* at 0\.0(19|20).* allowed: 0\.01 m"
+    ) as caught:
+        next(frames)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_body_that_comes_back_within_a_substep_stops_the_solver():
+    path = tuple(
+        (t, x, 0.2, 0.2, 0, 0, 0, 1) for t, x in [(0, 0.2), (1e-5, 0.2), (1.1e-5, 0.22), (1.2e-5, 0.2)]
+    )
+    with pytest.raises(SolverStopped, match=r"the body jumps by 0.04 m .* at 0.00000 s"):
+        list(Solver(cut(motion="path", path=path, duration=0.05)).frames())
+
+
+def test_a_wheel_that_turns_too_fast_stops_the_solver():
+    """On the spot, so fast that no step is short enough; a wheel's poses show no whole turns."""
+    wheel = Wheel(bed=cut().bed, duration=0.05, settle=0.0, slip=1.0, rim_speed=3000.0)
+    with pytest.raises(SolverStopped, match=r"the body jumps by 0 m .* half a grid spacing"):
+        list(Solver(wheel).frames())
+    slow = Wheel(bed=cut().bed)
+    assert top_body_speed(slow) == pytest.approx(slow.speed + slow.angular_speed * slow.body.reach)
+
+
+def test_a_path_that_leaves_the_bin_between_frames():
+    path = tuple(
+        (t, 0.24, 0.2, z, 0, 0, 0, 1) for t, z in [(0.0, 0.2), (0.04, 0.2), (0.042, -0.1), (0.044, 0.2)]
+    )
+    with pytest.raises(SceneError, match=r"the plate leaves the bin at 0\.042 s"):
+        cut(motion="path", path=path)
+    later = tuple((t + 0.5, *rest) for t, *rest in path)
+    cut(motion="path", path=later)  # the scene ends before
+
+
+# --- The wheel: its motion, its load, and what the soil does to it --------------------------------------
+
+
+def wheel(**kw) -> Wheel:
+    """A small wheel on a coarse bed: 1 200 particles."""
+    values = {
+        "bed": Bed(size=(0.30, 0.16, 0.08), spacing=0.02, particles_per_cell=2.5, headroom=0.1),
+        "diameter": 0.12,
+        "load": 60.0,
+        "damping": 20.0,
+        "rim_speed": 0.1,
+        "settle": 0.4,
+        "start": 0.4,
+        "contact_margin": -0.37,  # contact begins when a particle's centre is at the surface
+    }
+    values |= kw
+    values.setdefault("duration", values["settle"] + 1.0 / 60.0)
+    return Wheel(**values)
+
+
+def test_slip_kinematics():
+    """Rest, then constant speeds with slip 1 - v / (w R); the lowest point of a forward wheel moves backwards."""
+    scene = wheel(slip=0.25, settle=0.5, duration=1.5)
+    poses = scene.poses_at(np.array([0.0, 0.5, 1.0, 1.5]))
+    np.testing.assert_allclose(np.diff(poses[:, 0]), [0.0, 0.0375, 0.0375], atol=1e-12)
+    np.testing.assert_array_equal(poses[0], poses[1])
+    spun = rotate(poses[:, 3:], np.array([0.0, 0.0, -1.0]))
+    angle = np.arctan2(-spun[:, 0], -spun[:, 2])
+    np.testing.assert_allclose(angle, [0, 0, 0.1 / 0.06 * 0.5, 0.1 / 0.06], atol=1e-12)
+    assert 1.0 - scene.speed / (scene.angular_speed * 0.06) == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(("slip", "speed"), [(0.2, 15.60), (0.3846153846, 12.00), (0.7, 5.85)])
+@pytest.mark.parametrize(("diameter", "spin"), [(0.30, 0.13), (0.15, 0.26), (0.05, 0.78)])
+def test_published_speeds(slip, speed, diameter, spin):
+    scene = Wheel(slip=slip, diameter=diameter)
+    assert 1e3 * scene.speed == pytest.approx(speed, abs=1e-6)
+    assert scene.angular_speed == pytest.approx(spin)
+
+
+def test_weight_is_the_load_in_any_gravity():
+    for gravity in (1.62, 9.81):
+        scene = wheel(gravity=gravity)
+        assert scene.axle.mass * gravity == pytest.approx(scene.load)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_free_fall_of_a_wheel_is_exact(precision):
+    """Symplectic Euler, in double precision whatever the solver's: z falls by g dt^2 n (n + 1) / 2."""
+    scene = wheel(clearance=0.05, damping=0.0, settle=1.0 / 12.0)
+    solver = Solver(scene, precision=precision)
+    frames = list(solver.frames())
+    n = (scene.frame_count - 1) * solver.substeps_per_frame
+    drop = frames[0].body_pose[2] - frames[-1].body_pose[2]
+    assert 0.03 < drop
+    assert drop == pytest.approx(9.81 * solver.time_step**2 * n * (n + 1) / 2, rel=1e-12)
+    nodes = frames[-1].body_points[:, 2].mean()
+    assert nodes == pytest.approx(frames[-1].body_pose[2])
+    assert not frames[-1].force.any()
+
+
+def test_damped_fall_reaches_its_terminal_speed():
+    """g / damping, exactly, for the damping is implicit."""
+    scene = wheel(clearance=0.05, damping=500.0, settle=0.2)
+    z = [f.body_pose[2] for f in Solver(scene).frames()]
+    assert 60.0 * (z[-2] - z[-1]) == pytest.approx(9.81 / 500.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("kw", [{}, {"gravity": 1.62, "settle": 1.0}, {"bilateral": True, "friction": 3.0}])
+def test_a_wheel_at_rest_carries_its_load(kw):
+    # Anywhere else the lattice is not the same on both sides, and friction holds that.
+    scene = wheel(start=0.5, **kw)
+    frames = list(Solver(scene).frames())
+    rest = frames[len(frames) // 2 : -1]  # in the last one it is driven
+    force = np.mean([f.force for f in rest], axis=0)
+    assert force[2] == pytest.approx(scene.load, rel=0.02)
+    assert np.abs(force[:2]).max() < 0.002 * scene.load
+    z = np.array([f.body_pose[2] for f in rest])
+    assert np.ptp(z) < 0.002
+    assert 0.0 < scene.sinkage(frames[-1].body_pose[None])[0] < 0.03
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """Driving for 0.6 s at 40 % slip, in double precision."""
+    scene = wheel(slip=0.4, settle=0.2, duration=0.8)
+    return scene, list(Solver(scene, precision="float64").frames())
+
+
+def test_soil_resists_the_rotation_and_pulls_the_wheel_forward(driven):
+    scene, frames = driven
+    last = frames[30:]
+    force, torque = (np.mean([getattr(f, k) for f in last], axis=0) for k in ("force", "torque"))
+    assert torque[1] < -0.1 * scene.load * 0.06
+    assert abs(torque[1]) <= scene.friction * scene.load * 0.06 * 1.2
+    assert force[0] > 0.0  # at 40 % slip on friction 0.75 traction exceeds the resistance
+    assert force[2] == pytest.approx(scene.load, rel=0.05)
+
+
+def test_no_lateral_force(driven):
+    _, frames = driven
+    force, torque = (np.array([getattr(f, k) for f in frames]) for k in ("force", "torque"))
+    assert np.abs(force[:, 1]).max() < 1e-8 * np.abs(force).max()
+    assert np.abs(torque[:, [0, 2]]).max() < 1e-8 * np.abs(torque).max()
+
+
+def test_poses_hold_the_computed_height(driven):
+    scene, frames = driven
+    poses = np.array([f.body_pose for f in frames])
+    planned = scene.body_poses()
+    np.testing.assert_allclose(poses[:, [0, 1, 3, 4, 5, 6]], planned[:, [0, 1, 3, 4, 5, 6]], atol=1e-12)
+    assert poses[-1, 2] < planned[-1, 2]
+    middle = np.array([f.body_points.mean(axis=0) for f in frames])
+    np.testing.assert_allclose(middle, poses[:, :3], atol=1e-9)
+
+
+def test_momentum_goes_from_the_wheel_to_the_soil():
+    """A wheel falls on a free block: both lose to gravity only, and one gains what the other loses."""
+    bed = replace(block().bed, low=(0.1, 0.1, -0.1), high=(0.2, 0.2, 0.0))
+    scene = wheel(
+        bed=bed,
+        load=5.0,
+        damping=0.0,
+        settle=0.02,
+        duration=0.04,
+        frame_rate=100.0,
+        start=0.5,
+        slip=0.9,
+        clearance=-0.012,
+    )
+    solver = Solver(scene, precision="float64")
+    frames = list(solver.frames())
+    time = scene.duration
+    impulse = sum(f.force for f in frames) / scene.frame_rate
+    assert np.linalg.norm(impulse) > 1e-3
+    soil, _ = momenta(solver)
+    mass = solver.particle_count * solver._grid.particle_mass
+    np.testing.assert_allclose(
+        soil + mass * 9.81 * time * np.array([0, 0, 1]), -impulse, atol=1e-10 * np.linalg.norm(impulse)
+    )
+    speed = solver._body._axle.numpy()[1]
+    assert scene.axle.mass * (speed + 9.81 * time) == pytest.approx(impulse[2], rel=1e-10)
+
+
+def test_bilateral_contact_holds_soil_that_a_separable_one_lets_go():
+    """A wheel that rotates on the spot while it is let up: only held soil pulls it down."""
+    lifted = {}
+    for bilateral in (False, True):
+        scene = wheel(bilateral=bilateral, settle=0.2)
+        solver = Solver(scene)
+        frames = solver.frames()
+        for _ in range(10):
+            next(frames)
+        solver._body._axle.assign([solver._body._axle.numpy()[0], 0.5, 0.0])
+        lifted[bilateral] = next(frames).force[2]
+    assert lifted[False] >= 0.0
+    assert lifted[True] < -1.0
+
+
+def test_a_wheel_much_lighter_than_its_soil_is_stable():
+    """0.3 kg on up to 150 springs made for particles of 6 g: shorter steps, and it rests."""
+    light = wheel(load=3.0, settle=0.3)
+    solver = Solver(light)
+    assert solver.substeps_per_frame > 4 * Solver(wheel()).substeps_per_frame
+    frames = list(solver.frames())
+    z = np.array([f.body_pose[2] for f in frames])
+    assert np.abs(z - z[0]).max() < 0.02
+    assert np.mean([f.force[2] for f in frames[10:]]) == pytest.approx(3.0, rel=0.05)
+
+
+def test_the_stable_step_is_stable_and_not_far_from_the_limit():
+    """A mass on many springs under symplectic Euler with a lagged damper."""
+
+    def grows(dt):
+        x, v = 1.0, 0.0
+        for _ in range(2000):
+            v += dt * (-n * k * x - n * c * v) / mass
+            x += dt * v
+            if abs(x) > 1e6:
+                return True
+        return False
+
+    for mass, n, k, c in ((1.0, 50, 1e4, 6.0), (0.01, 50, 1e4, 6.0), (0.01, 50, 1e4, 0.0)):
+        dt = stable_step(mass, n, k, c)
+        assert not grows(dt)
+        assert grows(2.1 * dt)
+
+
+def test_a_wheel_that_reaches_the_floor_stops_the_run():
+    empty = BlockBed(size=(0.3, 0.16, 0.08), spacing=0.02, low=(0, 0, -0.08), high=(0.02, 0.02, -0.06))
+    with pytest.raises(SolverStopped, match=r"the body reached the floor of the bin by 0\.1\d+ s"):
+        list(Solver(wheel(bed=empty, damping=0.0)).frames())
+
+
+@pytest.mark.parametrize("gravity", [1.62, 3.72, 9.81])
+@pytest.mark.parametrize("friction_angle", [30.0, 37.0, 43.0])
+def test_all_published_combinations_are_valid_scenes(gravity, friction_angle):
+    """3 x 3 of these times 27: 243."""
+    bed = Bed(size=(0.40, 0.19, 0.0583))
+    for diameter, width, share in ((0.30, 0.125, 1), (0.15, 0.0833, 1), (0.05, 0.0833, 9)):
+        for load in (100.0, 164.0, 225.0):
+            for slip in (0.2, 0.3846153846, 0.7):
+                scene = Wheel(
+                    bed=bed, gravity=gravity, friction_angle=friction_angle, diameter=diameter,
+                    width=width, load=load / share, slip=slip,
+                )  # fmt: skip
+                assert scene.arrangement_hash == bed.arrangement_hash
+                assert Scene.from_dict(json.loads(json.dumps(scene.to_dict()))) == scene
+                assert scene.body_points().shape == (16, 3)
+
+
+def test_friction_angles():
+    assert static_friction(37.0) == pytest.approx(math.tan(math.radians(37.0)))
+    mild = wheel(friction_angle=43.0)  # 0.9325: below the limit friction, which stays
+    assert mild.material.static_friction == pytest.approx(0.932515, abs=1e-6)
+    assert mild.material.limit_friction == 0.9616
+    assert mild.warnings() == []
+    steep = wheel(friction_angle=45.0)
+    assert steep.material.static_friction == pytest.approx(1.0)
+    assert steep.material.limit_friction == pytest.approx(1.2016)  # 0.2016 above, as before
+    assert "is raised to 1.2016" in steep.warnings()[0]
+    own = Material(static_friction=0.5, limit_friction=0.6)
+    assert wheel(material=own).material == own
+
+
+def test_grousers_raise_the_wheel_and_warn_when_thin():
+    scene = wheel(grousers=12, grouser_height=0.01, grouser_thickness=0.004)
+    assert scene.body_poses()[0, 2] == pytest.approx(0.07)
+    assert any("0.20 grid spacings thick" in w for w in scene.warnings())
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"load": 0.0}, "scene.load is 0.0 N; a wheel needs more than 0"),
+        ({"gravity": 0.0}, "scene.gravity"),
+        ({"slip": 1.5}, "scene.slip is 1.5; allowed: -1 to 1"),
+        ({"settle": -1.0, "duration": 1.0}, "scene.settle"),
+        ({"damping": -1.0}, "scene.damping"),
+        ({"diameter": 0.0}, "scene.diameter"),
+        ({"grousers": 4}, "scene.grouser_height"),
+        ({"width": 0.3}, "only 0.16 m wide"),
+        ({"friction_angle": 95.0}, "friction_angle is 95.0"),
+        ({"start": 0.9, "duration": 9.0}, "the axle moves from"),
+        ({"clearance": float("nan")}, "scene.clearance"),
+    ],
+)
+def test_what_a_wheel_refuses(change, words):
+    with pytest.raises(SceneError, match=words):
+        wheel(**change)
+
+
+def test_a_wheels_summary_leaves_the_settling_out():
+    scene = wheel(settle=0.1, duration=0.2)
+    poses = scene.body_poses()
+    force, torque = np.zeros((len(poses), 3)), np.zeros((len(poses), 3))
+    force[:7] = 1000.0
+    force[7:], torque[7:, 1] = [2.0, 0.0, 60.0], -0.5
+    words = scene.summary(force, torque, poses)
+    assert "drawbar pull 2.00 N, vertical force 60.00 N" in words
+    assert "torque -0.500 N m" in words

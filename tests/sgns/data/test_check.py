@@ -1,0 +1,266 @@
+"""`check_run` finds every planted fault, and nothing in a good file."""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from synthetic import make_run, make_writer, random_frame
+
+from sgns.config import UserError
+from sgns.data.check import check_run, main, run_files
+from sgns.data.run import Run
+
+# --- `check_run` finds every planted fault, and nothing in a good file ----------------------------------
+
+
+def spoil(path, change):
+    """The problems of a good run after `change(file)`."""
+    assert check_run(make_run(path)) == []
+    with h5py.File(path, "r+") as file:
+        change(file)
+    return check_run(path)
+
+
+def put(name, where, value):
+    def change(file):
+        file[name][where] = value
+
+    return change
+
+
+def replace(name, value):
+    def change(file):
+        del file[name]
+        file[name] = value
+
+    return change
+
+
+def attribute(name, value):
+    def change(file):
+        file.attrs[name] = value
+
+    return change
+
+
+GOOD = [{}, {"frames": 1}, {"n": 1, "m": 0}, {"producer": "rollout", "seed": 5}]
+
+
+@pytest.mark.parametrize("kw", GOOD, ids=str)
+def test_a_good_run_has_no_problems(tmp_path, kw):
+    assert check_run(make_run(tmp_path / "a.h5", **kw)) == []
+
+
+FAULTS = [
+    # values that Run would read without complaint
+    (put("particles/soil/position/value", (3, 7, 1), np.nan), "position of particle 7 is not finite"),
+    (put("particles/soil/velocity/value", (0, 2), np.inf), "velocity of particle 2 is not finite at frame 0"),
+    (put("particles/soil/position/value", (3, 7, 1), 0.1), "changed or damaged"),
+    (put("observables/body/force/value", (4, 0), 1.0), "changed or damaged"),
+    (put("observables/body/torque/value", 4, np.nan), "torque is not finite at frame 4"),
+    (put("observables/body/pose/value", (2, 6), 0.5), "quaternion of frame 2"),
+    (put("observables/body/pose/value", (5, 0), 0.3), "of frame 5 is .* from where the pose puts it"),
+    (put("particles/body/position/value", (1, 4, 2), 9.0), "body point 4 of frame 1"),
+    (put("particles/soil/position/time", 5, 0.01), "time does not increase at frame 5"),
+    (put("particles/soil/position/time", 5, np.nan), "time is not finite at frame 5"),
+    (put("particles/soil/position/time", -1, 0.19), "not by 1 / frame_rate"),
+    (put("particles/soil/position/step", 5, 0), "step does not increase at frame 5"),
+    (replace("observables/body/force/time", np.arange(12) / 30), "force/time differs"),
+    # structure
+    (replace("observables/body/pose/value", np.zeros((12, 6))), r"shape \(12, 6\), expected \(12, 7\)"),
+    (replace("observables/body/force/value", np.zeros((11, 3))), r"shape \(11, 3\), expected \(12, 3\)"),
+    (replace("particles/soil/velocity/value", np.zeros((12, 49, 3))), r"expected \(12, 50, 3\)"),
+    (replace("particles/soil/velocity/value", np.zeros((12, 150))), r"shape \(12, 150\), expected"),
+    (replace("particles/soil/position/step", np.zeros(12)), "step has the wrong type"),
+    (lambda file: file.pop("h5md"), "/h5md is missing"),
+    (lambda file: file.pop("h5md/author"), "name of /h5md/author"),
+    (lambda file: file.pop("particles/body/box"), "/particles/body/box"),
+    # provenance
+    (attribute("scene", "a: [1"), "'scene' is not YAML"),
+    (attribute("scene", "just text"), "'scene' is not a group of keys"),
+    (attribute("effects", "yielding: true"), "effect 'yielding'"),
+    (attribute("producer", "me"), "producer is 'me'"),
+    (attribute("frame_rate", -1.0), "frame_rate is -1.0"),
+    (attribute("frame_rate", 0.0), "frame_rate is 0.0; it must be above 0 Hz"),
+    (attribute("wall_time_s", np.nan), "wall_time_s is nan; it must be 0 s or more"),
+    (attribute("scene", "speed: fast"), "scene.speed is 'fast', not a finite number"),
+    (attribute("scene", "diameter: .nan"), "scene.diameter is nan"),
+    (attribute("scene", "blade: {width: [1], length: 1, thickness: 1}"), r"scene.blade.width is \[1\]"),
+    (attribute("scene", "blade: plate"), "scene.blade is 'plate', not a group of keys"),
+    (attribute("frame_rate", "fast"), "'frame_rate' has the wrong type"),
+    (attribute("wall_time_s", np.nan), "wall_time_s is nan"),
+    (attribute("content_hash", "0" * 32), "changed or damaged"),
+    # the view
+    (lambda file: file.pop("VTKHDF"), "/VTKHDF is missing"),
+    (lambda file: file.pop("VTKHDF/Points"), "/VTKHDF/Points is missing"),
+    (lambda file: file.pop("VTKHDF/Steps/PointOffsets"), "Steps/PointOffsets is missing"),
+    (put("VTKHDF/NumberOfPoints", 0, 3), "NumberOfPoints does not fit"),
+    (replace("VTKHDF/Points", np.zeros((600, 3), "f4")), "is a copy"),
+    (replace("VTKHDF/Points", np.zeros((600, 3), "f4")), "shows another position at frame 0"),
+    (replace("VTKHDF/PointData/velocity", np.zeros((5, 3), "f4")), "velocity has shape"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), FAULTS, ids=[words for _, words in FAULTS])
+def test_a_planted_fault_is_found(tmp_path, change, words):
+    problems = spoil(tmp_path / "a.h5", change)
+    assert any(re.search(words, problem) for problem in problems), problems
+    assert all("\n" not in problem for problem in problems)
+
+
+def test_all_problems_are_listed(tmp_path):
+    def change(file):
+        del file["h5md"], file["observables/body/force"], file["VTKHDF"], file.attrs["seed"]
+        file.attrs["producer"] = "me"
+
+    problems = spoil(tmp_path / "a.h5", change)
+    text = "\n".join(problems)
+    for words in ("h5md", "force/value", "force/step", "force/time", "seed", "producer"):
+        assert words in text
+
+
+def test_bad_values_are_all_listed(tmp_path):
+    def change(file):
+        file["particles/soil/position/value"][3, 7] = np.nan
+        file["observables/body/pose/value"][2] = 1.0
+        file["particles/soil/position/time"][5] = 9.0
+
+    text = "\n".join(spoil(tmp_path / "a.h5", change))
+    for words in ("particle 7", "quaternion", "time", "content_hash"):
+        assert words in text
+
+
+def test_a_file_that_cannot_be_opened_is_one_problem(tmp_path):
+    (tmp_path / "text.h5").write_text("x")
+    for name in ("none.h5", "text.h5", "."):
+        (problem,) = check_run(tmp_path / name)
+        assert str(tmp_path) in problem
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_damage_never_surprises(tmp_path, seed):
+    """Whatever bytes change, `Run` and `check_run` answer in words."""
+    rng = np.random.default_rng(seed)
+    good = make_run(tmp_path / "good.h5", frames=3, n=5, m=3).read_bytes()
+    noticed = 0
+    for _ in range(25):
+        data = bytearray(good)
+        at = int(rng.integers(48, len(data) - 16))
+        data[at : at + 8] = rng.bytes(8)
+        path = tmp_path / "bad.h5"
+        path.write_bytes(data)
+        problems = check_run(path)
+        noticed += bool(problems)
+        try:
+            with Run(path) as run:
+                run.positions(), run.velocities(), run.force, run.scene, run.effects, run.content_hash
+        except UserError as error:
+            assert problems and "\n" not in str(error)
+    assert noticed > 0
+
+
+CORNERS = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
+FACES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+BOX = CORNERS, np.array([[f[0], f[k], f[k + 1]] for f in FACES for k in (1, 2)])
+TOOL = {"tool": {"shape": "mesh", "file": "/etc/passwd", "digest": "0123"}}
+
+
+def mesh_run(path, mesh=BOX, scene=TOOL):
+    """A run of two frames whose tool is a box."""
+    with make_writer(path, n=3, m=2, scene=scene, mesh=mesh) as writer:
+        for i in range(2):
+            frame = random_frame(i, n=3, m=2)
+            writer.append(**frame | {"body_points": frame["body_pose"][:3] + CORNERS[[0, 5]]})
+        writer.finish(1.0)
+    return path
+
+
+def test_a_run_holds_the_mesh_of_its_tool(tmp_path):
+    path = mesh_run(tmp_path / "a.h5")
+    assert check_run(path) == []
+    with Run(path) as run, h5py.File(path) as file:
+        for found, kept in zip(run.mesh, BOX, strict=True):
+            np.testing.assert_array_equal(found, kept)
+        assert file["parameters/tool/vertices"].dtype == "<f8"
+        assert file["parameters/tool/triangles"].dtype == "<i4"
+    with Run(make_run(tmp_path / "b.h5")) as run:
+        assert run.mesh is None
+
+
+VERTICES, TRIANGLES = "parameters/tool/vertices", "parameters/tool/triangles"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (put(VERTICES, (0, 0), np.nan), "not finite"),
+        (put(VERTICES, (0, 0), 0.2), "centre of mass"),
+        (put(VERTICES, ..., 1.01 * CORNERS), "the mesh is of another tool"),
+        (put(TRIANGLES, (0, 0), 8), "vertex that is not there"),
+        (put(TRIANGLES, (0, 0), -1), "vertex that is not there"),
+        (put(TRIANGLES, ..., BOX[1][:, ::-1]), "faces inwards"),
+        (replace(TRIANGLES, BOX[1].astype("f8")), "wrong type float64"),
+        (replace(VERTICES, CORNERS.ravel()), "has shape (24,)"),
+        (replace(TRIANGLES, h5py.SoftLink("/particles")), "is a link to elsewhere"),
+        (replace(VERTICES, h5py.ExternalLink("other.h5", "/x")), "is a link to elsewhere"),
+        (lambda file: file.__delitem__(VERTICES), f"dataset /{VERTICES} is missing"),
+        (lambda file: file.__delitem__(TRIANGLES), f"dataset /{TRIANGLES} is missing"),
+        (attribute("scene", "tool: {shape: mesh, file: /etc/passwd}"), "without the digest"),
+    ],
+)
+def test_damage_to_a_mesh_is_found(tmp_path, change, words):
+    path = mesh_run(tmp_path / "a.h5")
+    with h5py.File(path, "r+") as file:
+        change(file)
+    (problem,) = check_run(path)
+    assert words in problem and "\n" not in problem
+    if "another tool" not in words:
+        with pytest.raises(UserError, match=re.escape(words)), Run(path) as run:
+            _ = run.scene, run.mesh
+
+
+# --- Which files `sgns check` reads, and what it says of them -------------------------------------------
+
+
+def test_a_dataset_stands_for_its_runs_in_order(tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    for name in ("b.h5", "a.h5", ".a.h5.123", ".half.h5", "notes.txt"):
+        (tmp_path / "runs" / name).touch()
+    (tmp_path / "basis.h5").touch()
+    expected = [tmp_path / "runs/a.h5", tmp_path / "runs/b.h5"]
+    assert run_files([tmp_path]) == run_files([tmp_path / "runs"]) == expected
+    assert run_files([expected[1], expected[0]]) == expected[::-1]
+
+
+def test_what_cannot_be_checked_is_said(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="holds no run file"):
+        run_files([tmp_path])
+    with pytest.raises(UserError, match="no such file"):
+        run_files([tmp_path / "nope.h5"])
+    with pytest.raises(UserError, match="nothing to check"):
+        run_files([])
+
+
+def test_good_files_are_good(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    make_run(tmp_path / "run.h5")
+    with caplog.at_level(logging.INFO):
+        assert main(OmegaConf.create({"files": str(tmp_path / "run.h5")})) == 0
+    assert caplog.messages == [f"{tmp_path / 'run.h5'}: good"]
+
+
+def test_every_file_is_read_before_a_bad_one_is_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    make_run(tmp_path / "good.h5")
+    (tmp_path / "bad.h5").write_bytes(b"not HDF5")
+    with caplog.at_level(logging.INFO), pytest.raises(UserError, match="1 of 2 files checked is not good"):
+        main(OmegaConf.create({"files": [str(tmp_path / "bad.h5"), str(tmp_path / "good.h5")]}))
+    assert caplog.messages[-1] == f"{tmp_path / 'good.h5'}: good"
+    assert caplog.messages[0].startswith(f"{tmp_path / 'bad.h5'}")
+    assert caplog.messages[0].count("bad.h5") == 1

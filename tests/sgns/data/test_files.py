@@ -1,0 +1,276 @@
+"""A claim on a file: one process has it, and it ends with that process."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from synthetic import make_run, make_writer, random_frame
+
+from sgns.config import UserError
+from sgns.data.files import claimed, claimed_in_turn, only_here, whole_file, write_whole
+
+# --- A claim on a file: one process has it, and it ends with that process -------------------------------
+
+pytest.importorskip("fcntl", reason="this system has no file locks")
+# Claims the file named on the command line, says so and waits for a line.
+HOLD = """
+import sys, pathlib
+from sgns.data.files import claimed
+with claimed(pathlib.Path(sys.argv[1])) as ours:
+    print(ours, flush=True)
+    sys.stdin.readline()
+"""
+# Adds 1 to a number in a file whenever it has the claim; a second process in between would lose a count.
+COUNT = """
+import sys, pathlib
+from sgns.data.files import claimed
+path, done = pathlib.Path(sys.argv[1]), 0
+while done < 200:
+    with claimed(path) as ours:
+        if ours:
+            path.write_text(str(int(path.read_text()) + 1))
+            done += 1
+"""
+
+
+def start(code, path):
+    return subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+
+
+def test_another_process_cannot_claim_until_the_first_ends(tmp_path):
+    path = tmp_path / "runs" / "a.h5"
+    with start(HOLD, path) as holder:
+        assert holder.stdout.readline() == "True\n"
+        with claimed(path) as ours:
+            assert not ours
+        with claimed(path.with_name("b.h5")) as ours:
+            assert ours
+        holder.kill()  # it leaves its lock file behind, without the lock
+    with claimed(path) as ours:
+        assert ours
+    assert list(path.parent.iterdir()) == []
+
+
+def test_an_error_gives_the_claim_back(tmp_path):
+    with pytest.raises(RuntimeError), claimed(tmp_path / "a.h5"):
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_claims_exclude_each_other(tmp_path):
+    path = tmp_path / "count"
+    path.write_text("0")
+    processes = [start(COUNT, path) for _ in range(3)]
+    assert [p.wait(timeout=60) for p in processes] == [0, 0, 0]
+    for process in processes:
+        process.stdin.close()
+        process.stdout.close()
+    assert path.read_text() == "600"
+    assert [p.name for p in tmp_path.iterdir()] == ["count"]
+
+
+def test_who_asks_second_hears_who_is_at_it(tmp_path):
+    path = tmp_path / "a.h5"
+    with start(HOLD, path) as holder:
+        assert holder.stdout.readline() == "True\n"
+        with pytest.raises(UserError) as caught, only_here(path):
+            pass
+        assert str(caught.value).startswith(f"{path} is being made by process {holder.pid}; wait until")
+        holder.kill()
+    with only_here(path), pytest.raises(UserError, match=f"process {os.getpid()};"), only_here(path):
+        pass  # the killed one left its number in the lock file
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_claim_in_turn_waits(tmp_path):
+    path = tmp_path / "a"
+    with start(HOLD, path) as holder:
+        assert holder.stdout.readline() == "True\n"
+        threading.Timer(0.3, holder.stdin.close).start()
+        with claimed_in_turn(path):
+            assert holder.stdin.closed
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: os.symlink("file", path)])
+def test_what_is_no_lock_file_is_not_used_as_one(tmp_path, make):
+    (tmp_path / "file").write_text("mine")
+    make(tmp_path / ".a.lock")
+    with pytest.raises(UserError, match=r"\.a\.lock: it is a"), only_here(tmp_path / "a"):
+        pass
+    with pytest.raises(UserError, match="file: File exists; choose"), only_here(tmp_path / "file" / "a"):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".a.lock", "file"]
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+# ---  ---------------------------------------------------------------------------------------------------
+
+
+def test_a_file_is_replaced_whole(tmp_path):
+    write_whole(tmp_path / "a", "old")
+    with whole_file(tmp_path / "a") as hidden:
+        hidden.write_text("new")
+        assert (tmp_path / "a").read_text() == "old"
+    assert (tmp_path / "a").read_text() == "new"
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path):
+    write_whole(tmp_path / "a", "old")
+    with pytest.raises(KeyError), whole_file(tmp_path / "a") as hidden:
+        hidden.write_text("half")
+        raise KeyError
+    assert (tmp_path / "a").read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def a_pipe(path):
+    os.mkfifo(path)
+
+
+def a_socket(path):
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(str(path))
+
+
+def a_device(path):
+    try:
+        os.mknod(path, 0o600 | 0o020000, os.makedev(1, 3))
+    except OSError:
+        pytest.skip("may not make devices here")
+
+
+def a_link_to_a_device(path):
+    path.symlink_to(os.devnull)
+
+
+def a_link_to_a_file(path):
+    path.with_name("file").write_text("old")
+    path.symlink_to("file")
+
+
+KINDS = [
+    (a_pipe, "a pipe"),
+    (a_socket, "a socket"),
+    (a_device, "a device"),
+    (a_link_to_a_device, "a symbolic link"),
+    (a_link_to_a_file, "a symbolic link"),
+    (os.mkdir, "a folder"),
+]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs pipes and links")
+@pytest.mark.parametrize(("make", "words"), KINDS)
+@pytest.mark.parametrize("when", ["before", "meanwhile"])
+def test_only_plain_files_are_replaced(tmp_path, make, words, when):
+    path = tmp_path / "a"
+    begun = False
+    if when == "before":
+        make(path)
+    with pytest.raises(UserError, match=f"cannot write .*a: it is {words}"), whole_file(path) as hidden:
+        begun = True
+        hidden.write_text("new")
+        make(path)
+    assert begun == (when == "meanwhile")
+    there = os.lstat(path).st_mode
+    assert {p.name for p in tmp_path.iterdir()} <= {"a", "file"}
+    path.rmdir() if words == "a folder" else path.unlink()
+    make(path) if make is not a_link_to_a_file else path.symlink_to("file")
+    assert os.lstat(path).st_mode == there  # it still was what it had been
+    if make is a_link_to_a_file:
+        assert (tmp_path / "file").read_text() == "old"
+
+
+# --- A file is complete under its name or not there at all, whatever the disk does ----------------------
+
+
+def test_places_that_cannot_be_written_are_named(tmp_path):
+    (tmp_path / "file").write_text("x")
+    for path in (tmp_path, tmp_path / "file" / "a.h5", tmp_path / ("x" * 300), Path("/proc/nowhere/a.h5")):
+        with pytest.raises(UserError) as caught:
+            make_writer(path)
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_without_permission_is_named(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(UserError, match="Permission denied"):
+        make_writer(tmp_path / "a.h5")
+    tmp_path.chmod(0o700)
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from synthetic import make_run
+from sgns.config import UserError
+folder, limit = Path(sys.argv[1]), int(sys.argv[2])
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+try:
+    make_run(folder / "a.h5", frames=30, n=200)
+except UserError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs resource limits")
+@pytest.mark.parametrize("limit", [1, 1_000, 30_000, 145_000, 155_000, 160_000])
+def test_a_disk_that_fills_up_at_any_moment(tmp_path, limit):
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(tmp_path), str(limit)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "" and done.stdout.count("\n") == 1 and "cannot write" in done.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs file locks")
+def test_leftovers_of_killed_processes_go_and_those_of_living_ones_stay(tmp_path):
+    with make_writer(tmp_path / "a.h5"):
+        (alive,) = tmp_path.iterdir()
+        host = alive.name.removeprefix(".a.h5.").rsplit("-", 2)[0]
+        dead = subprocess.Popen([sys.executable, "-c", ""])
+        dead.wait()
+        killed = tmp_path / f".a.h5.{host}-{dead.pid}-00000000.partial"
+        elsewhere = tmp_path / f".a.h5.other-{dead.pid}-00000000.partial"
+        for leftover in (killed, elsewhere):
+            leftover.write_bytes(b"x")
+        make_run(tmp_path / "a.h5", frames=2, n=3)
+        assert {p.name for p in tmp_path.iterdir()} == {"a.h5", alive.name, elsewhere.name}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_a_run_replaces_runs_only(tmp_path):
+    """Neither a pipe under its own name, nor what is no stopped run under the name of one."""
+    os.mkfifo(tmp_path / "a.h5")
+    os.mkfifo(tmp_path / "b.stopped.h5")
+    (tmp_path / "c.stopped.h5").write_text("mine")
+    make_run(tmp_path / "d.stopped.h5", frames=2, n=3)
+    for name, words in (("a", "a pipe"), ("b", "a pipe"), ("c", "no stopped run"), ("d", "no stopped run")):
+        with pytest.raises(UserError, match=words):
+            make_writer(tmp_path / f"{name}.h5")
+    with make_writer(tmp_path / "e.h5") as writer:
+        writer.append(**random_frame(0))
+        os.mkfifo(tmp_path / "e.h5")
+        with pytest.raises(UserError, match=r"e\.h5: it is a pipe"):
+            writer.finish(1.0)
+    with make_writer(tmp_path / "f.h5") as writer:
+        writer.append(**random_frame(0))
+        (tmp_path / "f.stopped.h5").write_text("mine")
+        writer.finish(1.0)
+    assert (tmp_path / "f.stopped.h5").read_text() == "mine"
+    names = "a.h5 b.stopped.h5 c.stopped.h5 d.stopped.h5 e.h5 f.h5 f.stopped.h5".split()
+    assert sorted(path.name for path in tmp_path.iterdir()) == names

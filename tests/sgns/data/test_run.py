@@ -1,0 +1,150 @@
+"""Reading runs: as numpy would, and every bad file is named in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from synthetic import make_run, make_writer, random_frame, start_positions
+
+from sgns.config import UserError
+from sgns.data.run import Run
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        *[
+            slice(None),
+            slice(3, 8),
+            slice(-3, None),
+            slice(None, None, 4),
+            slice(None, None, -1),
+            slice(5, 2),
+        ],
+        *[slice(5, 2), 3, -1, [4, 0, 0, 11], np.array([2, 1]), np.arange(12) % 3 == 0, []],
+    ],
+    ids=str,
+)
+def test_frames_are_chosen_as_numpy_does(tmp_path, frames):
+    with Run(make_run(tmp_path / "a.h5")) as run:
+        index = np.arange(12)[np.array(frames, dtype=int) if isinstance(frames, list) else frames]
+        expected = run.positions()[np.atleast_1d(index)]
+        np.testing.assert_array_equal(run.positions(frames), expected)
+        assert run.velocities(frames).shape == expected.shape
+        assert run.positions(frames).dtype == np.float32
+
+
+def test_what_is_given_out_may_be_changed(tmp_path):
+    with Run(make_run(tmp_path / "a.h5")) as run:
+        run.force[...] = 0.0
+        run.scene["depth"] = -1
+        assert run.force.any() and run.scene["depth"] > 0
+
+
+def test_a_closed_run_keeps_what_was_read(tmp_path):
+    with Run(make_run(tmp_path / "a.h5")) as run:
+        force = run.force
+    np.testing.assert_array_equal(run.force, force)
+    assert run.scene and run.producer == "mpm"
+    with pytest.raises(ValueError, match="is closed"):
+        run.positions()
+
+
+def test_opening_reads_no_soil(tmp_path):
+    path = make_run(tmp_path / "a.h5", frames=3, n=20)
+    with h5py.File(path) as file:
+        chunk = file["particles/soil/position/value"].id.get_chunk_info(1)
+    with path.open("r+b") as file:  # spoil a frame: whoever does not read it cannot notice
+        file.seek(chunk.byte_offset)
+        file.write(b"\xff" * chunk.size)
+    with Run(path) as run:
+        assert np.isfinite(run.force).all() and run.frame_count == 3
+        assert not np.isfinite(run.positions(1)).any()
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(UserError) as caught:
+        Run(path)
+    text = str(caught.value)
+    assert str(path) in text and "\n" not in text
+    return text
+
+
+def test_missing_folder_text_and_empty_files(tmp_path):
+    assert "no such run file" in refused(tmp_path / "none.h5")
+    assert "is a folder" in refused(tmp_path)
+    (tmp_path / "text.h5").write_text("not a run")
+    assert "not an HDF5 file" in refused(tmp_path / "text.h5")
+    (tmp_path / "empty.h5").write_bytes(b"")
+    assert "not an HDF5 file" in refused(tmp_path / "empty.h5")
+
+
+def test_foreign_hdf5(tmp_path):
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file["particles/soil/position/value"] = np.zeros((2, 3, 3))
+    assert "not a run of sgns" in refused(tmp_path / "foreign.h5")
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.5, 0.9, 0.999])
+def test_truncated(tmp_path, share):
+    path = make_run(tmp_path / "a.h5")
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    assert "cut short" in refused(path)
+
+
+def test_a_file_that_was_never_closed(tmp_path):
+    with make_writer(tmp_path / "a.h5", n=5000) as writer:
+        for i in range(3):
+            writer.append(**random_frame(i, n=5000))
+        (hidden,) = tmp_path.iterdir()
+        copied = tmp_path / "b.h5"
+        copied.write_bytes(hidden.read_bytes())
+    assert copied.exists()
+    refused(copied)
+
+
+def test_a_newer_format(tmp_path):
+    path = make_run(tmp_path / "a.h5")
+    with h5py.File(path, "r+") as file:
+        file.attrs["format_version"] = 99
+    assert "upgrade" in refused(path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["particles/soil/position/value", "particles/soil/velocity/time", "observables/body/pose", "particles"],
+)
+def test_missing_parts(tmp_path, name):
+    path = make_run(tmp_path / "a.h5")
+    with h5py.File(path, "r+") as file:
+        del file[name]
+    assert f"/{name}" in refused(path) and "sgns check" in refused(path)
+
+
+@pytest.mark.parametrize("name", ["scene", "seed", "content_hash", "wall_time_s", "format_version"])
+def test_missing_attributes(tmp_path, name):
+    path = make_run(tmp_path / "a.h5")
+    with h5py.File(path, "r+") as file:
+        del file.attrs[name]
+    assert name in refused(path)
+
+
+def test_yaml_cannot_build_objects(tmp_path):
+    path = make_run(tmp_path / "a.h5")
+    with h5py.File(path, "r+") as file:
+        file.attrs["scene"] = "!!python/object/apply:os.getcwd []"
+    with Run(path) as run, pytest.raises(UserError, match="scene is damaged"):
+        run.scene  # noqa: B018
+
+
+def test_synthetic_runs_share_their_start_and_differ_in_their_motion(tmp_path):
+    with Run(make_run(tmp_path / "a.h5", seed=1)) as a, Run(make_run(tmp_path / "b.h5", seed=2)) as b:
+        np.testing.assert_array_equal(a.positions(0), b.positions(0))
+        np.testing.assert_allclose(a.positions(0)[0], start_positions(50), atol=1e-7)
+        assert a.arrangement_hash == b.arrangement_hash and a.content_hash != b.content_hash
+        assert np.abs(a.positions(-1) - b.positions(-1)).max() > 1e-4
+        assert (a.force[1:, 0] <= 0).all()

@@ -1,0 +1,79 @@
+import json
+import math
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic import make_run
+from tiny import MODEL
+
+from sgns.config import UserError
+from sgns.evaluate import costs
+from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory
+from sgns.model.settings import ModelSettings
+
+# ---  ---------------------------------------------------------------------------------------------------
+
+CARD = {"settings": {"training": {"batch_size": 32}}}
+
+
+def test_nothing_is_known_of_a_checkpoint_that_is_not_there(tmp_path):
+    unknown = network_costs(tmp_path / "best.ckpt", {})
+    assert math.isnan(unknown.parameters) and math.isnan(unknown.seconds_per_step)
+
+
+def test_training_is_read_from_beside_the_checkpoint(tmp_path):
+    (tmp_path / "training.json").write_text(json.dumps({"steps": 50, "seconds": 2.0, "skill": 0.5}))
+    known = network_costs(tmp_path / "best.ckpt", CARD)
+    assert known.seconds_per_step == pytest.approx(0.04) and known.batch_size == 32
+    assert math.isnan(network_costs(tmp_path / "best.ckpt", {}).batch_size)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"steps": 3}', '{"steps": "x", "seconds": 1}', "null"])
+def test_damaged_summary_is_one_clear_line(tmp_path, text):
+    (tmp_path / "training.json").write_text(text)
+    with pytest.raises(UserError, match=r"training\.json is not the summary of a training") as caught:
+        network_costs(tmp_path / "best.ckpt", CARD)
+    assert "\n" not in str(caught.value)
+
+
+def test_size_and_weights_of_a_checkpoint(tmp_path, monkeypatch):
+    class Loaded:
+        dynamics = torch.nn.Linear(3, 4)
+
+    monkeypatch.setattr(costs, "load_surrogate", lambda path: Loaded)
+    (tmp_path / "best.ckpt").write_bytes(b"x" * 1234)
+    known = network_costs(tmp_path / "best.ckpt", {})
+    assert known.parameters == 16 and known.checkpoint_bytes == 1234
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts it this way")
+def test_peak_of_memory_is_seen_and_forgotten():
+    forget_peak()
+    before = peak_memory()
+    block = np.ones(40_000_000 // 8)
+    assert peak_memory() > before + 30e6
+    del block
+
+
+def test_systems_that_do_not_count_it(monkeypatch):
+    monkeypatch.setattr(costs, "Path", lambda name: (_ for _ in ()).throw(OSError(name)))
+    forget_peak()
+    assert math.isnan(peak_memory())
+
+
+# ---  ---------------------------------------------------------------------------------------------------
+
+SETTINGS = ModelSettings(**MODEL)
+
+
+@pytest.mark.parametrize("n", [200, 2000])
+def test_cost_of_a_network_on_every_particle(tmp_path, n):
+    run = make_run(tmp_path / "run.h5", n=n)
+    cost = full_space_cost(run, SETTINGS, 3)
+    assert cost.training_step > cost.rollout / 60.0 > 0.0
+    assert cost.peak_bytes > 1e7 and cost.batch_size == 2
+    wider = full_space_cost(run, replace(SETTINGS, hidden_width=2 * SETTINGS.hidden_width), 1)
+    assert wider.parameters > 2 * cost.parameters

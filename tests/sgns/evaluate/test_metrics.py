@@ -1,0 +1,310 @@
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from mpm_warp import Bed
+from sgns.config import UserError
+from sgns.data import run as chunks
+from sgns.evaluate.metrics import (
+    PositionErrors,
+    SurfaceGrid,
+    VectorErrors,
+    body_errors,
+    height_map,
+    mean_prediction,
+    particle_spacing,
+    position_errors,
+    skill,
+    surface_grid,
+)
+from sgns.reduction.basis import Basis
+
+# ---  ---------------------------------------------------------------------------------------------------
+
+
+def lattice(nx=12, ny=8, nz=4, spacing=0.05):
+    """A full bed whose top layer lies at z = 0, particles in the middle of their cells."""
+    axes = [np.arange(nx) + 0.5, np.arange(ny) + 0.5, -np.arange(nz)]
+    return spacing * np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def test_spacing_of_a_lattice():
+    assert particle_spacing(lattice()) == pytest.approx(0.05, rel=1e-9)
+
+
+def test_grid_covers_the_bed_with_columns_of_two_spacings():
+    grid = surface_grid(lattice())
+    assert grid.shape == (6, 4)
+    assert grid.x_edges[[0, -1]] == pytest.approx([0.0, 0.6])
+    assert grid.y_edges[[0, -1]] == pytest.approx([0.0, 0.4])
+    assert grid.x_centres[0] == pytest.approx(0.05)
+
+
+def test_known_bump():
+    bed = lattice()
+    bump = 0.03 * np.exp(-((bed[:, 0] - 0.325) ** 2) / 0.01)
+    raised = bed + np.stack([0 * bump, 0 * bump, bump], axis=1)
+    grid = surface_grid(bed)
+    heights = height_map(raised, grid)
+    # Every column's height is that of the higher of its two rows of top particles.
+    rows = np.sort(np.unique(bed[:, 0])).reshape(-1, 2)
+    expected = 0.03 * np.exp(-((rows - 0.325) ** 2) / 0.01).max(axis=1)
+    assert heights == pytest.approx(np.repeat(expected[:, None], 4, axis=1))
+
+
+def test_flat_bed_is_flat_and_order_does_not_matter():
+    bed = lattice()
+    grid = surface_grid(bed)
+    assert (height_map(bed, grid) == 0.0).all()
+    shuffled = np.random.default_rng(0).permutation(bed)
+    assert (height_map(shuffled, grid) == height_map(bed, grid)).all()
+
+
+def test_empty_column_is_nan_and_outside_counts_for_the_border():
+    grid = SurfaceGrid(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0]))
+    heights = height_map(np.array([[-5.0, 9.0, 0.3]]), grid)
+    assert heights[0, 0] == pytest.approx(0.3)
+    assert np.isnan(heights[1, 0])
+
+
+def test_thin_and_tiny_beds_have_a_grid():
+    assert surface_grid(np.zeros((1, 3))).shape == (1, 1)
+    line = np.stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)], axis=1)
+    assert surface_grid(line).shape[1] == 1
+
+
+@pytest.mark.parametrize("arrangement", ["lattice", "jittered"])
+def test_surface_error_of_a_thinned_bed_is_that_of_the_bed(arrangement):
+    bed = Bed(store_every=5, arrangement=arrangement)
+
+    def error(start):
+        hill = 0.03 * np.exp(
+            -((start[:, 0] - 0.4) ** 2 + (start[:, 1] - 0.3) ** 2) / 0.01 + start[:, 2] / 0.05
+        )
+        grid = surface_grid(start)
+        raised = height_map(start + np.stack([0 * hill, 0 * hill, hill], axis=1), grid)
+        return np.sqrt(
+            np.mean((raised - height_map(start, grid)) ** 2)
+        )  # a column without particles makes it NaN
+
+    full = bed.filled[0]
+    thinned = full[bed.stored]
+    assert error(thinned) == pytest.approx(error(full), rel=0.05)
+    assert particle_spacing(thinned) == pytest.approx(5 ** (1 / 3) * particle_spacing(full), rel=0.05)
+
+
+# ---  ---------------------------------------------------------------------------------------------------
+
+
+class ArrayRun:
+    """A run in memory."""
+
+    def __init__(self, positions, name="run.h5"):
+        self.values = np.asarray(positions, dtype=np.float32)
+        self.frame_count, self.particle_count, _ = self.values.shape
+        self.time = np.arange(self.frame_count) / 60.0
+        self.arrangement_hash = "same"
+        self.path = name
+
+    def positions(self, frames=slice(None)):
+        return self.values[frames]
+
+
+def make_basis(n=7, r=2, seed=0):
+    rng = np.random.default_rng(seed)
+    modes = np.linalg.qr(rng.normal(size=(n, r)))[0]
+    return Basis(
+        mean=torch.from_numpy(rng.normal(size=(n, 3))),
+        modes=torch.from_numpy(modes),
+        eigenvalues=torch.arange(r, 0, -1, dtype=torch.float64),
+        total_variance=float(r * (r + 1) / 2),
+        displacement_variance=1.0,
+        centring="particle_axis",
+    )
+
+
+def compared(truth, prediction, basis=None, history=2):
+    truth, prediction = ArrayRun(truth), ArrayRun(prediction)
+    grid = surface_grid(truth.values[0])
+    return position_errors(truth, prediction, basis or make_basis(truth.particle_count), history, grid)
+
+
+def random_walk(frames=9, n=7, seed=1, size=0.1):
+    return np.cumsum(np.random.default_rng(seed).normal(0.0, size, (frames, n, 3)), axis=0)
+
+
+def test_position_errors_by_hand():
+    # One particle that goes 0, 1, 3, 6 along x; the prediction stays at 1; two frames are given.
+    truth = np.zeros((4, 1, 3))
+    truth[:, 0, 0] = [0, 1, 3, 6]
+    prediction = np.zeros((4, 1, 3))
+    prediction[:, 0, 0] = [0, 1, 1, 1]
+    basis = make_basis(n=1, r=1)
+    errors = compared(truth, prediction, basis)
+    assert errors.frozen == pytest.approx([4 / 3, 25 / 3])
+    assert errors.total == pytest.approx([4 / 3, 25 / 3])
+    assert errors.constant_velocity == pytest.approx([1 / 3, 9 / 3])  # goes on to 2 and 3
+    assert errors.reduction == pytest.approx([0.0, 0.0], abs=1e-12)  # one mode holds one particle
+    assert errors.network == pytest.approx(errors.total)
+    assert errors.mse("total") == pytest.approx(29 / 6)
+    assert errors.rmse_mm("total") == pytest.approx(1e3 * math.sqrt(29 / 6))
+    assert errors.skill("constant_velocity") == pytest.approx(1 - 29 / 10)
+    assert errors.time == pytest.approx([2 / 60, 3 / 60])
+
+
+def test_skill_of_perfect_is_one_and_of_frozen_is_zero():
+    truth = random_walk()
+    assert compared(truth, truth).skill() == 1.0
+    frozen = truth.copy()
+    frozen[2:] = frozen[1]
+    assert compared(truth, frozen).skill() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_history_counts_in_no_metric():
+    truth, prediction = random_walk(), random_walk(seed=2)
+    expected = compared(truth, prediction)
+    prediction[:2] += 100.0
+    changed = compared(truth, prediction)
+    assert changed.mse("total") == expected.mse("total")
+    assert len(changed.total) == len(truth) - 2
+
+
+def test_latent_formula_equals_full_space():
+    truth, basis = random_walk(), make_basis()
+    latent = torch.from_numpy(np.random.default_rng(3).normal(size=(9, 2, 3)))
+    prediction = basis.inverse(latent).numpy()
+    errors = compared(truth, prediction, basis)
+    projected = basis.inverse(basis.transform(torch.from_numpy(truth.astype(np.float32)).double())).numpy()
+    full = np.mean((prediction.astype(np.float32) - projected)[2:] ** 2, axis=(1, 2))
+    assert errors.network == pytest.approx(full, rel=1e-5)
+    # The residual of the reduction stands at right angles to the subspace.
+    assert errors.total == pytest.approx(errors.network + errors.reduction, rel=1e-5)
+
+
+def test_chunks_of_frames_do_not_change_anything(monkeypatch):
+    truth, prediction = random_walk(), random_walk(seed=2)
+    whole = compared(truth, prediction)
+    monkeypatch.setattr(chunks, "CHUNK_BYTES", 1.0)
+    pieces = compared(truth, prediction)
+    for name in ("reduction", "network", "total", "frozen", "constant_velocity", "surface"):
+        assert getattr(pieces, name) == pytest.approx(getattr(whole, name), rel=1e-12)
+    assert pieces.particles.reduction == pytest.approx(whole.particles.reduction, rel=1e-12)
+    assert pieces.particles.network == pytest.approx(whole.particles.network, rel=1e-12)
+
+
+def test_errors_by_particle_have_the_same_mean_as_those_by_frame():
+    basis = make_basis()
+    truth, walk = random_walk(), random_walk(seed=2)
+    prediction = basis.inverse(basis.transform(torch.from_numpy(walk))).numpy()
+    errors = compared(truth, prediction, basis)
+    assert errors.particles.reduction.shape == errors.particles.network.shape == (7,)
+    assert errors.particles.reduction.mean() == pytest.approx(errors.mse("reduction"))
+    assert errors.particles.network.mean() == pytest.approx(errors.mse("network"), rel=1e-5)
+
+
+def test_error_of_one_particle_by_hand():
+    basis = make_basis()
+    inside = basis.inverse(basis.transform(torch.from_numpy(random_walk()))).numpy()
+    off = inside.copy()
+    off[2:, 3, 1] += 0.3
+    particles = compared(inside, off, basis).particles
+    assert particles.network[3] == pytest.approx(0.3**2 / 3, rel=1e-4)
+    assert np.delete(particles.network, 3) == pytest.approx(0.0, abs=1e-12)
+    assert particles.reduction == pytest.approx(0.0, abs=1e-12)
+
+
+def test_surface_error_of_a_raised_bed():
+    bed = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0), np.arange(3.0)), axis=-1).reshape(1, -1, 3)
+    truth = np.repeat(bed, 4, axis=0)
+    prediction = truth.copy()
+    prediction[2:, :, 2] += 0.01
+    errors = compared(truth, prediction, make_basis(n=truth.shape[1]))
+    assert errors.rmse_mm("surface") == pytest.approx(10.0, rel=1e-5)
+    assert errors.mse("surface_frozen") == 0.0
+
+
+def test_one_frame_of_history_has_no_velocity():
+    truth = random_walk()
+    errors = compared(truth, truth, history=1)
+    assert errors.constant_velocity == pytest.approx(errors.frozen)
+
+
+def test_aggregate_skill_is_of_sums():
+    assert skill([1.0, 3.0], [4.0, 4.0]) == pytest.approx(0.5)
+    assert skill([5.0], [4.0]) == pytest.approx(-0.25)
+    assert math.isnan(skill([0.0], [0.0]))
+
+
+def test_incomparable_runs_are_refused():
+    truth = random_walk()
+    with pytest.raises(UserError, match="frames 8 against 9"):
+        compared(truth, truth[:-1])
+    with pytest.raises(UserError, match="particles 6 against 7"):
+        compared(truth, truth[:, :-1], make_basis())
+    with pytest.raises(UserError, match="nothing is left to compare"):
+        compared(truth, truth, history=9)
+
+
+def test_force_metrics_by_hand():
+    truth = np.array([[-100.0, 0.0, 50.0], [-300.0, 0.0, -50.0]])
+    prediction = np.array([[-110.0, 1.0, 50.0], [-330.0, -1.0, -30.0]])
+    errors = VectorErrors.compare(truth, prediction)
+    assert errors.mae == pytest.approx([20.0, 1.0, 10.0])
+    assert errors.nrmse[0] == pytest.approx(0.1)
+    assert errors.nrmse[2] == pytest.approx(math.sqrt(200 / 2500))
+    assert math.isnan(errors.nrmse[1])  # zero by symmetry: a ratio says nothing
+    assert errors.mpe[0] == pytest.approx(10.0)
+    assert math.isnan(errors.mpe[1]) and math.isnan(errors.mpe[2])  # means are zero
+    assert errors.overall_nrmse == pytest.approx(math.sqrt((100 + 900 + 2 + 400) / (1e4 + 9e4 + 5e3)))
+
+
+def test_sign_of_mpe_does_not_depend_on_the_sign_of_the_force():
+    truth = np.full((5, 3), [-10.0, 8.0, 10.0])
+    assert VectorErrors.compare(truth, 1.2 * truth).mpe == pytest.approx([20.0, 20.0, 20.0])
+    assert VectorErrors.compare(truth, 0.9 * truth).mpe == pytest.approx([-10.0, -10.0, -10.0])
+
+
+def test_body_errors_by_hand():
+    poses = np.zeros((5, 7))
+    moved = poses.copy()
+    moved[0, 0] = 9.0  # within the history: does not count
+    moved[2:, 2] = [-0.003, 0.003, -0.003]
+    moved[2:, 1] = 0.004
+    wheel = {"diameter": 0.15}
+    errors = body_errors(SimpleNamespace(pose=poses, scene=wheel), SimpleNamespace(pose=moved), 2)
+    assert errors.mse == pytest.approx(0.005**2)
+    assert errors.sinkage_mae == pytest.approx(0.003)
+    blade = body_errors(SimpleNamespace(pose=poses, scene={}), SimpleNamespace(pose=poses), 2)
+    assert blade.mse == 0.0 and math.isnan(blade.sinkage_mae)
+
+
+def test_sums_of_runs_equal_the_runs_joined():
+    rng = np.random.default_rng(0)
+    truth, prediction = rng.normal(size=(2, 10, 3))
+    parts = VectorErrors.compare(truth[:4], prediction[:4]) + VectorErrors.compare(truth[4:], prediction[4:])
+    whole = VectorErrors.compare(truth, prediction)
+    assert parts.samples == whole.samples == 10
+    for name in ("mae", "nrmse", "mpe", "overall_nrmse"):
+        assert getattr(parts, name) == pytest.approx(getattr(whole, name), nan_ok=True)
+
+
+def test_forces_of_zero_have_no_relative_error():
+    errors = VectorErrors.compare(np.zeros((3, 3)), np.ones((3, 3)))
+    assert math.isnan(errors.overall_nrmse)
+    assert np.isnan(errors.nrmse).all() and np.isnan(errors.mpe).all()
+
+
+def test_constant_prediction_and_training_mean():
+    histories = [np.array([[9.0, 9, 9], [1, 2, 3]]), np.array([[9.0, 9, 9], [3, 4, 5], [5, 6, 7]])]
+    mean = mean_prediction(histories, history=1)
+    assert mean == pytest.approx([3.0, 4.0, 5.0])
+    errors = VectorErrors.compare(np.array([[1.0, 2, 3], [3, 4, 5]]), mean)
+    assert errors.mae == pytest.approx([1.0, 1.0, 1.0])
+
+
+def test_errors_of_zero_are_zero_not_negative():
+    zeros = np.zeros(3)
+    assert PositionErrors(*[zeros] * 8).rmse_mm("total") == 0.0

@@ -1,0 +1,290 @@
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sgns.evaluate.metrics import ParticleErrors, PositionErrors, VectorErrors
+from sgns.evaluate.report import render_report
+from sgns.evaluate.report_figures import FigureGroup, ReportFigure, file_name
+from sgns.evaluate.results import (
+    Costs,
+    EvaluatedRun,
+    Evaluation,
+    FullSpaceCost,
+    NetworkTiming,
+    Scores,
+    aggregate,
+)
+from sgns.evaluate.tables import cost_table, example_table, force_table
+from sgns.evaluate.words import cost_note, describe, fixed, number, short_names, summary, titled
+from sgns.reduction.basis import Basis, ReductionCurves
+
+EVIL = '<script>alert("run&1")</script>'
+
+
+def scores(name, skill=0.9, force=0.3, mean=0.6, reduction=0.1):
+    """Scores with a given skill, force NRMSE, NRMSE of the mean force and share of the reduction."""
+    truth = np.full((4, 3), [-100.0, 0.0, 50.0])
+    total = 1e-4 * (1.0 - skill)
+    mse = {
+        "reduction": reduction * total,
+        "network": (1 - reduction) * total,
+        "total": total,
+        "frozen": 1e-4,
+        "constant_velocity": 1e-4,
+        "surface": 1e-6,
+        "surface_frozen": 1e-5,
+    }
+    own = VectorErrors.compare(truth, (1 + force) * truth)
+    baseline = VectorErrors.compare(truth, (1 + mean) * truth)
+    mpe = {"draft": 100 * abs(force), "lateral": math.nan, "vertical": 100 * abs(force)}
+    mean_mpe = {"draft": 100 * abs(mean), "lateral": math.nan, "vertical": 100 * abs(mean)}
+    return Scores(name, 4, mse, own, own, baseline, baseline, 20.0, mpe, mean_mpe)
+
+
+def evaluation(names=("run1", "run2"), split="test", stepping=0.1, words="", wheel=False, **kw):
+    particles = ParticleErrors(np.full(5, 1e-6), np.full(5, 1e-7))
+    errors = PositionErrors(np.arange(4) / 60.0, *[np.full(4, 1e-6)] * 7, particles)
+    runs = [
+        EvaluatedRun(n, n, words, Path("t.h5"), Path("p.h5"), errors, scores(n, **kw), wheel) for n in names
+    ]
+    return Evaluation(
+        dataset="quick & <dirty>",
+        split=split,
+        runs=runs,
+        total=aggregate([run.scores for run in runs]),
+        timing=NetworkTiming(stepping, 2 * stepping, 3, names[0]),
+        mean_force=np.array([-90.0, 0.0, 40.0]),
+        curves=ReductionCurves(np.ones(2), np.ones(2), np.ones(2), np.ones(3)),
+        basis=Basis(torch.zeros(4, 3), torch.eye(4)[:, :2], torch.ones(2), 3.0, 3.0, "particle_axis"),
+        num_modes=2,
+        history=3,
+        particle_count=9600,
+        start=np.zeros((9600, 3)),
+        made={"command": "sgns evaluate 'a<b'", "machine": "a CPU, 4 cores"},
+    )
+
+
+class Tags(HTMLParser):
+    """Collects tags and attributes, and checks that they are closed in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.tags, self.links, self.headings = [], [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [value for key, value in attrs if key in ("src", "href", "action", "srcset")]
+        self.headings += [value for key, value in attrs if tag == "h2" and key == "id"]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def parsed(page):
+    parser = Tags()
+    parser.feed(page)
+    parser.close()
+    assert parser.open == []
+    return parser
+
+
+def group(data=b"", words="Words"):
+    return FigureGroup(words, words, [ReportFigure("a", words, words, data)])
+
+
+def test_page_is_well_formed_and_needs_nothing_from_outside():
+    page = render_report(evaluation(), [group(b"\x89PNG")])
+    parser = parsed(page)
+    pictures = [link for link in parser.links if not link.startswith("#")]
+    assert pictures == ["data:image/png;base64,iVBORw=="]
+    assert not {"script", "link", "iframe", "object"} & set(parser.tags)
+    assert not re.search(r"https?://|@import|url\(", page)
+
+
+def test_everything_is_escaped():
+    hostile = evaluation(names=(EVIL,))
+    page = render_report(replace(hostile, trained_on=[EVIL]), [group(words=EVIL)])
+    assert "<script" not in page
+    assert "&lt;script&gt;" in page
+    assert "quick &amp; &lt;dirty&gt;" in page
+    assert "a&lt;b" in page
+    parsed(page)
+
+
+def test_table_has_every_run_and_all_of_them():
+    page = render_report(evaluation(names=("alpha", "beta", "gamma")), [])
+    for name in ("alpha", "beta", "gamma", "all runs"):
+        assert page.count(f">{name}</td>") == 3  # soil, force and test examples
+    assert page.count('<tr class="total">') == 3
+
+
+@pytest.mark.parametrize(
+    ("skill", "words"),
+    [
+        (0.95, "follows the motion of the soil closely"),
+        (0.6, "follows most of the motion"),
+        (0.2, "only roughly"),
+        (-0.5, "does not predict the soil"),
+    ],
+)
+def test_words_follow_from_the_skill(skill, words):
+    text = summary(evaluation(skill=skill))
+    assert words in text
+    assert fixed(skill) in text
+    assert ("worse than letting every particle go on" in text) == (skill <= 0.0)
+
+
+@pytest.mark.parametrize(
+    ("force", "words"),
+    [
+        (0.1, "clearly better than"),
+        (0.5, "better than"),
+        (0.58, "hardly better than"),
+        (0.9, "no better than"),
+    ],
+)
+def test_words_follow_from_the_force(force, words):
+    assert f", {words} always answering" in summary(evaluation(force=force))
+
+
+def test_words_about_time_and_split():
+    assert "200 times less" in summary(evaluation(stepping=0.1))
+    assert "2.0 times more" in summary(evaluation(stepping=40.0))
+    assert "slower than the solver" in render_report(evaluation(stepping=40.0), [])
+    assert "never saw" in summary(evaluation())
+    assert "1 run that" in summary(evaluation(names=("one",)))
+
+
+def test_words_about_a_tool_whose_place_is_predicted():
+    result = evaluation(wheel=True)
+    assert "was given the tool's path" in summary(result) and "from its place" not in summary(result)
+    free = replace(result, total=replace(result.total, body_mse=4e-6, sinkage_mae=1.5e-3))
+    assert "was given what is prescribed of the tool's motion" in summary(free)
+    assert "is 2.00 mm (RMS) from its place; the sinkage is off by 1.50 mm" in summary(free)
+    free = replace(result, total=replace(result.total, body_mse=4e-6))
+    assert "from its place." in summary(free)
+
+
+def test_words_name_the_subspace_where_it_is_to_blame():
+    assert "is the subspace's" in summary(evaluation(reduction=0.7))
+    assert "is the subspace's" not in summary(evaluation(reduction=0.2))
+
+
+def test_nothing_that_moved_or_pushed_is_said():
+    result = evaluation()
+    still = replace(result.total, mse=dict.fromkeys(result.total.mse, 0.0))
+    none = VectorErrors.compare(np.zeros((2, 3)), np.zeros((2, 3)))
+    still = replace(still, force=none, mean_force=none, solver_rate=math.nan)
+    text = summary(replace(result, total=still))
+    assert "nothing moved" in text and "there was none" in text and "not recorded" in text
+    parsed(render_report(replace(result, total=still), []))
+
+
+def test_numbers_as_people_write_them():
+    assert [number(v) for v in (0.0, 1234.5, 3.14159, -0.01234, 2e-7)] == [
+        "0.000",
+        "1230",
+        "3.14",
+        "−0.0123",
+        "2.00e−07",
+    ]
+    assert number(math.nan) == "–" and number(math.inf) == "∞"
+    assert number(22829.0, 2) == "23000"
+    assert fixed(-1.255, 1, sign=True) == "−1.3" and fixed(2.0, 1, sign=True) == "+2.0"
+    assert fixed(math.nan) == "–" and fixed(-1e-6) == "0.00"
+
+
+def test_description_and_file_name():
+    scene = {"depth": 0.05, "speed": 0.1, "rake": 3.8, "motion": "curved"}
+    assert describe(scene) == "5 cm deep, 10 cm/s, rake 3.8°, curved motion"
+    wheel = {"diameter": 0.15, "load": 100.0, "slip": 0.4, "friction_angle": 30.0, "gravity": 3.72}
+    assert describe(wheel) == "15 cm wheel, 100 N, slip 40 %, friction angle 30°, gravity 3.72 m/s²"
+    assert describe({"kind": "bed"}) == ""
+    assert titled("run", scene) == f"run: {describe(scene)}" and titled("run", {}) == "run"
+    assert file_name("../a b/ü.h5") == "-a-b-h5"
+
+
+def test_short_names_still_tell_runs_apart():
+    assert short_names(["0012_rake-10.0_depth-0.05", "0013_rake-10.0"]) == ["0012", "0013"]
+    assert short_names(["cut_a", "cut_b"]) == ["cut_a", "cut_b"]
+    assert short_names(["_x"]) == ["_x"]
+
+
+def test_scene_of_every_run_is_told():
+    assert ">tool</th>" not in render_report(evaluation(), [])
+    assert render_report(evaluation(words="5 cm deep & slow"), []).count(">5 cm deep &amp; slow</td>") == 2
+
+
+def test_contents_point_at_every_heading():
+    parser = parsed(render_report(evaluation(), [group()]))
+    anchors = [link[1:] for link in parser.links if link.startswith("#")]
+    assert anchors == parser.headings and len(set(anchors)) == len(anchors) > 4
+
+
+def test_every_picture_has_words_for_those_who_do_not_see_it():
+    page = render_report(evaluation(), [group(words="Force through time")])
+    assert page.count("<img ") == page.count('<img alt="Force through time"') == 1
+
+
+def test_runs_seen_before_are_named_and_only_then():
+    clean = evaluation()
+    assert 'class="warning"' not in render_report(clean, [])
+    page = render_report(replace(clean, trained_on=["run1"]), [])
+    assert (
+        "1 of the 2 evaluated runs bear the names of runs that this checkpoint was trained on (run1)" in page
+    )
+    assert "not all new to it" in summary(replace(clean, trained_on=["run1"]))
+    assert "no test" in summary(replace(clean, trained_on=["run1", "run2"]))
+    assert "chose its checkpoint" in summary(replace(clean, chosen_by=["run1", "run2"]))
+    assert "validation runs that chose" in render_report(replace(clean, chosen_by=["run1"]), [])
+
+
+def test_table_of_examples_keeps_the_sign_of_a_run_and_not_of_the_mean():
+    page = example_table(evaluation(force=-0.25, mean=0.6, skill=0.5))
+    assert page.count(">−25.0</td>") == 4  # draft and vertical of two runs
+    assert page.count(">|25.0|</td>") == 2
+    assert page.count(">+60.0</td>") == 4
+    assert page.count(">0.500</td>") == 3  # total: 5e-5 m² in units of 1e-4 m²
+
+
+def test_forces_of_wheels_have_their_own_names():
+    blade, wheel = evaluation(), evaluation(wheel=True)
+    assert ">draft</th>" in example_table(blade) and ">drawbar pull</th>" not in example_table(blade)
+    assert ">drawbar pull</th>" in force_table(wheel) and "sinkage" in force_table(wheel)
+    assert "sinkage" not in force_table(blade) and "misplaced" not in force_table(blade)
+    moved = replace(blade.total, body_mse=4e-6)
+    assert ">2.00</td>" in force_table(replace(blade, total=moved))
+
+
+def test_shared_headings_span_their_columns():
+    page = force_table(evaluation())
+    spans = [int(span) for span in re.findall(r'colspan="(\d+)"', page)]
+    assert sum(spans) == page.count("<th>") + page.count('<th class="text">')
+
+
+def test_costs_that_are_not_known_are_not_made_up():
+    page = cost_table(evaluation())
+    assert page.count(">–</td>") == 7  # training twice, parameters, checkpoint, memory three times
+    assert ">57 600</td>" in page and ">6</td>" in page and ">28 800</td>" in page
+    assert "no training.json" in cost_note(evaluation())
+    costs = Costs(253_777, 5.4e6, 6000, 240.0, 32)
+    known = replace(evaluation(), costs=costs)
+    assert ">0.0400</td>" in cost_table(known) and ">253 777</td>" in cost_table(known)
+    assert "6000 steps of 32 samples" in cost_note(known)
+
+
+def test_full_space_has_a_column_where_it_was_measured():
+    plain = evaluation()
+    measured = replace(plain, full_space=FullSpaceCost(40_000, 2.5, 2, 27.0, 3e9))
+    assert "full space" not in cost_table(plain) and "full_space=true" in cost_note(plain)
+    page = cost_table(measured)
+    assert "full space, untrained" in page and ">27.0</td>" in page and ">40 000</td>" in page
+    assert "full_space=true" not in cost_note(measured)

@@ -1,0 +1,259 @@
+"""Body nodes lie on the surface, none twice, no hole wider than asked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from synthetic import PLATE, make_run
+from tiny import MODEL, TRAINING
+
+from sgns.config import UserError
+from sgns.model.features import BodyTrack
+from sgns.model.full_space import FullSpaceDynamics, box_surface, radius_graph
+from sgns.model.network_dynamics import ModelSettings
+from sgns.train.full_space import FullSpaceRun, FullSpaceWindows, fit_normalisation, losses, train
+from sgns.train.lightning_module import TrainingSettings
+
+# --- Body nodes lie on the surface, none twice, no hole wider than asked --------------------------------
+
+
+@pytest.mark.parametrize("spacing", [0.015, 0.04, 1.0])
+def test_the_surface_is_covered(spacing) -> None:
+    half = np.array([0.021, 0.10, 0.06])
+    points = box_surface(half, spacing)
+    np.testing.assert_allclose(np.max(np.abs(points) / half, axis=1), 1.0)
+    assert len(np.unique(points.round(9), axis=0)) == len(points)
+    for axis in range(3):
+        places = np.unique(points[:, axis].round(9))
+        assert places[[0, -1]] == pytest.approx([-half[axis], half[axis]])
+        assert np.diff(places).max() <= spacing + 1e-9 or len(places) == 2
+    # Wherever a point sits on the surface, a node is within half a cell's diagonal.
+    rng = np.random.default_rng(0)
+    probes = rng.uniform(-half, half, (300, 3))
+    axis = rng.integers(3, size=300)
+    probes[np.arange(300), axis] = np.sign(probes[np.arange(300), axis]) * half[axis]
+    nearest = np.linalg.norm(probes[:, None] - points, axis=-1).min(axis=1)
+    assert nearest.max() <= min(spacing, 2 * half.max()) / np.sqrt(2) + 1e-9
+
+
+def test_a_coarse_spacing_leaves_the_corners() -> None:
+    assert len(box_surface(np.ones(3), 10.0)) == 8
+
+
+# --- The hash grid finds exactly what comparing every pair finds ----------------------------------------
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def every_pair(points: torch.Tensor, radius: float) -> set[tuple[int, int]]:
+    near = (points[:, None] - points[None]).square().sum(-1) <= radius**2
+    near.fill_diagonal_(False)
+    return set(map(tuple, near.nonzero().tolist()))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("size", "radius"), [(1.0, 0.15), (1.0, 0.9), (100.0, 1.3), (0.01, 0.002)])
+def test_equals_brute_force(device, size, radius) -> None:
+    # From before the origin to behind it, and (100 / 1.3 cells) further than the hash grid is wide.
+    points = (torch.rand((400, 3), generator=torch.Generator().manual_seed(1)) - 0.5) * size
+    points[:50] = points[50:100] + 0.5 * radius  # some pairs even where points are few
+    edges = radius_graph(points.to(device), radius).cpu()
+    found = list(map(tuple, edges.T.tolist()))
+    assert len(found) == len(set(found))
+    assert set(found) == every_pair(points, radius)
+    assert edges.dtype == torch.int64 and bool((edges[1].diff() >= 0).all())
+
+
+def test_points_in_one_place_are_neighbours_and_none_is_its_own() -> None:
+    edges = radius_graph(torch.zeros(3, 3), 0.1)
+    assert set(map(tuple, edges.T.tolist())) == {(a, b) for a in range(3) for b in range(3) if a != b}
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_lonely_points_have_no_edges(count) -> None:
+    points = torch.arange(count)[:, None].double().expand(-1, 3)
+    assert radius_graph(points, 0.5).shape == (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("points", "radius"), [(torch.full((4, 3), torch.nan), 1.0), (torch.zeros(4, 3), 0.0)]
+)
+def test_bad_input_is_one_line(points, radius) -> None:
+    with pytest.raises(UserError, match=r"finite|above 0") as refused:
+        radius_graph(points, radius)
+    assert "\n" not in str(refused.value)
+
+
+# --- Full space: order of particles does not matter, the tool is felt where it is, forces add up, training
+
+SETTINGS = ModelSettings(
+    **(MODEL | {"body_nodes": "points", "message_passing_steps": 2, "layer_norm": True, "residual": True})
+)
+RADIUS = 0.08
+
+
+@pytest.fixture(scope="module")
+def windows(tmp_path_factory) -> FullSpaceWindows:
+    folder = tmp_path_factory.mktemp("runs")
+    nodes = box_surface(PLATE / 2, 0.1)
+    runs = [
+        FullSpaceRun(make_run(folder / f"{seed}.h5", frames=12, n=150, seed=seed), nodes) for seed in range(3)
+    ]
+    return FullSpaceWindows(runs, SETTINGS.history)
+
+
+def untrained(windows: FullSpaceWindows) -> FullSpaceDynamics:
+    torch.manual_seed(0)
+    dynamics = FullSpaceDynamics(SETTINGS, RADIUS, windows.runs[0].bin_size)
+    fit_normalisation(dynamics, windows, 0.1, 0.01)
+    return dynamics
+
+
+def test_order_of_particles_and_of_body_nodes_does_not_matter(windows) -> None:
+    dynamics, window = untrained(windows), windows.window(8)
+    order = torch.randperm(window.position.shape[2], generator=torch.Generator().manual_seed(0))
+    turned = BodyTrack(*(part.flip(2) for part in window.body))
+    with torch.inference_mode():
+        following, force = dynamics.advance(window.history, window.body)
+        shuffled, force_shuffled = dynamics.advance(window.history[:, :, order], turned)
+    torch.testing.assert_close(shuffled, following[:, order], atol=1e-9, rtol=0)
+    torch.testing.assert_close(force_shuffled, force, rtol=1e-4, atol=1e-4)
+
+
+def test_a_batch_is_its_windows_one_by_one(windows) -> None:
+    dynamics = untrained(windows)
+    batch = windows.batch(0, 3, torch.full((3,), 1e-5, dtype=torch.float64))
+    with torch.inference_mode():
+        together = dynamics.advance(batch.history, batch.body)
+        for b in range(3):
+            alone = dynamics.advance(
+                batch.history[b : b + 1], BodyTrack(*(part[b : b + 1] for part in batch.body))
+            )
+            torch.testing.assert_close(together[0][b : b + 1], alone[0], atol=1e-9, rtol=0)
+            torch.testing.assert_close(together[1][b : b + 1], alone[1], rtol=1e-4, atol=1e-4)
+
+
+def test_away_from_the_walls_the_place_does_not_matter() -> None:
+    torch.manual_seed(0)
+    dynamics = FullSpaceDynamics(SETTINGS, RADIUS, torch.tensor([10.0, 10.0, 10.0]))
+    soil = torch.rand((1, 1, 60, 3), dtype=torch.float64) * 0.2 + torch.tensor([5.0, 5.0, -5.0])
+    soil = soil.expand(-1, 3, -1, -1)
+    where = soil[:, :, :4] + 0.01
+    body = BodyTrack(where, where[..., :0], torch.full_like(where, 1e-3))
+    shift = torch.tensor([0.5, -0.25, 0.125], dtype=torch.float64)
+    moved = BodyTrack(where + shift, body.orientation, body.motion)
+    with torch.inference_mode():
+        one, other = dynamics(soil, body), dynamics(soil + shift, moved)
+    torch.testing.assert_close(other.acceleration, one.acceleration, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(other.force, one.force, atol=1e-4, rtol=1e-4)
+
+
+def test_the_tool_is_felt_within_reach_and_nowhere_else() -> None:
+    torch.manual_seed(0)
+    dynamics = FullSpaceDynamics(SETTINGS, 0.1, torch.tensor([2.0, 2.0, 2.0])).requires_grad_(False)
+    # A row of particles 0.08 m apart; two message-passing steps reach two neighbours along it.
+    row = torch.zeros((1, 3, 10, 3), dtype=torch.float64) + torch.tensor([0.5, 1.0, -1.0])
+    row[..., 0] += 0.08 * torch.arange(10)
+
+    def accelerations(x: float, motion: float = 1.0) -> torch.Tensor:
+        where = torch.zeros((1, 3, 1, 3), dtype=torch.float64) + torch.tensor([x, 1.0, -1.0])
+        return dynamics(row, BodyTrack(where, where[..., :0], torch.full_like(where, motion))).acceleration[0]
+
+    far, near, faster = accelerations(0.0), accelerations(0.42), accelerations(0.42, 2.0)
+    assert bool((far != near).any(-1)[:2].all()) and torch.equal(far[2:], near[2:])
+    # Its next motion is seen as well as its presence.
+    assert bool((near != faster).any(-1)[:2].all()) and torch.equal(near[2:], faster[2:])
+
+
+def test_force_is_the_sum_of_contributions(windows) -> None:
+    dynamics, window = untrained(windows), windows.window(8)
+    with torch.inference_mode():
+        prediction = dynamics(window.history, window.body)
+        contributions = dynamics.force_contributions(prediction)
+        _, force = dynamics.advance(window.history, window.body)
+        assert contributions.shape == prediction.force.shape
+        torch.testing.assert_close(contributions.sum(1), force)
+        # Without predictions the sum is the mean force, whatever the number of nodes.
+        silent = dynamics.force_contributions(prediction._replace(force=torch.zeros_like(prediction.force)))
+        torch.testing.assert_close(silent.sum(1), dynamics.force.mean[None])
+
+
+def test_the_position_update(windows) -> None:
+    dynamics, window = untrained(windows), windows.window(8)
+    with torch.inference_mode():
+        following, _ = dynamics.advance(window.history, window.body)
+        acceleration = dynamics.acceleration.denormalise(dynamics(window.history, window.body).acceleration)
+    x = window.history
+    torch.testing.assert_close(following, 2 * x[:, -1] - x[:, -2] + acceleration)
+
+
+def test_gradients_reach_every_weight(windows) -> None:
+    dynamics = untrained(windows)
+    sum(losses(dynamics, windows.window(8))).backward()
+    for name, parameter in dynamics.named_parameters():
+        assert parameter.grad is not None and float(parameter.grad.abs().max()) > 0, name
+
+
+def test_an_optimisation_step_reduces_the_loss_on_its_window(windows) -> None:
+    dynamics, window = untrained(windows), windows.window(8)
+    optimiser = torch.optim.SGD(dynamics.parameters(), lr=1e-4)
+    before = sum(losses(dynamics, window))
+    before.backward()
+    optimiser.step()
+    with torch.inference_mode():
+        assert float(sum(losses(dynamics, window))) < float(before.detach())
+
+
+def trained(windows: FullSpaceWindows, steps: int) -> tuple[FullSpaceDynamics, list[float]]:
+    """After some steps, with the losses of the acceleration on the same windows before and after."""
+    # With noise of the size of the motion most of the target is the correction of what is seen.
+    changes = {"max_steps": steps, "batch_size": 2, "learning_rate": 3e-3, "noise": 1.0}
+    settings = TrainingSettings.from_dict(TRAINING | changes)
+    dynamics = untrained(windows)
+    scale = fit_normalisation(dynamics, windows, settings.noise, settings.normalisation_floor)
+    asked, found = windows.batch(1000, 20, scale), []
+    for act in (lambda: None, lambda: train(dynamics, windows, settings, scale)):
+        record = act()
+        with torch.inference_mode():
+            found.append(float(losses(dynamics, asked)[0]))
+    assert len(record.acceleration) == len(record.force) == len(record.seconds) == steps
+    return dynamics, found
+
+
+def test_training_learns(windows) -> None:
+    _, (before, after) = trained(windows, 120)
+    assert after < 0.7 * before
+
+
+def test_training_repeats_to_the_bit(windows) -> None:
+    first, second = (trained(windows, 5)[0] for _ in range(2))
+    for a, b in zip(first.parameters(), second.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_loss_that_is_not_finite_stops_the_training(windows) -> None:
+    dynamics = untrained(windows)
+    with torch.no_grad():
+        dynamics.network.decode.first.weight[0, 0] = torch.nan
+    with pytest.raises(UserError, match="learning_rate"):
+        train(dynamics, windows, TrainingSettings.from_dict(TRAINING), torch.zeros(3, dtype=torch.float64))
+
+
+def test_a_rollout_is_steps_and_stays_finite(windows) -> None:
+    dynamics, run = untrained(windows), windows.runs[0]
+    soil = run.soil()[None]
+    body = BodyTrack(*(part[None] for part in run.track))
+    with torch.inference_mode():
+        positions, force = dynamics.unroll(soil[:, :3], body)
+        assert positions.shape == soil.shape and force.shape == (1, len(run), 3)
+        assert bool(torch.isfinite(positions).all()) and bool(torch.isfinite(force).all())
+        assert torch.equal(positions[:, :3], soil[:, :3]) and float(force[:, :3].abs().max()) == 0.0
+        following, pushed = dynamics.advance(positions[:, 4:7], body.frames(slice(5, 8)))
+    torch.testing.assert_close(positions[:, 7], following)
+    torch.testing.assert_close(force[:, 7], pushed)
+
+
+def test_a_pose_is_no_body_in_full_space() -> None:
+    with pytest.raises(UserError, match="body_nodes=points"):
+        FullSpaceDynamics(ModelSettings(**MODEL), 0.1, torch.ones(3))

@@ -1,0 +1,160 @@
+"""A wheel: its way is prescribed, its height follows from the network."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from tiny import MODEL, TRAINING, reduced
+
+from mpm_warp.poses import in_world_frame
+from sgns.config import UserError
+from sgns.model.features import nearest_rigid
+from sgns.simulator import Simulator
+from sgns.train.command import train
+
+KINDS = {
+    "pose": {},
+    "points": {"body_nodes": "points"},
+    "free": {"body_nodes": "points", "rigid": False, "predicts": "velocity", "next_motion": False},
+}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Reduced data of a body whose height is free, and checkpoints."""
+    folder = tmp_path_factory.mktemp("wheel")
+    data = reduced(folder, scene={"kind": "wheel"})
+    for name, change in KINDS.items():
+        train(data, num_modes=4, model=MODEL | change, training=TRAINING, output=folder / name)
+    return data, folder
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rollout_is_stepping_and_needs_no_height(trained, kind) -> None:
+    data, folder = trained
+    run = data.runs("test")[0]
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    assert simulator.predicts_body
+    rollout = simulator.rollout(run.pose, latent_history=run.latent[:3, :4])
+    assert not np.allclose(rollout.poses[3:, 2], run.pose[3:, 2])
+    # Whatever height is put in after the given frames, the same comes out.
+    raised = run.pose.copy()
+    raised[3:, 2] += 0.1
+    again = simulator.rollout(raised, latent_history=run.latent[:3, :4])
+    np.testing.assert_array_equal(again.latent, rollout.latent)
+    np.testing.assert_array_equal(again.poses[:, 2], rollout.poses[:, 2])
+    simulator.reset(history=(run.latent[:3, :4], run.pose[:3]))
+    for t in range(3, 14):
+        state = simulator.step(run.pose[t])
+        # One step after the other goes through poses: equal but for their rounding.
+        np.testing.assert_allclose(state.latent, rollout.latent[t], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(state.pose, rollout.poses[t], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_copies_go_on_to_the_bit(trained, kind) -> None:
+    data, folder = trained
+    path = data.runs("test")[0].pose
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    simulator.reset(path)
+    for pose in path[1:5]:
+        simulator.step(pose)
+    others = [copy.copy(simulator), copy.deepcopy(simulator), pickle.loads(pickle.dumps(simulator))]
+    for pose in path[5:9]:
+        expected = simulator.step(pose)
+        for other in others:
+            found = other.step(pose)
+            for name in ("latent", "force", "torque", "pose"):
+                np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("kind", ["pose", "points"])  # the third is not told of the way
+def test_a_way_far_from_everything_is_refused_and_forgotten(trained, kind) -> None:
+    data, folder = trained
+    path = data.runs("test")[0].pose
+    simulator = Simulator.load(folder / kind / "best.ckpt")
+    simulator.reset(path)
+    simulator.step(path[1])
+    plain, far = copy.copy(simulator), path[2].copy()
+    far[0] = 1e300
+    with pytest.raises(UserError, match="not finite at frame 2"):
+        simulator.step(far)
+    found, expected = simulator.step(path[2]), plain.step(path[2])
+    np.testing.assert_array_equal(found.latent, expected.latent)
+    np.testing.assert_array_equal(found.pose, expected.pose)
+    # A whole path says so in its numbers, also beside others, which are none the worse.
+    broken = path.copy()
+    broken[5:, 0] = 1e300
+    many = simulator.rollouts(np.stack([broken, path]))
+    assert not np.isfinite(many.latent[0, 6:]).any() and np.isfinite(many.poses[1]).all()
+    assert not np.isfinite(simulator.rollout(broken).latent[6:]).any()
+
+
+def test_points_that_fix_no_pose_are_refused(trained) -> None:
+    data, folder = trained
+    path = data.runs("test")[0].pose
+    simulator = Simulator.load(folder / "points" / "best.ckpt")
+    line = simulator.body_points[:1] + 0.01 * np.arange(5.0)[:, None]
+    for points in (simulator.body_points[:1], simulator.body_points[:2], line):
+        with pytest.raises(UserError, match="lie on one line"):
+            simulator.rollout(path, points)
+
+
+def test_soil_under_a_wheel_follows_the_clock(trained) -> None:
+    """A wheel that rests may still sink."""
+    data, folder = trained
+    path = data.runs("test")[0].pose[:1].repeat(20, axis=0)
+    found, own = (
+        Simulator.load(folder / "pose" / "best.ckpt", rate_independent=follows).rollout(path)
+        for follows in (True, False)
+    )
+    np.testing.assert_array_equal(found.latent, own.latent)
+    assert (np.diff(found.latent, axis=0) != 0).any(axis=(1, 2)).all()
+
+
+def test_the_prescribed_part_is_kept(trained) -> None:
+    data, folder = trained
+    run = data.runs("test")[0]
+    rollout = Simulator.load(folder / "pose" / "best.ckpt").rollout(run.pose)
+    np.testing.assert_allclose(rollout.poses[:, [0, 1]], run.pose[:, [0, 1]], atol=1e-12)
+    np.testing.assert_allclose(rollout.poses[:, 3:], run.pose[:, 3:], atol=1e-12)
+
+
+def test_points_stay_rigid_or_not(trained) -> None:
+    data, folder = trained
+    run = data.runs("test")[0]
+    apart = {}
+    for kind in ("points", "free"):
+        simulator = Simulator.load(folder / kind / "best.ckpt")
+        points = simulator.rollout(run.pose).body_points
+        distance = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
+        apart[kind] = np.abs(distance - distance[0]).max()
+    assert apart["points"] < 1e-9 < 1e-6 < apart["free"]
+
+
+def test_nearest_rigid_is_exact_for_a_rigid_motion_and_best_otherwise() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(8, 3))
+    pose = np.array([[0.3, -0.2, 0.1, 0.5, -0.5, 0.5, 0.5]])
+    moved = torch.as_tensor(in_world_frame(pose, points)[0])
+    reference = torch.as_tensor(points)
+    torch.testing.assert_close(nearest_rigid(reference, moved), moved, rtol=0, atol=1e-12)
+    shaken = moved + 0.05 * torch.as_tensor(rng.normal(size=(8, 3)))
+    best = nearest_rigid(reference, shaken)
+    for angle in (-0.01, 0.01):
+        turned = in_world_frame(np.array([[0, 0, 0, 0, 0, np.sin(angle), np.cos(angle)]]), best.numpy())[0]
+        assert (best - shaken).square().sum() < (torch.as_tensor(turned) - shaken).square().sum()
+
+
+def test_wheels_and_blades_do_not_mix(trained) -> None:
+    from dataclasses import replace
+
+    data, folder = trained
+    runs = {split: data.runs(split) for split in ("train", "validation", "test")}
+    runs["train"][0] = replace(runs["train"][0], scene={"kind": "excavation"})
+    with pytest.raises(UserError, match="mix wheels"):
+        train(replace(data, _runs=runs), num_modes=4, model=MODEL, training=TRAINING, output=folder / "mixed")

@@ -1,0 +1,143 @@
+"""How far a path leaves what the training runs covered."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tiny import reduced
+
+from sgns.config import UserError
+from sgns.model.training_range import NOTEWORTHY, TrainingRange, components, widths
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return reduced(tmp_path_factory.mktemp("tiny"))
+
+
+@pytest.fixture(scope="module")
+def known(data) -> TrainingRange:
+    return TrainingRange.of(data.runs("train"), 4, ("depth",))
+
+
+def excess(known, run, shift=0.0, points=None, latent=None, depth=None):
+    pose = run.pose + np.eye(7)[0] * shift
+    points = run.body_points + np.eye(3)[0] * shift if points is None else points
+    number = {"depth": run.scene["depth"] if depth is None else depth}
+    return known.excess(pose, points, run.latent[:, :4] if latent is None else latent, number)
+
+
+def test_training_runs_are_inside(data, known) -> None:
+    for run in data.runs("train"):
+        found = excess(known, run)
+        assert found.largest == 0.0
+        assert found.words() == ""
+
+
+def test_the_unit_is_the_width_of_the_range(data, known) -> None:
+    name = "the tool's position"
+    low, high = known.low[name][0], known.high[name][0]
+    run = data.runs("train")[0]
+    shift = high - run.pose[-1, 0] + 2.5 * (high - low)
+    found = excess(known, run, shift)
+    assert found.amount[-1] == pytest.approx(2.5)
+    assert found.quantity[-1] == "the tool's position (x)"
+    assert found.words().startswith("from frame 0 on")
+    assert "the tool's position (x) is 2.5 times its training range" in found.words()
+
+
+@pytest.mark.parametrize("what", ["turned", "deeper points", "faster", "soil", "soil runs", "context"])
+def test_every_quantity_counts(data, known, what) -> None:
+    run = data.runs("train")[0]
+    if what == "turned":
+        half = np.radians(60)
+        pose = run.pose.copy()
+        pose[:, 3:] = [0.0, 0.0, np.sin(half), np.cos(half)]
+        found = known.excess(pose, run.body_points, run.latent[:, :4], {"depth": run.scene["depth"]})
+        quantity = "the tool's orientation"
+    elif what == "deeper points":
+        found = excess(known, run, points=run.body_points - [0.0, 0.0, 0.1])
+        quantity = "the tool's lowest point"
+    elif what == "faster":
+        pose = run.pose.copy()
+        pose[:, 0] = run.pose[0, 0] + 3.0 * (run.pose[:, 0] - run.pose[0, 0])
+        found = known.excess(pose, run.body_points, run.latent[:, :4], {"depth": run.scene["depth"]})
+        quantity = "the tool's displacement per frame (x)"
+    elif what == "soil":
+        found = excess(known, run, latent=run.latent[:, :4] + [[0.0, 0.0, 9.0]])
+        quantity = "the soil's state"
+    elif what == "soil runs":
+        found = excess(known, run, latent=run.latent[:1, :4] + 3.0 * (run.latent[:, :4] - run.latent[:1, :4]))
+        quantity = "the soil's"
+    else:
+        found = excess(known, run, depth=1.0)
+        quantity = "depth"
+    assert found.largest > NOTEWORTHY
+    assert any(name.startswith(quantity) for name in found.quantity)
+
+
+def test_fewer_modes_are_compared_with_the_first(data, known) -> None:
+    run = data.runs("train")[0]
+    assert excess(known, run, latent=run.latent[:, :2]).largest == 0.0
+
+
+def test_the_number_of_points_counts_where_they_are_seen(data) -> None:
+    run, number = data.runs("train")[0], {"depth": data.runs("train")[0].scene["depth"]}
+    for seen in (True, False):
+        known = TrainingRange.of(data.runs("train"), 4, ("depth",), points=seen)
+        found = known.excess(run.pose, run.body_points[:, :1], run.latent[:, :4], number)
+        assert ("the number of the tool's points" in found.quantity) == seen
+        assert (found.largest == pytest.approx(14 / 15)) == seen
+
+
+def test_what_never_varied_has_a_unit_of_its_own() -> None:
+    np.testing.assert_allclose(widths(np.array([0.0, 3.0]), np.array([10.0, 3.0])), [10.0, 1.0])
+    np.testing.assert_allclose(widths(np.array([0.0, -4.0]), np.array([0.0, -4.0])), [4.0, 4.0])
+    np.testing.assert_allclose(widths(np.zeros(3), np.zeros(3)), 1.0)
+    # Round-off is no variation.
+    np.testing.assert_allclose(widths(np.array([0.3]), np.array([0.3 + 1e-17])), 0.3)
+
+
+def test_what_is_not_finite_is_noteworthy(data, known) -> None:
+    run = data.runs("train")[0]
+    latent = run.latent[:, :4].copy()
+    latent[5] = np.nan
+    found = excess(known, run, latent=latent)
+    assert np.isnan(found.largest) and found.words().startswith("from frame 5 on")
+
+
+def test_it_comes_back_from_plain_numbers(data, known) -> None:
+    again = TrainingRange.from_plain(known.plain())
+    for side in ("low", "high"):
+        for name, values in getattr(known, side).items():
+            np.testing.assert_array_equal(getattr(again, side)[name], values)
+
+
+@pytest.mark.parametrize(
+    "plain",
+    [
+        {},
+        {"low": {}},
+        {"low": {"a": [0.0]}, "high": {"b": [1.0]}},
+        {"low": {"a": [0.0]}, "high": {"a": [1.0, 2.0]}},
+        {"low": {"a": [1.0]}, "high": {"a": [0.0]}},
+        {"low": {"a": [float("nan")]}, "high": {"a": [0.0]}},
+        {"low": {"a": []}, "high": {"a": []}},
+        {"low": {"a": 1.0}, "high": {"a": 2.0}},
+        {"low": {"a": ["x"]}, "high": {"a": ["y"]}},
+        [1, 2],
+    ],
+)
+def test_anything_else_is_refused(plain) -> None:
+    with pytest.raises((KeyError, TypeError, ValueError, AttributeError)):
+        TrainingRange.from_plain(plain)
+
+
+def test_a_scene_without_the_number_is_named(data) -> None:
+    with pytest.raises(UserError, match="no number load"):
+        TrainingRange.of(data.runs("train"), 4, ("load",))
+
+
+def test_modes_are_numbered_from_one() -> None:
+    assert components("the soil's state", 4)[3] == " (mode 2, x)"
+    assert components("depth", 1) == [""]

@@ -1,0 +1,261 @@
+"""What runs cost: counted, scheduled, and said in words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import yaml
+from omegaconf import OmegaConf
+
+from mpm_warp import Effects, Scene, effects_for
+from sgns.config import UserError
+from sgns.data.dataset import SPLITS, Dataset
+from sgns.simulate import campaign as cost
+from sgns.simulate.campaign import duration_words, finishing_time, plan, require_space, run_cost, size_words
+from sgns.simulate.run import simulate_scene
+
+# --- What runs cost: counted, scheduled, and said in words ----------------------------------------------
+
+
+@pytest.mark.parametrize("store_every", [1, 4])
+def test_work_and_size_are_those_of_the_run(tmp_path, store_every):
+    scene = next(iter(campaign(tmp_path).scenes.values()))
+    data = scene.to_dict()
+    data["bed"] |= {"spacing": 0.02, "store_every": store_every}
+    data["duration"] = 0.5
+    scene = Scene.from_dict(data)
+    expected = run_cost(scene)
+    timing = simulate_scene(scene, tmp_path / "run.h5", effects=Effects())
+    assert expected.work == timing.particle_steps
+    assert expected.particles == 20 * 10 * 8
+    assert (tmp_path / "run.h5").stat().st_size == pytest.approx(expected.size, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("waiting", "running", "workers", "end"),
+    [
+        ([], [], 2, 0.0),
+        ([3.0], [], 4, 3.0),  # a run is not shared among cores
+        ([5.0, 4.0, 3.0, 3.0, 3.0], [], 2, 10.0),
+        ([3.0, 3.0, 3.0, 4.0, 5.0], [], 2, 11.0),  # the longest last: worse
+        ([2.0], [1.0, 6.0], 2, 6.0),
+        ([2.0], [5.0], 2, 5.0),
+    ],
+)
+def test_end_of_the_last_run(waiting, running, workers, end):
+    assert finishing_time(waiting, running, workers) == end
+
+
+def test_a_disk_that_is_too_full_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(cost.shutil, "disk_usage", lambda path: SimpleNamespace(free=10**9))
+    require_space(tmp_path / "not" / "there", 10**9)
+    with pytest.raises(UserError, match=r"there needs 1.4 GB of disk and 1.0 GB are free; .*store_every"):
+        require_space(tmp_path / "not" / "there", 14 * 10**8)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (0.0, "1 s"),
+        (99.0, "99 s"),
+        (100.0, "2 min"),
+        (5990.0, "1 h 40 min"),
+        (12000.0, "3 h 20 min"),
+        (2e5, "2 d 8 h"),
+    ],
+)
+def test_durations(seconds, words):
+    assert duration_words(seconds) == words
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [(100, "0.1 kB"), (56_300_000, "56 MB"), (999_600_000, "1.0 GB"), (3e12, "3.0 TB"), (3e15, "3000 TB")],
+)
+def test_sizes(size, words):
+    assert size_words(size) == words
+
+
+# --- Campaigns and datasets: what is drawn, how it is split, what is on disk ----------------------------
+
+BASE = {
+    "kind": "excavation",
+    "duration": 0.05,
+    "blade": {"length": 0.1, "width": 0.1, "thickness": 0.08},
+    "bed": {"size": [0.4, 0.2, 0.16], "spacing": 0.04},
+}
+EFFECTS = {"yielding": True, "rate_dependence": True, "separation": True}
+
+
+def campaign(tmp_path, seed=0, **change):
+    settings = {
+        "name": "tiny",
+        "path": tmp_path / "tiny",
+        "draw": {"rake": [0.0, 10.0], "depth": [0.02, 0.04, 0.05], "blade.friction": [0.1, 0.3]},
+        "runs": 10,
+    }
+    return plan(settings | change, BASE, EFFECTS, "float32", seed)
+
+
+def test_runs_are_different_scenes_of_the_grid(tmp_path):
+    scenes = list(campaign(tmp_path).scenes.values())
+    drawn = {(s.rake, s.depth, s.blade.friction) for s in scenes}
+    assert len(drawn) == 10
+    assert {d for _, d, _ in drawn} <= {0.02, 0.04, 0.05}
+    assert len({s.arrangement_hash for s in scenes}) == 1
+
+
+def test_seed_decides_draw_and_split(tmp_path):
+    one, two, other = campaign(tmp_path), campaign(tmp_path), campaign(tmp_path, seed=1)
+    assert one == two
+    assert (list(one.scenes), one.split) != (list(other.scenes), other.split)
+
+
+def test_every_run_is_in_one_split(tmp_path):
+    c = campaign(tmp_path)
+    counts = [list(c.split.values()).count(s) for s in SPLITS]
+    assert counts == [8, 1, 1]
+    assert list(campaign(tmp_path, split=[0.9, 0.0, 0.1]).split.values()).count("validation") == 0
+
+
+def test_several_grids_are_joined(tmp_path):
+    grids = [
+        {"motion": ["curved"], "depth": [0.02, 0.04]},
+        {"motion": ["ramp"], "depth": [0.02], "speed": [0.1, 0.2]},
+    ]
+    scenes = campaign(tmp_path, draw=grids, runs=None).scenes.values()
+    assert sorted((s.motion, s.depth, s.speed) for s in scenes) == [
+        ("curved", 0.02, 0.1), ("curved", 0.04, 0.1), ("ramp", 0.02, 0.1), ("ramp", 0.02, 0.2)
+    ]  # fmt: skip
+
+
+def test_all_combinations_when_no_number_is_given(tmp_path):
+    assert len(campaign(tmp_path, runs=None).scenes) == 12
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"runs": 13}, "allowed: 3 to 12"),
+        ({"draw": {"rake": 3.0}}, "dataset.draw.rake is 3.0"),
+        ({"draw": None}, "dataset.draw is missing"),
+        ({"draw": [3]}, "must be a grid"),
+        ({"split": [0.8, 0.1]}, "three shares"),
+        ({"split": [0.8, 0.1, 0.2]}, "sum to 1"),
+    ],
+)
+def test_settings_it_refuses(tmp_path, change, words):
+    with pytest.raises(UserError, match=words):
+        campaign(tmp_path, **change)
+
+
+def test_record_once_and_open(tmp_path):
+    c = campaign(tmp_path)
+    c.record()
+    c.record()  # the same again is fine
+    with pytest.raises(UserError, match="made with other settings"):
+        campaign(tmp_path, seed=1).record()
+    with pytest.raises(UserError, match="are missing: 10"):
+        Dataset.open(c.path)
+    (c.path / "runs").mkdir()
+    for name in c.scenes:
+        c.file(name).touch()
+    dataset = Dataset.open(c.path)
+    assert dataset.name == "tiny"
+    assert sum(len(dataset.runs(s)) for s in SPLITS) == 10
+    assert all(run.exists() for run in dataset.runs("train"))
+    with pytest.raises(UserError, match="allowed: train, validation, test"):
+        dataset.runs("valid")
+
+
+def test_a_tolerance_that_decides_alike_makes_no_other_dataset(tmp_path):
+    """The default tolerance was 0.01 once; such datasets stay what they are while each run is decided alike."""
+    c = campaign(tmp_path)
+    numbers = [effects_for(scene)[1]["rate_dependence"].number for scene in c.scenes.values()]
+    numbers = [number for number in numbers if number > 0.0]  # the others' blades stay above the soil
+
+    def asking(friction: float):
+        tolerance = {"friction": friction, "grid": 0.03, "reach": 0.02}
+        return replace(c, effects={"rate_dependence": "auto", "tolerance": tolerance})
+
+    asking(10.0 * max(numbers)).record()
+    text = (c.path / "dataset.yaml").read_text()
+    asking(2.0 * max(numbers)).record()
+    assert (c.path / "dataset.yaml").read_text() == text
+    friction = 10.0 * max(numbers)
+    with pytest.raises(
+        UserError,
+        match=rf"{len(numbers)} of its 10 runs have .*go on with it: effects.tolerance.friction={friction}$",
+    ):
+        asking(0.5 * min(numbers)).record()
+    with pytest.raises(UserError, match="made with other settings"):
+        replace(asking(friction), precision="float64").record()
+
+
+@pytest.mark.parametrize("effects", [3, {"colour": True}, {"tolerance": [1]}, None])
+def test_a_dataset_file_with_odd_effects_is_another_dataset(tmp_path, effects):
+    c = campaign(tmp_path)
+    c.path.mkdir()
+    (c.path / "dataset.yaml").write_text(yaml.safe_dump(c.describe() | {"effects": effects}))
+    with pytest.raises(UserError, match="made with other settings"):
+        c.record()
+
+
+def test_scenes_are_recorded_completely(tmp_path):
+    c = campaign(tmp_path)
+    name, scene = next(iter(c.scenes.items()))
+    assert Scene.from_dict(c.describe()["scenes"][name]) == scene
+
+
+@pytest.mark.parametrize("text", ["split: [", "- 1", "!!python/object/apply:os.system [ls]"])
+def test_a_foreign_dataset_file_is_refused(tmp_path, text):
+    (tmp_path / "dataset.yaml").write_text(text)
+    with pytest.raises(UserError):
+        Dataset.open(tmp_path)
+
+
+def test_no_dataset(tmp_path):
+    with pytest.raises(UserError, match="sgns simulate dataset="):
+        Dataset.open(tmp_path / "nothing")
+
+
+def test_where_picks_runs_by_their_scene(tmp_path) -> None:
+    (tmp_path / "runs").mkdir()
+    scenes = {n: {"load": 100.0 / n, "material": {"friction": n}} for n in (1, 2, 3, 4)}
+    content = {
+        "name": "some",
+        "split": {"train": ["1", "2"], "validation": ["3"], "test": ["4"]},
+        "scenes": {str(n): scene for n, scene in scenes.items()},
+    }
+    (tmp_path / "dataset.yaml").write_text(yaml.safe_dump(content))
+    for n in scenes:
+        (tmp_path / "runs" / f"{n}.h5").touch()
+    names = lambda where: [p.stem for s in SPLITS for p in Dataset.open(tmp_path, where).runs(s)]  # noqa: E731
+    assert names(None) == names({}) == ["1", "2", "3", "4"]
+    assert names({"load": 33.3333333333}) == ["3"]
+    assert names({"load": [100, 25], "material.friction": [1, 2]}) == ["1"]
+    assert names(OmegaConf.create({"material": {"friction": [2, 4]}})) == ["2", "4"]
+    with pytest.raises(UserError, match=r"dataset\.where names depth, which the scene of \d in"):
+        names({"depth": 1})
+    with pytest.raises(UserError, match=r"leaves no run: load is \[7\]; .* it is 100\.0, 25\.0, 33"):
+        names({"load": 7})
+
+
+def test_every_scene_reads_the_mesh_that_the_settings_name(tmp_path):
+    from meshes import BOX_FACES, box_corners, write_obj
+
+    sizes = {"one": (0.08, 0.09, 0.10), "two": (0.08, 0.09, 0.11)}
+    files = [
+        str(write_obj(tmp_path / f"{name}.obj", box_corners(size), BOX_FACES)) for name, size in sizes.items()
+    ]
+    rows = [[0.0, 0.1, 0.1, 0.03, 0, 0, 0, 1], [1.0, 0.2, 0.1, 0.03, 0, 0, 0, 1]]
+    tool = {"shape": "mesh", "file": files[0]}
+    base = Scene.from_dict({"kind": "body", "bed": BASE["bed"], "duration": 0.05, "path": rows, "tool": tool})
+    draw = {"tool.file": files, "tool.friction": [0.1, 0.3]}
+    settings = {"name": "tiny", "path": tmp_path / "tiny", "draw": draw}
+    c = plan(settings, base.to_dict(), EFFECTS, "float32", 0)
+    assert {scene.tool.digest for scene in c.scenes.values()} > {base.tool.digest}
+    c.record()
+    c.record()  # the same settings go on

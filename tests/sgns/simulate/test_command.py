@@ -1,0 +1,162 @@
+"""`sgns simulate`: one run and a campaign, resumed; what goes wrong leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+
+import h5py
+import pytest
+from omegaconf import OmegaConf
+from test_campaign import campaign
+
+from mpm_warp import Bed, Effects, Excavation, SolverStopped
+from mpm_warp.batch import all_together
+from sgns.config import UserError
+from sgns.data.check import check_run
+from sgns.data.files import only_here
+from sgns.data.run import Run
+from sgns.simulate import command as simulate
+from sgns.simulate import workers as campaign_runs
+from sgns.simulate.run import scene_stages, simulate_scene
+
+SMALL = [
+    "scene.bed.particles_per_cell=1",
+    "scene.duration=0.05",
+    "scene.bed.size=[0.4,0.2,0.16]",
+    "scene.bed.spacing=0.04",
+    "scene.blade={length: 0.1, width: 0.1, thickness: 0.08, friction: 0.3}",
+]
+
+
+def sgns(folder, *arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "sgns", *arguments], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+def test_command_writes_a_complete_run(tmp_path):
+    done = sgns(tmp_path, "simulate", *SMALL, "scene.rake=5", "output=run.h5")
+    assert done.returncode == 0, done.stderr
+    assert "particle-steps/s" in done.stdout
+    assert check_run(tmp_path / "run.h5") == []
+    with Run(tmp_path / "run.h5") as run:
+        assert run.producer == "mpm"
+        assert run.scene["rake"] == 5.0
+        assert run.effects["separation"]["on"] is True
+        assert run.effects["separation"]["reason"]
+        assert run.frame_count == 4
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert file["particles/soil/position/value"].shape == (4, 10 * 5 * 4, 3)
+    assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
+
+
+def test_command_writes_fewer_particles(tmp_path):
+    done = sgns(tmp_path, "simulate", *SMALL, "scene.bed.store_every=7")
+    assert done.returncode == 0, done.stderr
+    assert "run.h5: 200 particles (one of every 7 recorded), 4 frames" in done.stdout
+    with Run(tmp_path / "run.h5") as run:
+        assert run.particle_count == 29
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("scene.depth=0.5", "leaves the bin"),
+        ("scene.bed.colour=red", "colour"),
+        ("effects.gravity=true", "effects"),
+        ("solver.precision=float16", "allowed: float32, float64"),
+        ("device=tpu", "device is 'tpu'"),
+        ("scene.bed.store_every=0", "bed.store_every is 0"),
+        ("shards=4", "give dataset=..."),
+        ("solver.batch=0", "solver.batch is 0"),
+        ("scene.courant=1e-3 material.youngs_modulus=1e12", "lower material.youngs_modulus"),
+        ("scene.duration=1e300", "scene.duration is 1e+300 s; allowed: at most"),
+        ("scene.depth=deep", "scene.depth is 'deep'"),
+        ("scene.path=nowhere.csv", "scene.path"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, override, words):
+    done = sgns(tmp_path, "simulate", *SMALL, *override.split())
+    assert done.returncode == 2
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1
+    assert words in lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nan_in_a_path(tmp_path):
+    (tmp_path / "path.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0.1,0.1,0.1,0,0,0,1\n1,nan,0.1,0.1,0,0,0,1\n")
+    done = sgns(tmp_path, "simulate", *SMALL, "scene.motion=path", "scene.path=path.csv")
+    assert done.returncode == 2
+    assert "not finite in row 2, column 2" in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["path.csv"]
+
+
+def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
+    scene = next(iter(campaign(tmp_path).scenes.values()))
+
+    def stops(self):
+        raise SolverStopped("particle 1 went wrong")
+        yield
+
+    monkeypatch.setattr("sgns.simulate.command.run.Solver.stages", stops)
+    with pytest.raises(SolverStopped):
+        simulate_scene(scene, tmp_path / "run.h5", effects=Effects())
+    assert not list(tmp_path.glob("*"))
+
+
+def test_scenes_side_by_side_share_the_time_that_passes(tmp_path):
+    scenes, begin = list(campaign(tmp_path).scenes.values())[:2], time.perf_counter()
+    stages = [scene_stages(scene, tmp_path / f"{n}.h5", effects=Effects()) for n, scene in enumerate(scenes)]
+    timings = dict(all_together(stages, 2, "cpu"))
+    passed = time.perf_counter() - begin
+    assert 0.0 < sum(timing.wall_time for timing in timings.values()) < passed
+    for number, timing in timings.items():
+        assert timing.wall_time < 0.7 * passed
+        with Run(tmp_path / f"{number}.h5") as run:
+            assert run.wall_time_s == timing.wall_time
+
+
+def test_output_that_is_a_folder(tmp_path):
+    scene = next(iter(campaign(tmp_path).scenes.values()))
+    with pytest.raises(UserError, match="is a folder"):
+        simulate_scene(scene, tmp_path, effects=Effects())
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_an_output_that_is_a_pipe_or_taken_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
+    monkeypatch.setattr(simulate, "simulate_scene", None)
+    cfg = OmegaConf.create({"output": str(tmp_path / "run.h5"), "device": "cpu"})
+    scene = Excavation()
+    with only_here(tmp_path / "run.h5"), pytest.raises(UserError, match=f"made by process {os.getpid()}"):
+        simulate._simulate_one(scene, cfg)
+    os.mkfifo(tmp_path / "run.stopped.h5")
+    with pytest.raises(UserError, match=r"run\.stopped\.h5: it is a pipe"):
+        simulate._simulate_one(scene, cfg)
+    os.mkfifo(tmp_path / "run.h5")
+    with pytest.raises(UserError, match=r"run\.h5: it is a pipe"):
+        simulate._simulate_one(scene, cfg)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_a_campaign_refuses_a_pipe_before_the_first_frame(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign_runs, "_frames_done", [0])
+    scene, place = Excavation(bed=Bed(size=(0.8, 0.6, 0.16), spacing=0.04)), tmp_path / "a.h5"
+    os.mkfifo(place)
+    described = scene.to_dict(), None
+    task = campaign_runs._make(0, described, place, Effects(), Effects().described(), 0, "cpu", "float32")
+    ((_, (kind, words)),) = all_together([task], 1, "cpu")
+    assert kind == "failed" and "it is a pipe" in words
+    assert campaign_runs._frames_done == [0]
+    assert place.is_fifo()
+
+
+def test_the_command_says_that_an_output_is_a_device(tmp_path):
+    (tmp_path / "run.h5").symlink_to("/dev/null")
+    done = sgns(tmp_path, "simulate", *SMALL, "output=run.h5")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "cannot write run.h5: it is a symbolic link" in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]

@@ -1,0 +1,294 @@
+"""A run whose solver stopped: what is kept, and how to go on with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from meshes import BOX_FACES, box_corners, write_obj
+from omegaconf import OmegaConf
+from test_command import SMALL, sgns
+
+from mpm_warp import (
+    Bed,
+    Effects,
+    Excavation,
+    MeshBody,
+    Plate,
+    Push,
+    Scene,
+    SceneError,
+    Solver,
+    SolverStopped,
+    bodies,
+    effects_for,
+)
+from mpm_warp import (
+    mesh as mesh_file,
+)
+from mpm_warp.batch import all_together
+from sgns.config import UserError
+from sgns.data.check import check_run
+from sgns.data.run import Run, read_state, stopped_path
+from sgns.simulate import workers as campaign_runs
+from sgns.simulate.run import continued, simulate_scene
+from sgns.simulate.scene import recorded
+
+LAST = 3  # frame before the one in which the solver stops
+
+
+def small(**kw) -> Excavation:
+    return Excavation(
+        bed=Bed(size=(0.4, 0.2, 0.16), spacing=0.04, store_every=3),
+        blade=Plate(length=0.1, width=0.1, thickness=0.08),
+        duration=0.1,
+        **kw,
+    )
+
+
+def physics() -> dict[str, Any]:
+    """Effects and the record of them as `sgns simulate` decides."""
+    effects, decisions = effects_for(small())
+    return {"effects": effects, "reasons": recorded(decisions)}
+
+
+@pytest.fixture
+def stops(monkeypatch):
+    """Solvers lose a particle after the frame LAST, unless they step at half the usual courant number."""
+    whole = Solver._check
+
+    def check(self, index):
+        if index == LAST + 1 and self.scene.courant > 0.4:
+            raise self._stopped(index, 7, 11, "the test stops it: lower scene.courant")
+        whole(self, index)
+
+    monkeypatch.setattr(Solver, "_check", check)
+
+
+@pytest.fixture
+def stopped(stops, tmp_path):
+    """A stopped run's file, and the file that it was to become."""
+    output = tmp_path / "run.h5"
+    with pytest.raises(SolverStopped) as caught:
+        simulate_scene(small(), output, **physics())
+    assert f"sgns simulate continue_from={stopped_path(output)} output={output} scene.courant=0.3" in str(
+        caught.value
+    )
+    return stopped_path(output), output
+
+
+def test_the_frames_before_are_kept(stopped):
+    kept, output = stopped
+    assert kept.name == "run.stopped.h5"
+    assert not output.exists()
+    assert [p.name for p in kept.parent.iterdir()] == [kept.name]
+    with Run(kept) as run:
+        assert run.frame_count == LAST + 1
+        assert "particle 51 at (" in run.stopped  # 11 of the half that is computed
+        assert run.positions(0)[0].shape == (len(small().stored), 3)
+    (problem,) = check_run(kept)
+    assert problem.startswith("the run stopped after 4 good frames: particle 51 at (")
+    assert read_state(kept).frame == LAST
+
+
+def test_check_names_it(stopped):
+    done = sgns(stopped[0].parent, "check", ".")
+    assert done.returncode == 2
+    assert "run.stopped.h5: the run stopped after 4 good frames" in done.stdout
+
+
+def test_going_on_with_half_the_step(stopped):
+    kept, output = stopped
+    done = sgns(kept.parent, "simulate", f"continue_from={kept}", "scene.courant=0.3", "output=run.h5")
+    assert done.returncode == 0, done.stderr
+    assert check_run(output) == []
+    assert not kept.exists()  # it has served its purpose
+    assert campaign_runs._done(output, small())  # a campaign takes it for its own
+    reference = list(Solver(small(courant=0.3)).frames())
+    with Run(output) as run:
+        assert run.frame_count == small().frame_count
+        assert run.scene == small().to_dict()
+        assert run.extra["continued"] == [{"frame": LAST, "changed": {"courant": 0.3}}]
+        assert run.stopped is None
+        assert np.abs(run.positions(-1)[0] - reference[-1].position[small().stored]).max() < 1e-3
+
+
+def test_a_run_that_goes_on_unchanged_is_the_undisturbed_one(stopped, monkeypatch, tmp_path):
+    """Bit for bit, as a run file: the same content hash."""
+    kept, _ = stopped
+    monkeypatch.undo()
+    simulate_scene(small(), tmp_path / "whole.h5", **physics())
+    done = sgns(tmp_path, "simulate", f"continue_from={kept}", "output=rest.h5")
+    assert done.returncode == 0, done.stderr
+    with Run(tmp_path / "whole.h5") as one, Run(tmp_path / "rest.h5") as two:
+        assert one.content_hash == two.content_hash
+        assert two.extra["continued"] == [{"frame": LAST, "changed": {}}]
+
+
+def test_it_may_stop_again(stopped, monkeypatch):
+    """Then the frames of both are kept, and the file says so."""
+    kept, output = stopped
+    with Run(kept) as run:
+        first = run.wall_time_s
+    cfg = OmegaConf.create(
+        {"continue_from": str(kept), "scene": {"courant": 0.3}, "solver": {"precision": "float32"}}
+    )
+    going_on = continued(cfg, ["scene.courant=0.3", f"output={output}"])
+
+    def check(self, index):
+        if index == LAST + 2:
+            raise self._stopped(index, 7, 11, "the test stops it again: raise scene.bed.headroom")
+
+    monkeypatch.setattr(Solver, "_check", check)
+    with pytest.raises(SolverStopped, match=r"stops it again.*scene.bed.headroom=0"):
+        simulate_scene(going_on.scene, output, effects=going_on.effects, going_on=going_on)
+    with Run(kept) as run:
+        assert run.frame_count == LAST + 2
+        assert "stops it again" in run.stopped
+        assert run.extra["continued"] == [{"frame": LAST, "changed": {"courant": 0.3}}]
+        took = run.wall_time_s
+    assert took > first  # the frames before the first stop included
+    assert read_state(kept).frame == LAST + 1
+    cfg.scene = {"bed": {"headroom": 0.5}}
+    third = continued(cfg, ["scene.bed.headroom=0.5"])
+    assert third.changes == {"courant": 0.3, "bed.headroom": 0.5}  # those of before as well
+    assert third.changed_scene.courant == 0.3 and third.wall_time == took
+
+
+def test_a_campaign_says_where_its_run_is_kept(stops, tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign_runs, "_frames_done", [0])
+    output = tmp_path / "runs" / "1.h5"
+    task = campaign_runs._make(
+        0, (small().to_dict(), None), output, Effects(), Effects().described(), 0, "cpu", "float32"
+    )
+    ((_, (kind, words)),) = all_together([task], 1, "cpu")
+    assert kind == "failed"
+    assert f"continue_from={stopped_path(output)}" in words
+    assert check_run(stopped_path(output))[0].startswith("the run stopped after 4 good frames")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["scene.depth=0.03"], "leave out scene.depth"),
+        (["scene=wheel"], "leave out scene"),
+        (["material.youngs_modulus=1e6"], "leave out material.youngs_modulus"),
+        (["scene.courant=2"], "scene.courant is 2"),
+        (["dataset=quick"], "leave out dataset="),
+    ],
+)
+def test_what_may_not_change(stopped, arguments, words):
+    kept, output = stopped
+    done = sgns(kept.parent, "simulate", f"continue_from={kept}", f"output={output}", *arguments)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert words in line
+    assert kept.exists()
+
+
+def test_what_cannot_be_gone_on_with(tmp_path, stopped):
+    kept, _ = stopped
+    assert sgns(tmp_path, "simulate", *SMALL, "output=whole.h5").returncode == 0
+    for name, words in (("whole.h5", "is a whole run"), ("none.h5", "no such run file")):
+        done = sgns(tmp_path, "simulate", f"continue_from={name}")
+        assert done.returncode == 2
+        assert words in done.stderr
+    with h5py.File(kept, "r+") as file:
+        file["state/log_volume"][0] = np.nan
+    done = sgns(tmp_path, "simulate", f"continue_from={kept}")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "log_volume is not finite" in done.stderr
+    with h5py.File(kept, "r+") as file:
+        del file["state/position"]
+        file["state/position"] = "text"
+    with pytest.raises(UserError, match="does not hold numbers"):
+        read_state(kept)
+    with h5py.File(kept, "r+") as file:
+        del file["state"]
+    with pytest.raises(UserError, match="holds no state to go on from"):
+        read_state(kept)
+
+
+def test_a_bed_without_a_body_can_go_on(stops, tmp_path):
+    scene = Scene(bed=Bed(size=(0.2, 0.2, 0.1), spacing=0.04), duration=0.1)
+    with pytest.raises(SolverStopped, match="continue_from="):
+        simulate_scene(scene, tmp_path / "bed.h5", effects=Effects())
+    assert read_state(tmp_path / "bed.stopped.h5").frame == LAST
+
+
+def pushed(file) -> Push:
+    rows = tuple((t, 0.1 + 0.5 * t, 0.1, 0.03, 0.0, 0.0, 0.0, 1.0) for t in (0.0, 0.1))
+    bed = Bed(size=(0.4, 0.2, 0.16), spacing=0.04)
+    return Push(bed=bed, tool=MeshBody(file=str(file)), path=rows, duration=0.1)
+
+
+@pytest.fixture
+def stopped_mesh(stops, tmp_path):
+    """A stopped run of a mesh whose file is gone, and the content of that file."""
+    file = write_obj(tmp_path / "box.obj", box_corners((0.08, 0.09, 0.1)), BOX_FACES)
+    with pytest.raises(SolverStopped):
+        simulate_scene(pushed(file), tmp_path / "run.h5", effects=Effects())
+    content = file.read_text()
+    file.unlink()
+    return tmp_path / "run.stopped.h5", content
+
+
+def asked(kept, *overrides):
+    cfg = {"continue_from": str(kept), "scene": {"courant": 0.3}, "solver": {"precision": "float32"}}
+    found = OmegaConf.merge(cfg, OmegaConf.from_dotlist([o.lstrip("+") for o in overrides]))
+    return continued(found, ["scene.courant=0.3", *overrides])
+
+
+def test_a_run_brings_its_mesh(stopped_mesh, tmp_path, monkeypatch):
+    """Whatever lies where the run says that the mesh was, it is not looked at."""
+    kept, _ = stopped_mesh
+    (tmp_path / "box.obj").write_text("another's")
+
+    def never(*_):
+        raise AssertionError("a file is read because a run names it")
+
+    monkeypatch.setattr(bodies, "read_bytes", never)
+    monkeypatch.setattr(mesh_file, "read_bytes", never)
+    with pytest.raises(UserError, match=r"brings its own tool; leave out scene\.tool\.file"):
+        asked(kept, "+scene.tool.file=box.obj")
+    going_on = asked(kept)
+    simulate_scene(going_on.scene, tmp_path / "run.h5", effects=going_on.effects, going_on=going_on)
+    assert check_run(tmp_path / "run.h5") == []
+    with Run(tmp_path / "run.h5") as run:
+        assert run.frame_count == going_on.scene.frame_count
+        np.testing.assert_array_equal(run.mesh[0], going_on.scene.mesh[0])
+
+
+def test_a_run_without_its_mesh_reads_what_the_command_names(stopped_mesh, tmp_path):
+    kept, content = stopped_mesh
+    with Run(kept) as run:
+        whole = run.mesh
+    with h5py.File(kept, "r+") as file:
+        del file["parameters"]
+    (tmp_path / "box.obj").write_text(content)  # where the run says it was
+    with pytest.raises(UserError, match=r"not hold the mesh of its tool.*'\+scene\.tool\.file=") as caught:
+        asked(kept)
+    assert "\n" not in str(caught.value)
+    other = tmp_path / "other.obj"
+    (tmp_path / "box.obj").rename(other)
+    going_on = asked(kept, f"+scene.tool.file={other}")
+    np.testing.assert_array_equal(going_on.scene.mesh[0], whole[0])
+    assert going_on.scene.tool.file.endswith("box.obj")  # a campaign knows the run by it
+    other.write_text(content.replace("v 0.08", "v 0.07"))
+    with pytest.raises(SceneError, match="is not the file this scene was made with"):
+        asked(kept, f"+scene.tool.file={other}")
+
+
+def test_a_run_cannot_ask_for_a_file(stopped_mesh):
+    """A scene in a file without a digest would be one of a person, whose file is read."""
+    kept, _ = stopped_mesh
+    with h5py.File(kept, "r+") as file:
+        scene = yaml.safe_load(file.attrs["scene"])
+        scene["tool"].pop("digest")
+        del file["parameters"]
+        file.attrs["scene"] = yaml.safe_dump(scene)
+    with pytest.raises(UserError, match="without the digest"):
+        asked(kept)

@@ -1,0 +1,138 @@
+"""The group `effects`: from the settings to each run's physics, and into its file."""
+
+from __future__ import annotations
+
+import logging
+from types import SimpleNamespace
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_module
+from test_campaign import campaign
+
+from mpm_warp import Decision, Effects, SceneError, Tolerances
+from sgns.config import UserError
+from sgns.data.check import check_run
+from sgns.data.run import Run
+from sgns.simulate import workers as campaign_runs
+from sgns.simulate.campaign import plan
+from sgns.simulate.command import simulate_campaign
+from sgns.simulate.scene import asked_effects, decided, decision_summary, scene_from_config
+
+
+def chosen(*overrides: str) -> tuple[Effects, dict[str, Decision]]:
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        cfg = compose("simulate", list(overrides))
+    return decided(scene_from_config(cfg), asked_effects(cfg))
+
+
+def test_the_shipped_tolerances_are_the_solvers_own():
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        asked = asked_effects(compose("simulate"))
+    assert Tolerances(**asked.pop("tolerance")) == Tolerances()
+    assert set(asked.values()) == {"auto"}
+
+
+@pytest.mark.parametrize(
+    ("scene", "rate_dependence"),
+    [
+        (["scene=excavation"], False),
+        (["scene=excavation", "scene.speed=0.15", "scene.depth=0.02"], True),  # the fastest, shallowest cut
+        (["scene=paper_wheel"], False),
+        (["scene=paper_wheel", "scene.gravity=1.62", "scene.diameter=0.05", "scene.load=11.1"], True),
+    ],
+)
+def test_only_the_fastest_of_the_papers_runs_call_for_rate_dependence(scene, rate_dependence):
+    effects, _ = chosen(*scene)
+    assert effects == Effects(rate_dependence=rate_dependence, symmetry=True)
+
+
+@pytest.mark.parametrize("scene", ["incline", "thin_layer"])
+def test_layers_of_some_grains_call_for_nonlocality(scene):
+    assert chosen(f"scene={scene}")[0].nonlocality
+
+
+def test_two_names_of_nonlocality():
+    for override in ("effects.nonlocal=true", "effects.nonlocality=true"):
+        assert chosen("scene=quick_excavation", override)[0].nonlocality
+    assert not chosen("scene=thin_layer", "effects.nonlocal=false")[0].nonlocality
+
+
+def test_all_physics():
+    effects, decisions = chosen("scene=column", "effects=all")
+    assert effects == Effects(fluidity=True, nonlocality=True, symmetry=True, torque=False)
+    assert decisions["fluidity"].reason.startswith("asked for; auto would turn it off")
+
+
+@pytest.mark.parametrize(
+    ("asked", "error", "words"),
+    [
+        ({"symmetry": "maybe"}, SceneError, "effects.symmetry is 'maybe'; allowed: auto, true, false"),
+        ({"colour": True}, SceneError, "effects has no key 'colour'"),
+        ({"tolerance": 3}, UserError, "effects.tolerance is 3; it must be a group of keys"),
+        ({"tolerance": {"grid": 1.0}}, UserError, "effects.tolerance.friction is missing"),
+        ({"tolerance": {"grid": -1.0, "reach": 0.1, "friction": 0.1}}, SceneError, "tolerance.grid is -1.0"),
+    ],
+)
+def test_settings_it_refuses(tmp_path, asked, error, words):
+    scene = next(iter(campaign(tmp_path).scenes.values()))
+    with pytest.raises(error, match=words):
+        decided(scene, asked)
+
+
+def fast_and_slow(tmp_path, asked):
+    """Three slow cuts and one so fast that friction depends on the rate."""
+    base = {
+        "kind": "excavation",
+        "duration": 0.05,
+        "clearance": 0.0,
+        "start": 0.3,
+        "blade": {"length": 0.1, "width": 0.1, "thickness": 0.08},
+        "bed": {"size": [0.4, 0.2, 0.16], "spacing": 0.04},
+    }
+    settings = {"name": "tiny", "path": tmp_path / "tiny", "draw": {"speed": [0.05, 0.06, 0.07, 4.0]}}
+    return plan(settings, base, asked, "float32", 0)
+
+
+def test_runs_of_a_dataset_decide_for_themselves(tmp_path, caplog):
+    c = fast_and_slow(tmp_path, {"fluidity": "auto", "torque": False})
+    with caplog.at_level(logging.INFO):
+        simulate_campaign(c, device="cpu", workers=1)
+    assert "rate_dependence on in 1 of 4 runs; else off: the body moves soil" in caplog.text
+    assert "torque off: asked for; auto would turn it on" in caplog.text
+    said = yaml.safe_load((c.path / "dataset.yaml").read_text())
+    assert said["effects"] == {"fluidity": "auto", "torque": False}
+    for name, scene in c.scenes.items():
+        assert check_run(c.file(name)) == []
+        with Run(c.file(name)) as run:
+            assert run.effects["rate_dependence"]["on"] is (scene.speed == 4.0)
+            assert (run.effects["rate_dependence"]["number"] > 0.01) is (scene.speed == 4.0)
+            assert not run.torque.any()
+
+
+def test_each_set_of_effects_is_compiled_once(tmp_path, monkeypatch):
+    compiled = []
+
+    def solver(scene, effects, *_):
+        compiled.append(effects)
+        return SimpleNamespace(frames=lambda: iter([None]))
+
+    monkeypatch.setattr(campaign_runs, "Solver", solver)
+    c = fast_and_slow(tmp_path, {})
+    campaign_runs._compile(c, list(c.scenes), "cpu")
+    assert sorted(effects.rate_dependence for effects in compiled) == [False, True]
+
+
+def test_what_no_run_can_have_is_refused_before_anything_is_written(tmp_path):
+    c = fast_and_slow(tmp_path, {"free_body": True})
+    with pytest.raises(SceneError, match=r"effects\.free_body needs a body whose height is free"):
+        simulate_campaign(c, device="cpu", workers=1)
+    assert not c.path.exists()
+
+
+def test_summary_of_a_dataset():
+    on, off = Decision(True, "it flows"), Decision(False, "it rests")
+    assert decision_summary([{"yielding": on}]) == ["yielding on: it flows"]
+    assert decision_summary([{"yielding": on}, {"yielding": off}]) == [
+        "yielding on in 1 of 2 runs; else off: it rests"
+    ]

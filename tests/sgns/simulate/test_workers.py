@@ -1,0 +1,233 @@
+"""The runs of a campaign: order, shares, estimates; several processes on one folder; what fails."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_campaign import campaign
+
+from sgns.config import UserError
+from sgns.data.check import check_run
+from sgns.data.files import claimed
+from sgns.data.run import Run
+from sgns.simulate import workers as campaign_runs
+from sgns.simulate.campaign import run_cost
+from sgns.simulate.workers import simulate_campaign
+
+# Makes a campaign of four runs in the folder named on the command line.
+MAKE = """
+import sys, pathlib, logging
+sys.path[:0] = sys.argv[2:]
+from test_campaign import campaign
+from sgns.simulate.command.workers import simulate_campaign
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+    simulate_campaign(campaign(pathlib.Path(sys.argv[1]), runs=4), device="cpu", workers=1)
+"""
+# Compiles a kernel when told to.
+COMPILE = """
+import warp as wp
+from mpm_warp.kernels.grid import grid_step
+from mpm_warp.launch import start_warp
+start_warp()
+print("ready", flush=True)
+input()
+kernel = grid_step(wp.float32, ("no_slip",) * 3).step.alone
+wp.load_module(kernel.module, device="cpu")
+print("done")
+"""
+
+
+@pytest.fixture
+def order(monkeypatch):
+    """Names of the runs in the order of their beginning, without making any."""
+    names = []
+
+    def make_all(self, disk):
+        names.extend(self.costs)
+        self._pool.shutdown()
+        return {}
+
+    monkeypatch.setattr(campaign_runs._Production, "make_all", make_all)
+    monkeypatch.setattr(campaign_runs, "_compile", lambda *_: None)
+    return names
+
+
+def unequal(tmp_path):
+    return campaign(tmp_path, draw={"duration": [0.1, 0.5, 0.2], "depth": [0.02, 0.04]}, runs=None)
+
+
+def test_campaign_is_resumed(tmp_path, caplog):
+    c = campaign(tmp_path, runs=3)
+    with caplog.at_level(logging.INFO):
+        simulate_campaign(c, device="cpu", workers=2)
+    assert "3 runs, 3 to do" in caplog.text
+    assert re.search(r"about \d+ s with 2 at once, about \d+ kB of disk", caplog.text)
+    files = [c.file(name) for name in c.scenes]
+    assert all(check_run(f) == [] for f in files)
+    before = [f.stat().st_mtime_ns for f in files]
+    force = Run(files[1]).force
+    files[1].unlink()
+    files[2].write_bytes(files[2].read_bytes()[:5000])  # a torn file is made again
+    simulate_campaign(c, device="cpu", workers=1)
+    after = [f.stat().st_mtime_ns for f in files]
+    assert after[0] == before[0]
+    assert check_run(files[2]) == []
+    np.testing.assert_array_equal(Run(files[1]).force, force)
+    assert sorted(f.name for f in files[0].parent.iterdir()) == sorted(f.name for f in files)
+
+
+def test_runs_that_take_turns_are_the_runs_made_one_by_one(tmp_path, caplog):
+    one, two = campaign(tmp_path / "one", runs=5), campaign(tmp_path / "two", runs=5)
+    simulate_campaign(one, device="cpu", workers=1)
+    with caplog.at_level(logging.INFO):
+        simulate_campaign(two, device="cpu", workers=1, batch=3)
+    assert "with 3 at once" in caplog.text
+    for name in two.scenes:
+        assert check_run(two.file(name)) == []
+        with Run(one.file(name)) as alone, Run(two.file(name)) as together:
+            np.testing.assert_array_equal(alone.positions(), together.positions())
+            np.testing.assert_array_equal(alone.force, together.force)
+
+
+def test_the_longest_runs_come_first(tmp_path, order):
+    c = unequal(tmp_path)
+    simulate_campaign(c, device="cpu", workers=2)
+    assert [c.scenes[name].duration for name in order] == [0.5, 0.5, 0.2, 0.2, 0.1, 0.1]
+
+
+def test_shards_are_the_campaign_in_shares_of_like_work(tmp_path, order):
+    c = unequal(tmp_path)
+    shares = []
+    for shard in range(2):
+        simulate_campaign(c, device="cpu", shard=shard, shards=2)
+        shares.append([run_cost(c.scenes[name]).work for name in order])
+        done = list(order)
+        order.clear()
+        assert len(done) == 3
+    assert sum(shares[0]) == pytest.approx(sum(shares[1]), rel=0.01)
+    simulate_campaign(c, device="cpu")
+    assert len(order) == 6
+
+
+@pytest.mark.parametrize(
+    ("shard", "shards", "words"),
+    [
+        (2, 2, "from 0 to 1"),
+        (-1, 2, "from 0 to 1"),
+        ("a", 2, "shard is 'a'"),
+        (0, 0, "shards is 0"),
+        (0, 1.5, "1.5"),
+    ],
+)
+def test_shards_it_refuses(tmp_path, shard, shards, words):
+    with pytest.raises(UserError, match=words):
+        simulate_campaign(campaign(tmp_path), device="cpu", shard=shard, shards=shards)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_is_too_full_is_refused_before_anything_is_made(tmp_path, order, monkeypatch):
+    monkeypatch.setattr("sgns.simulate.campaign.shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
+    with pytest.raises(UserError, match=r"of disk and 1\.0 kB are free"):
+        simulate_campaign(campaign(tmp_path), device="cpu")
+    assert order == []
+
+
+def test_kernels_are_compiled_once_for_each_kind_of_scene(tmp_path, monkeypatch):
+    compiled = []
+
+    def solver(scene, *_):
+        compiled.append(scene)
+        return SimpleNamespace(frames=lambda: iter(["the first"]))
+
+    monkeypatch.setattr(campaign_runs, "Solver", solver)
+    numbers = campaign(tmp_path, draw={"rake": [5.0, 10.0], "depth": [0.02, 0.04, 0.05]}, runs=None)
+    campaign_runs._compile(numbers, list(numbers.scenes), "cpu")
+    assert len(compiled) == 1
+    compiled.clear()
+    kinds = campaign(
+        tmp_path, draw={"motion": ["curved", "ramp"], "blade.friction": [0.0, 0.1, 0.3]}, runs=None
+    )
+    campaign_runs._compile(kinds, list(kinds.scenes), "cpu")
+    assert sorted((s.motion, s.blade.friction) for s in compiled) == [
+        ("curved", 0.0), ("curved", 0.1), ("ramp", 0.0), ("ramp", 0.1)
+    ]  # fmt: skip
+
+
+def test_time_left_follows_from_the_work_left_and_the_speed_seen(tmp_path):
+    c = campaign(tmp_path, runs=6)
+    costs = {name: run_cost(scene) for name, scene in c.scenes.items()}
+    per_frame = costs[next(iter(costs))].work_per_frame
+    production = campaign_runs._Production(c, costs, "cpu", 4)
+    try:
+        assert production._left() == "an unknown time"
+        # A frame takes a worker 100 s; six runs of three steps on four workers end after two runs.
+        production._work_seen, production._seconds_seen = 10 * per_frame, 1000.0
+        assert production._left() == "10 min"
+        # Then an hour at half that speed, with three of the workers busy: the estimate says so.
+        for _ in range(60):
+            production._see(0.9 * per_frame, elapsed=60.0, busy=3)
+        assert production._left() == "20 min"
+        # Four runs have only one step left (frames 0 to 2 are there), two have not begun.
+        production._frames_done[:] = [3, 3, 3, 3, 0, 0]
+        assert production._work_made() == 8 * per_frame
+        assert production._left() == "13 min"
+    finally:
+        production._pool.shutdown()
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_a_run_that_fails_does_not_stop_the_others(tmp_path, batch):
+    c = campaign(tmp_path, draw={"depth": [0.02, 0.04, 0.05], "path": [None]}, runs=None)
+    name = next(iter(c.scenes))
+    c.file(name).mkdir(parents=True)  # nothing can be written there
+    with pytest.raises(UserError, match=f"1 of 3 runs could not be made .* first is {name}: .* is a folder"):
+        simulate_campaign(c, device="cpu", workers=1, batch=batch)
+    assert [check_run(c.file(n)) for n in list(c.scenes)[1:]] == [[], []]
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_a_run_that_another_process_makes_is_left_to_it(tmp_path, caplog, batch):
+    c = campaign(tmp_path, runs=3)
+    first, *others = c.scenes
+    with claimed(c.file(first)) as ours, caplog.at_level(logging.INFO):
+        assert ours
+        simulate_campaign(c, device="cpu", workers=1, batch=batch)
+    assert "runs left to another process that is making them or has made them: 1" in caplog.text
+    assert not c.file(first).exists()
+    assert all(c.file(name).exists() for name in others)
+
+
+def test_two_processes_on_an_empty_folder_make_every_run_once(tmp_path):
+    script = tmp_path / "make.py"
+    script.write_text(MAKE)
+    command = [sys.executable, str(script), str(tmp_path), os.path.dirname(__file__)]
+    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    said = [process.communicate(timeout=100)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0]
+    c = campaign(tmp_path, runs=4)
+    assert all(check_run(c.file(name)) == [] for name in c.scenes)
+    # What one process did not make, the other did; nothing was made by both.
+    to_do = [int(re.search(r"(\d+) to do", text)[1]) for text in said]
+    left = [int(found[1]) if (found := re.search(r"has made them: (\d+)", text)) else 0 for text in said]
+    assert sum(to_do) - sum(left) == 4
+
+
+def test_two_processes_may_compile_into_an_empty_cache_at_once(tmp_path):
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": environment}
+    processes = [subprocess.Popen([sys.executable, "-c", COMPILE], **pipes) for _ in range(2)]
+    for process in processes:
+        assert process.stdout.readline() == "ready\n"
+    said = [process.communicate("go\n", timeout=100)[0] for process in processes]
+    assert said == ["done\n"] * 2
+    # One kernel, and no half-made folder beside it.
+    assert len(list(tmp_path.glob("*/wp_grid_step*"))) == 1
+    assert len(list(tmp_path.glob("*/wp_grid_step*/*.o"))) == 1

@@ -1,0 +1,147 @@
+"""Advice from a table."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from sgns.advise import advice, bands, main, shipped, table, wished
+from sgns.config import UserError
+from sgns.frontier.point import Point, read_points, write_points
+
+POINTS = [
+    Point("full", "cut", "solver", "reference", "finest", wall_s_per_simulated_s=400.0, ratio=90.0),
+    Point("full", "cut", "solver", "dx", "coarse", settings="scene=quick_excavation", wall_s_per_simulated_s=3.0,
+          ratio=0.6, force_nrmse=0.22, position_rmse_mm=3.5),
+    Point("full", "cut", "solver", "dx", "fine", settings="scene=quick_excavation scene.bed.spacing=0.01",
+          wall_s_per_simulated_s=60.0, ratio=12.0, force_nrmse=0.1, position_rmse_mm=2.0),
+    Point("full", "cut", "surrogate", "r", "r = 8", settings="dataset=quick", wall_s_per_simulated_s=0.02,
+          decoded_wall_s_per_simulated_s=0.2, ratio=0.004, force_nrmse=0.35, position_rmse_mm=5.0,
+          own_force_nrmse=0.26),
+]  # fmt: skip
+
+
+@pytest.fixture
+def own_table(tmp_path: Path) -> Path:
+    write_points(tmp_path / "points.csv", POINTS)
+    return tmp_path / "points.csv"
+
+
+def asked(*overrides: str) -> dict:
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        return OmegaConf.to_container(compose("advise", list(overrides)))
+
+
+def answer(*overrides: str) -> list[str]:
+    return advice(POINTS, wished(asked(*overrides), POINTS))
+
+
+def test_the_fastest_that_is_good_enough_is_named_with_its_command() -> None:
+    lines = answer("error.force=0.25")
+    assert lines[0] == "use: solver, coarse"
+    assert "sgns simulate scene=quick_excavation output=run.h5" in lines[1]
+    surrogate = answer("error.force=0.4")
+    assert surrogate[0] == "use: surrogate, r = 8"
+    assert any("its training runs: force NRMSE 0.26" in line for line in surrogate)
+    assert answer("error.position=0.004")[0] == "use: solver, coarse"  # in metres
+
+
+def test_time_is_that_of_a_step() -> None:
+    assert answer("error.force=0.4", "time=0.001")[0] == "use: surrogate, r = 8"  # 0.02 / 60 s
+    assert answer("time=0.1")[0] == "use: solver, coarse"  # the smallest error within the time
+    closest = answer("error.force=0.25", "time=0.001")
+    assert closest[0].startswith("nothing meets this; closest: surrogate")
+
+
+def test_a_surrogate_is_not_taken_for_its_luck() -> None:
+    lucky = replace(
+        POINTS[3], label="lucky", force_nrmse=0.2, own_force_nrmse=0.5, wall_s_per_simulated_s=0.01
+    )
+    points = [*POINTS, lucky]
+    assert advice(points, wished(asked("error.force=0.4"), points))[0] == "use: surrogate, r = 8"
+    assert advice(points, wished(asked("time=0.001"), points))[0] == "use: surrogate, r = 8"
+
+
+def test_a_surrogate_that_no_command_makes_is_not_named() -> None:
+    study = replace(
+        POINTS[3], label="9 runs", force_nrmse=0.3, wall_s_per_simulated_s=0.01, note="trained on 9 runs"
+    )
+    points = [*POINTS, study]
+    assert advice(points, wished(asked("error.force=0.4"), points))[0] == "use: surrogate, r = 8"
+
+
+def test_particles_cost_their_decoding() -> None:
+    assert answer("error.force=0.4", "time=0.001", "particles=true")[0].startswith("nothing meets this")
+
+
+def test_nothing_claims_to_be_better_than_the_reference_is_known() -> None:
+    lines = answer("error.force=0.1")
+    assert lines[0].startswith("nothing meets this; closest: solver, fine")
+    assert any("only known to 0.2" in line for line in lines)
+    assert any("within the reference's own error" in line for line in lines)
+
+
+def test_surrogates_can_be_judged_against_their_training_runs() -> None:
+    lines = answer("error.force=0.3", "against=training")
+    assert lines[0] == "use: surrogate, r = 8" and "over its test runs" in lines[-1]
+
+
+def test_the_answer_says_what_it_rests_on() -> None:
+    last = answer("error.force=0.25")[-1]
+    assert "study full" in last and "the solver at finest" in last
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        ([], "nothing is asked for"),
+        (["error.force=-1"], "error.force is -1; it must be a number above 0"),
+        (["time=fast"], "time is 'fast'"),
+        (["task=moon", "time=1"], "task is 'moon'; the table has cut"),
+        (["against=me", "time=1"], "against is 'me'; allowed: reference, training"),
+        (["particles=3", "time=1"], "particles is 3"),
+        (["error.sinkage=0.001"], "has all the numbers asked for"),
+        (["error=0.3"], "error is 0.3; give one of its keys"),
+        (["+error.torque=1"], "error has no key 'torque'"),
+    ],
+)
+def test_bad_input_gives_one_line(overrides: list[str], line: str) -> None:
+    with pytest.raises(UserError, match=line):
+        answer(*overrides)
+
+
+def test_the_command_reads_a_table_of_one_s_own(own_table: Path) -> None:
+    assert main(OmegaConf.create(asked("error.force=0.25", f"table='{own_table}'"))) == pytest.approx(
+        3.0 / 60
+    )
+
+
+def test_the_table_that_ships_is_the_committed_study() -> None:
+    committed = Path(__file__).parents[3] / "experiments" / "accuracy_vs_time" / "full" / "points.csv"
+    assert table(None).read_bytes() == committed.read_bytes()
+    points = read_points(table(None))
+    assert {p.kind for p in points} >= {"solver", "surrogate"}
+    references = [p for p in points if p.axis == "reference"]
+    assert len(references) == len({p.scene for p in points})
+    assert not any("/" in p.command for p in points)  # no folder of the machine that made it
+
+
+def test_the_table_that_ships_answers() -> None:
+    points = read_points(table(None))
+    lines = advice(points, wished(asked("error.force=0.6", "time=0.01"), points))
+    assert lines[0].startswith("use: ")
+
+
+@pytest.mark.parametrize("study", ["../train", "x" * 300, "a/b", "$"])
+def test_tables_of_studies_that_do_not_ship(study: str) -> None:
+    assert shipped(study, "cut") == {}
+
+
+def test_a_table_names_no_file_to_be_read(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("scenes: {cut: {bands: {force_nrmse: 0.5}}}")
+    assert bands("full", "cut")
+    assert bands(str(tmp_path / "mine"), "cut") == {}

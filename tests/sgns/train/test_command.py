@@ -1,0 +1,333 @@
+"""Training: it learns, it resumes to the bit, it stops in plain words."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
+
+from sgns.config import UserError
+from sgns.model.network_dynamics import Path
+from sgns.simulator import Simulator
+from sgns.train import command as module
+from sgns.train.callbacks import ValidationRollouts
+from sgns.train.command import main, train
+from sgns.train.lightning_module import TrainingSettings
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return reduced(tmp_path_factory.mktemp("tiny"))
+
+
+def run(data, output, **changes) -> float:
+    return train(data, num_modes=4, model=MODEL, training=TRAINING | changes, output=output, seed=3)
+
+
+def weights(path) -> dict[str, torch.Tensor]:
+    return torch.load(path, weights_only=True)["state_dict"]
+
+
+def test_it_learns(data, tmp_path) -> None:
+    before = run(data, tmp_path / "short", max_steps=1, validate_every=1)
+    after = run(data, tmp_path / "long", max_steps=300, validate_every=100, learning_rate=5e-3, noise=0.3)
+    assert after > max(before, 0.5)
+
+
+def test_resuming_equals_not_stopping(data, tmp_path, monkeypatch) -> None:
+    whole = run(data, tmp_path / "whole")
+
+    class Interrupted(Exception):
+        pass
+
+    def stop(self, trainer, *args) -> None:
+        if trainer.global_step == 13:
+            raise Interrupted
+
+    with monkeypatch.context() as patch, pytest.raises(Interrupted):
+        patch.setattr(module.StepProgress, "on_train_batch_end", stop)
+        run(data, tmp_path / "parts")
+    assert not (tmp_path / "parts" / "training.json").exists()
+    assert run(data, tmp_path / "parts") == whole
+    a, b = (weights(tmp_path / name / "last.ckpt") for name in ("whole", "parts"))
+    assert a.keys() == b.keys()
+    for name in a:
+        assert torch.equal(a[name], b[name]), name
+
+
+def test_lightning_says_nothing(data, tmp_path, capfd) -> None:
+    run(data, tmp_path)
+    (tmp_path / "training.json").unlink()
+    run(data, tmp_path)  # resumed
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_complete_training_is_not_repeated(data, tmp_path, monkeypatch) -> None:
+    first = run(data, tmp_path)
+    monkeypatch.setattr(module, "fit", None)
+    assert run(data, tmp_path) == first
+    # Speed and reporting do not make it another training.
+    assert run(data, tmp_path, threads=1, log_every=7) == first
+
+
+def test_other_settings_do_not_mix(data, tmp_path) -> None:
+    run(data, tmp_path)
+    with pytest.raises(UserError, match=r"training\.learning_rate is 0\.001 there and 0\.002 here"):
+        run(data, tmp_path, learning_rate=2e-3)
+    run(data, tmp_path, learning_rate=2e-3, resume=False)
+
+
+def test_a_training_from_before_goes_on_if_it_had_no_slower_windows(data, tmp_path) -> None:
+    run(data, tmp_path)
+    content = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    for slower, words in ((0.0, None), (0.3, r"training\.slower is 0\.3 there")):
+        content["hyper_parameters"]["settings"]["training"]["slower"] = slower
+        torch.save(content, tmp_path / "last.ckpt")
+        (tmp_path / "training.json").unlink()
+        with pytest.raises(UserError, match=words) if words else contextlib.nullcontext():
+            run(data, tmp_path)
+
+
+def test_the_last_step_is_judged_even_if_odd(data, tmp_path) -> None:
+    run(data, tmp_path, max_steps=7, validate_every=5)
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == 7
+
+
+def test_a_loss_that_is_not_finite_stops_in_one_line(data, tmp_path) -> None:
+    with pytest.raises(UserError, match=r"loss is (nan|inf) at step \d+.*learning_rate") as caught:
+        run(data, tmp_path, learning_rate=1e30, final_learning_rate=1e30, gradient_clip=None, warmup_steps=0)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "training.json").exists()
+
+
+def test_what_tensorboard_shows(data, tmp_path) -> None:
+    skill = run(data, tmp_path)
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    scalars = set(events.Tags()["scalars"])
+    assert {"loss/change", "loss/force", "loss/torque", "loss/total"} <= scalars
+    assert {"skill/validation", "skill/validation_at_rest", "force_nrmse/validation"} <= scalars
+    assert {"learning_rate", "samples_per_s", "final/skill", "final/force_nrmse"} <= scalars
+    assert events.Tags()["images"] == ["force/validation"]
+    assert events.Scalars("final/skill")[0].value == pytest.approx(skill)
+
+
+def test_start_from_another_checkpoint(data, tmp_path) -> None:
+    run(data, tmp_path / "first")
+    train(
+        data,
+        num_modes=4,
+        model=MODEL,
+        training=TRAINING | {"max_steps": 1, "learning_rate": 1e-12, "final_learning_rate": 1e-12},
+        output=tmp_path / "second",
+        start_from=tmp_path / "first" / "last.ckpt",
+    )
+    a, b = (weights(tmp_path / name / "last.ckpt") for name in ("first", "second"))
+    for name in a:
+        torch.testing.assert_close(a[name], b[name], rtol=0, atol=1e-9)
+    with pytest.raises(UserError, match="another model"):
+        train(
+            data,
+            num_modes=4,
+            model=MODEL | {"hidden_width": 8},
+            training=TRAINING,
+            output=tmp_path / "third",
+            start_from=tmp_path / "first" / "last.ckpt",
+        )
+
+
+def test_a_checkpoint_of_another_basis_is_refused(data, tmp_path) -> None:
+    run(data, tmp_path / "first")
+    other = replace(data, basis=replace(data.basis, modes=data.basis.modes.flip(1)))
+    with pytest.raises(UserError, match="belongs to another basis"):
+        train(
+            other,
+            num_modes=4,
+            model=MODEL,
+            training=TRAINING,
+            output=tmp_path / "second",
+            start_from=tmp_path / "first" / "last.ckpt",
+        )
+
+
+def test_skill_of_truth_and_of_a_frozen_bed(data) -> None:
+    rollouts = ValidationRollouts(data.runs("validation"), 4, 3, "pose")
+
+    class Known(torch.nn.Module):
+        """Gives the answers instead of learning them."""
+
+        def __init__(self, latent, force) -> None:
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.zeros(1))
+            self.answers = latent, force
+
+        predicts_body = False
+
+        def unroll(self, latent, body, context):
+            frames = body.position.shape[1]
+            pad = frames - self.answers[0].shape[1]
+            answers = [torch.cat([a[:, :1].expand(-1, pad, *a.shape[2:]), a], 1) for a in self.answers]
+            return Path(*answers, None, body)
+
+    perfect = rollouts.measure(Known(rollouts.latent, rollouts.force))
+    assert perfect.skill == pytest.approx(1.0) and perfect.force_nrmse == 0.0
+    frozen = rollouts.latent.clone()
+    frozen[:, 3:] = frozen[:, 2:3]
+    still = rollouts.measure(Known(frozen, 0 * rollouts.force))
+    assert still.skill == pytest.approx(0.0, abs=1e-12) and still.force_nrmse == pytest.approx(1.0)
+    lost = rollouts.measure(Known(rollouts.latent * np.nan, rollouts.force))
+    assert lost.skill == -np.inf
+
+
+def test_schedule() -> None:
+    for schedule in ("cosine", "exponential"):
+        settings = TrainingSettings.from_dict(TRAINING | {"schedule": schedule, "max_steps": 50})
+        rates = [settings.rate(step) for step in range(51)]
+        assert rates[2] == pytest.approx(1.0) and rates[0] < rates[1] < rates[2]
+        assert all(a >= b for a, b in itertools.pairwise(rates[2:]))
+        assert rates[50] == pytest.approx(1e-2)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("batch_size", 0),
+        ("learning_rate", -1.0),
+        ("schedule", "steps"),
+        ("resume", "yes"),
+        ("noise", -0.1),
+        ("learning_rate", "fast"),
+        ("learning_rate", float("nan")),
+        ("max_steps", 1.5),
+        ("max_steps", True),
+        ("threads", 0),
+        ("gradient_clip", 0.0),
+        ("loss", {"change": 1.0, "force": "x", "torque": 1.0}),
+        ("loss", None),
+        ("x", 1),
+    ],
+)
+def test_wrong_settings_name_their_key(key, value) -> None:
+    with pytest.raises(UserError, match=f"training.{key}"):
+        TrainingSettings.from_dict(TRAINING | {key: value})
+
+
+def test_the_command(tmp_path) -> None:
+    make_dataset(tmp_path / "data")
+    cfg = OmegaConf.create(
+        {
+            "dataset": {"name": "tiny", "path": str(tmp_path / "data")},
+            "reduction": REDUCTION,
+            "model": MODEL,
+            "training": TRAINING | {"max_steps": 5, "validate_every": 5},
+            "preset": {"name": "default"},
+            "output": str(tmp_path / "out"),
+            "checkpoint": None,
+            "seed": 0,
+            "device": "cpu",
+        }
+    )
+    skill = main(cfg)
+    assert json.loads((tmp_path / "out" / "training.json").read_text())["skill"] == skill
+    card = torch.load(tmp_path / "out" / "best.ckpt", weights_only=True)["hyper_parameters"]
+    assert card["settings"]["preset"] == "default" and card["settings"]["dataset"] == "tiny"
+
+
+def poisoned(data, split: str, what: str):
+    """The data with one number that is none in the second run of a split."""
+    runs = {name: data.runs(name) for name in ("train", "validation", "test")}
+    values = getattr(runs[split][1], what).copy()
+    values[7].flat[-1] = np.nan
+    runs[split][1] = replace(runs[split][1], **{what: values})
+    return replace(data, _runs=runs)
+
+
+@pytest.mark.parametrize("what", ["latent", "pose", "body_points", "force", "torque"])
+@pytest.mark.parametrize(("split", "name"), [("train", "b"), ("validation", "f")])
+def test_one_poisoned_number_is_named(data, tmp_path, what, split, name) -> None:
+    with pytest.raises(
+        UserError, match=rf"not finite at frame 7 of the reduced run {name};.*sgns check {name}\.h5"
+    ):
+        run(poisoned(data, split, what), tmp_path)
+
+
+def test_a_training_that_diverges_stops_and_keeps_its_best(data, tmp_path, monkeypatch) -> None:
+    """From step 12 on the rate is a thousand times what it should be; step 10 was judged and saved."""
+    rate = TrainingSettings.rate
+    monkeypatch.setattr(
+        TrainingSettings, "rate", lambda self, step: rate(self, step) * (1e3 if step > 11 else 1)
+    )
+    with pytest.raises(
+        UserError, match=r"diverges: the loss is .* at step 1\d and was .*best\.ckpt"
+    ) as caught:
+        run(data, tmp_path / "ill", max_steps=60, validate_every=10)
+    assert "\n" not in str(caught.value)
+    assert torch.load(tmp_path / "ill" / "best.ckpt", weights_only=True)["global_step"] == 10
+    assert np.isfinite(Simulator.load(tmp_path / "ill" / "best.ckpt").mean_force).all()
+    assert not (tmp_path / "ill" / "training.json").exists()
+
+
+def test_weights_that_are_not_finite_are_not_saved(data, tmp_path, monkeypatch) -> None:
+    """Gradients that are not finite spoil the weights though the loss was finite: step 10 is saved, step 20 is not."""
+    clip = module.SurrogateTraining.configure_gradient_clipping
+
+    def spoil(self, optimizer, *args, **kw) -> None:
+        clip(self, optimizer, *args, **kw)
+        if self.global_step == 19:
+            next(self.surrogate.dynamics.network.parameters()).grad[0] = torch.nan
+
+    monkeypatch.setattr(module.SurrogateTraining, "configure_gradient_clipping", spoil)
+    with pytest.raises(UserError, match=r"the weights .* are not finite after step 20; .*best\.ckpt"):
+        run(data, tmp_path, max_steps=30)
+    for name in ("best.ckpt", "last.ckpt"):
+        content = torch.load(tmp_path / name, weights_only=True)
+        assert content["global_step"] == 10
+        assert all(value.isfinite().all() for value in content["state_dict"].values())
+
+
+def test_a_resumed_training_knows_its_first_loss(data, tmp_path) -> None:
+    run(data, tmp_path)
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["first_loss"] > 0
+
+
+def test_all_settings_that_differ_are_named(data, tmp_path) -> None:
+    run(data, tmp_path, max_steps=1, validate_every=1)
+    with pytest.raises(UserError) as caught:
+        run(data, tmp_path, max_steps=2, batch_size=4, noise=0.3)
+    for words in ("max_steps is 1 there and 2 here", "batch_size is 8 there", "noise is 0.1 there"):
+        assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_one_training_at_a_time_in_a_folder(data, tmp_path, monkeypatch) -> None:
+    """The second one's settings do not matter: neither result would be whole."""
+    before = module.fit
+
+    def fit(*args) -> None:
+        with pytest.raises(UserError, match=r"best\.ckpt is being made by process"):
+            run(data, tmp_path, learning_rate=2e-3)
+        before(*args)
+
+    monkeypatch.setattr(module, "fit", fit)
+    run(data, tmp_path, max_steps=1, validate_every=1)
+    names = sorted(p.name for p in tmp_path.iterdir())
+    assert names == ["best.ckpt", "last.ckpt", "tensorboard", "training.json"]
+
+
+@pytest.mark.parametrize("resume", ["auto", False])
+@pytest.mark.parametrize("name", ["best.ckpt", "last.ckpt", "training.json"])
+def test_a_pipe_stays_a_pipe(data, tmp_path, monkeypatch, name, resume) -> None:
+    os.mkfifo(tmp_path / name)
+    monkeypatch.setattr(module, "fit", None)  # it is found before
+    with pytest.raises(UserError, match=f"{name}: it is a pipe"):
+        run(data, tmp_path, resume=resume)
+    assert (tmp_path / name).is_fifo()

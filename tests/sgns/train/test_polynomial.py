@@ -1,0 +1,172 @@
+"""`sgns train model=polynomial`: the same folder as a network's, chosen by rollouts, refused in plain words."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset, reduced
+
+from sgns.config import UserError
+from sgns.model.checkpoint import load_surrogate
+from sgns.model.polynomial import PolynomialDynamics
+from sgns.model.settings import FitSettings, PolynomialSettings
+from sgns.train import command as module
+from sgns.train.callbacks import ValidationRollouts
+from sgns.train.command import train
+from sgns.train.polynomial import fit_polynomial
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return reduced(tmp_path_factory.mktemp("tiny"))
+
+
+def run(data, output, model=POLYNOMIAL, training=FIT, **kw) -> float:
+    return train(data, num_modes=4, model=model, training=training, output=output, seed=3, **kw)
+
+
+def without_validation(data, count: int):
+    """The dataset with the first training runs only."""
+    return replace(data, _runs={"train": data.runs("train")[:count], "validation": [], "test": []})
+
+
+def fitted(data, **changes):
+    runs = data.runs("train")
+    return fit_polynomial(
+        runs,
+        data.runs("validation"),
+        4,
+        PolynomialSettings(**POLYNOMIAL),
+        FitSettings.from_dict(FIT | changes),
+        predicts_body=False,
+        seed=3,
+    )
+
+
+def test_what_is_written_is_what_was_fitted(data, tmp_path) -> None:
+    skill = run(data, tmp_path)
+    model = fitted(data).dynamics
+    loaded = load_surrogate(tmp_path / "best.ckpt").dynamics
+    assert isinstance(loaded, PolynomialDynamics)
+    state = loaded.state_dict()
+    for name, value in model.state_dict().items():
+        assert torch.equal(state[name], value), name
+    assert torch.equal(loaded.used, model.used) and torch.equal(loaded.terms, model.terms)
+    rollouts = ValidationRollouts(data.runs("validation"), 4, 3, "pose")
+    assert rollouts.measure(loaded).skill == rollouts.measure(model).skill == skill
+    summary = json.loads((tmp_path / "training.json").read_text())
+    assert summary["skill"] == skill and summary["coefficients"] == model.num_terms
+    assert summary["motion"]["noise"] in FIT["noises"] and summary["force"]["penalty"] in FIT["penalties"]
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert events.Scalars("final/skill")[0].value == pytest.approx(skill)
+
+
+def test_a_complete_fit_is_not_repeated(data, tmp_path, monkeypatch) -> None:
+    first = run(data, tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "fit_polynomial", None)
+        assert run(data, tmp_path) == first
+    with pytest.raises(UserError, match=r"model\.degree is 2 there and 1 here"):
+        run(data, tmp_path, POLYNOMIAL | {"degree": 1})
+    with pytest.raises(UserError, match=r"model\.kind is 'polynomial' there and 'network' here"):
+        run(data, tmp_path, MODEL, TRAINING)
+    (tmp_path / "training.json").unlink()  # interrupted
+    assert run(data, tmp_path) == first
+    run(data, tmp_path, POLYNOMIAL | {"degree": 1}, FIT | {"resume": False})
+
+
+def test_without_validation_runs_a_third_chooses_and_all_are_fitted(data, tmp_path, caplog) -> None:
+    quadratic = FIT | {"linear": False}
+    skill = run(without_validation(data, 4), tmp_path, training=quadratic)
+    assert "every third training run" in caplog.text
+    runs = data.runs("train")
+    settings = PolynomialSettings(**POLYNOMIAL), FitSettings.from_dict(quadratic)
+    without = fit_polynomial(runs[1:3], runs[::3], 4, *settings, predicts_body=False, seed=3)
+    assert without.score.skill == skill
+    # The same noise and penalty for all runs.
+    motion = without.choice.motion
+    chosen = {"noises": [motion.noise], "penalties": [motion.penalty]}
+    everything = fit_polynomial(
+        runs,
+        data.runs("test"),
+        4,
+        settings[0],
+        FitSettings.from_dict(quadratic | chosen),
+        predicts_body=False,
+        seed=3,
+    )
+    loaded = load_surrogate(tmp_path / "best.ckpt").dynamics
+    assert torch.equal(loaded.weights[:, :-6], everything.dynamics.weights[:, :-6])
+
+
+def test_one_run_alone_can_be_fitted(data, tmp_path) -> None:
+    assert run(without_validation(data, 1), tmp_path) > 0.5
+
+
+def test_what_chooses_is_the_best_there_is(data) -> None:
+    best = fitted(data)
+    for noise in FIT["noises"]:
+        for penalty in FIT["penalties"]:
+            other = fitted(data, noises=[noise], penalties=[penalty])
+            assert other.score.skill <= best.score.skill
+
+
+@pytest.mark.parametrize(
+    ("model", "training", "line"),
+    [
+        ({}, TRAINING, "training.batch_size is unknown"),
+        ({"hidden_width": 8}, FIT, "model.hidden_width is unknown; keys: context, degree, history, kind"),
+        ({"degree": 3}, FIT, "model.degree is 3; allowed: 1, 2"),
+        ({"history": 1}, FIT, "model.history is 1; it must be at least 2"),
+        ({"kind": "tree"}, FIT, "model.kind is 'tree'; allowed: network, polynomial"),
+        ({"context": "load"}, FIT, "model.context is 'load'"),
+        ({}, FIT | {"noises": []}, "training.noises is"),
+        ({}, FIT | {"penalties": [-1.0]}, "training.penalties is"),
+        ({}, FIT | {"draws": 0}, "training.draws is 0"),
+        ({}, FIT | {"resume": "yes"}, "training.resume is 'yes'"),
+    ],
+)
+def test_wrong_settings_name_their_key(data, tmp_path, model, training, line) -> None:
+    with pytest.raises(UserError, match=line.replace(".", r"\.")):
+        run(data, tmp_path, POLYNOMIAL | model, training)
+
+
+def test_what_polynomials_have_no_use_for(data, tmp_path) -> None:
+    with pytest.raises(UserError, match="but polynomials start from nothing"):
+        run(data, tmp_path, start_from="a.ckpt")
+    with pytest.raises(UserError, match="device is cuda, but polynomials are fitted on the CPU"):
+        run(data, tmp_path, device="cuda")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_commands(tmp_path: Path, monkeypatch) -> None:
+    make_dataset(tmp_path / "data", frames=20, n=300)
+    monkeypatch.chdir(tmp_path)
+    dataset = ["dataset=quick", "dataset.path=data"]
+
+    def call(*arguments: str) -> tuple[int, str]:
+        command = [sys.executable, "-m", "sgns", *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+        return done.returncode, done.stderr
+
+    train_it = ["train", *dataset, "model=polynomial", "reduction.num_modes=4", "training.threads=1"]
+    assert call(*train_it, "output=out")[0] == 0
+    assert {path.name for path in Path("out").iterdir()} == {
+        ".hydra",
+        "best.ckpt",
+        "tensorboard",
+        "training.json",
+    }
+    assert call("evaluate", *dataset, "checkpoint=out/best.ckpt", "output=report")[0] == 0
+    assert Path("report/report.html").exists()
+    status, line = call(*train_it, "output=other", "preset=paper")
+    assert status == 2 and "model.body_nodes is unknown" in line
+    assert not Path("other").exists()
