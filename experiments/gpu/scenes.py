@@ -12,10 +12,7 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(1, str(Path(__file__).resolve().parents[2] / "tests" / "mpm_warp"))
-
-from beds import cut
-from meshes import BOX_FACES, box_corners, write_obj
+sys.path.insert(1, str(Path(__file__).resolve().parents[2] / "support"))
 
 from mpm_warp import (
     Bed,
@@ -32,6 +29,8 @@ from mpm_warp import (
     frames_together,
 )
 from mpm_warp.bodies import Box, MeshBody
+from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
+from sgns_testing.scenes import cut
 
 __all__ = ["FARTHEST", "FORCE", "Case", "Outcome", "cases", "outcome", "write_rows"]
 

@@ -18,9 +18,9 @@ from mpm_warp import Excavation, Plate, SceneError, Solver
 from mpm_warp.diagnostics import leakage
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(1, str(HERE.parents[1] / "tests" / "mpm_warp"))
+sys.path.insert(1, str(HERE.parents[1] / "support"))
 
-from beds import cut  # noqa: E402
+from sgns_testing.scenes import cut  # noqa: E402
 
 THICKNESSES = (2.2, 2.0, 1.5, 1.2, 1.0, 0.5)  # [grid spacings]
 MARGINS = (-0.75, -0.5, -0.25)  # [grid spacings]

@@ -9,23 +9,18 @@ there. Needs the runs of `sgns simulate dataset=quick`; the network is that of r
 from __future__ import annotations
 
 import csv
-import sys
 from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from hard_cases.networks import quick_data, quick_network
+from hard_cases.rollout import moved, slowed
+
+from sgns.reduction.reduce import ReducedRun
+from sgns.simulator import Simulator
 
 HERE = Path(__file__).resolve().parent
-for folder in ("stability", "sgns"):
-    sys.path.insert(1, str(HERE.parents[1] / "tests" / folder))
-
-from rollout_cases import moved, slowed  # noqa: E402
-from trained import quick_data, quick_network  # noqa: E402
-
-from sgns.reduction.reduce import ReducedRun  # noqa: E402
-from sgns.simulator import Simulator  # noqa: E402
-
 TIMES = (1, 2, 3, 5, 10, 30)
 
 

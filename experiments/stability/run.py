@@ -1,4 +1,4 @@
-"""Measure the hard cases of tests/stability/, each in a process of its own.
+"""Measure the hard cases, each in a process of its own.
 
     python experiments/stability/run.py --workers 2
 
@@ -21,17 +21,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, fields
 from pathlib import Path
 
+from hard_cases import AREAS, Case, Row, cases
+from margins import draw
+
+from sgns.data.files import write_whole
+
 HERE = Path(__file__).resolve().parent
-TESTS = HERE.parents[1] / "tests"
-for folder in ("stability", "mpm_warp", "sgns"):
-    sys.path.insert(1, str(TESTS / folder))
-
-from areas import AREAS, cases  # noqa: E402
-from case import Case, Row  # noqa: E402
-from margins import draw  # noqa: E402
-
-from sgns.data.files import write_whole  # noqa: E402
-
 log = logging.getLogger(__name__)
 LONGEST = 1800.0  # seconds that a case may take
 

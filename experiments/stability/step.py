@@ -20,9 +20,9 @@ import mpm_warp.limits
 from mpm_warp import Material, Solver, SolverStopped
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(1, str(HERE.parents[1] / "tests" / "mpm_warp"))
+sys.path.insert(1, str(HERE.parents[1] / "support"))
 
-from beds import cut  # noqa: E402
+from sgns_testing.scenes import cut  # noqa: E402
 
 COURANT = (0.1, 0.2, 0.4, 0.6, 0.8, 0.83, 0.86, 0.9, 0.95, 1.0, 1.05, 1.2, 1.5)
 

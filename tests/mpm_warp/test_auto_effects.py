@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from beds import cut
-from test_nonlocal_solver import compiled_source, launches
 
 from mpm_warp import (
     Bed,
@@ -27,6 +25,8 @@ from mpm_warp import (
 )
 from mpm_warp.auto_effects import EFFECTS, expected_flow
 from mpm_warp.poses import about_y, multiply, rotate
+from sgns_testing.scenes import cut
+from sgns_testing.solvers import compiled_source, launches
 
 BEADS = Material(
     youngs_modulus=1e5,

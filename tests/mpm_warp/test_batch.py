@@ -8,7 +8,6 @@ from unittest import mock
 import numpy as np
 import pytest
 import warp as wp
-from beds import block, cut
 
 from mpm_warp import (
     Bed,
@@ -27,6 +26,7 @@ from mpm_warp import (
 from mpm_warp import launch as work_module
 from mpm_warp.batch import all_together
 from mpm_warp.launch import Launch, Program, Together, Work
+from sgns_testing.scenes import block, cut
 
 needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
 

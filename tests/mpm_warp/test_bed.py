@@ -9,12 +9,12 @@ from itertools import product
 import numpy as np
 import pytest
 import warp as wp
-from beds import BlockBed, block, cut
 from scipy.spatial import cKDTree
 
 from mpm_warp import Bed, Effects, Incline, Scene, SceneError, Solver, Walls, arrange
 from mpm_warp.bed import POISSON_RADIUS
 from mpm_warp.kernels.grid import grid_step
+from sgns_testing.scenes import BlockBed, block, cut
 
 # --- Floor and walls: sticking, sliding, friction, periodic ends, and a tilted bin ----------------------
 

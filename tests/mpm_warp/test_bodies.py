@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from meshes import BOX_FACES, box_corners, box_triangles, write_obj, write_stl, write_text_stl
 
 from mpm_warp import Box, Cylinder, MeshBody, Plate, SceneError
+from sgns_testing.meshes import BOX_FACES, box_corners, box_triangles, write_obj, write_stl, write_text_stl
 
 SIZE = (0.1, 0.2, 0.3)
 CORNERS = box_corners(SIZE, (5.0, -2.0, 1.0))

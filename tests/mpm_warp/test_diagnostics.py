@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from beds import cut
 
 from mpm_warp import Frame, Plate, Solver
 from mpm_warp.diagnostics import leakage, leaked
 from mpm_warp.poses import about_y
+from sgns_testing.scenes import cut
 
 PLATE = Plate(thickness=0.02, width=0.2, length=0.1)
 

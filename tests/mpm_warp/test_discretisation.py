@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from beds import cut
 
 from mpm_warp import Bed, Column, Effects, Scene, SceneError, Solver, Walls, asymmetry
 from mpm_warp.discretisation import half
+from sgns_testing.scenes import cut
 
 BED = Bed(size=(0.48, 0.40, 0.16), spacing=0.02, headroom=0.12)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 import warp as wp
-from beds import cut
 from stand_in import Checked, Threads, compiler, on_stand_in
 from threads import beyond_the_end, from_neighbour, one_more
 
 from mpm_warp import Bed, Plate, Solver
 from mpm_warp.launch import Launch, Program, Work, Worker, find_device
+from sgns_testing.scenes import cut
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="needs g++ on Linux")
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from beds import cut
 
 from mpm_warp import Material, Scene, SceneError
 from mpm_warp.material import FRICTION_MAPS, static_friction
+from sgns_testing.scenes import cut
 
 
 def cone_ratio(stress):

@@ -1,15 +1,17 @@
 """Fluidity and nonlocality in a whole solver: what is off costs nothing, precisions, symmetry, seams, inertness."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
-from beds import cut
-from test_nonlocal_fluidity import DYNAMIC, PRESSURE, STEADY
 
 from mpm_warp import Bed, Effects, Material, Scene, Solver, SolverStopped, Walls
+from sgns_testing.scenes import cut
+from sgns_testing.solvers import compiled_source, launches
+
+STEADY, DYNAMIC = Effects(nonlocality=True), Effects(fluidity=True, nonlocality=True)
+PRESSURE = 1000.0
 
 
 @pytest.mark.parametrize("at_walls", ["free", "zero"])
@@ -67,22 +69,6 @@ def test_what_is_off_costs_nothing():
             and "friction_with_excess" not in found
             and "coefficients" not in found
         )
-
-
-def launches(solver):
-    """At a remap, in a step and at its end."""
-    return [*solver._to_grid, *solver._begin, *solver._step, solver._from_grid]
-
-
-def compiled_source(launch):
-    """What Warp compiled for a kernel with a module of its own, from its cache."""
-    launch.load()
-    (newest, *_) = sorted(
-        Path(wp.config.kernel_cache_dir).glob(f"wp_{launch.kernel.alone.module.name}_*/*.cpp"),
-        key=lambda file: file.stat().st_mtime,
-        reverse=True,
-    )
-    return newest.read_text()
 
 
 @pytest.mark.parametrize("effects", [STEADY, DYNAMIC, Effects(fluidity=True)])

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from synthetic import random_poses
 
 from mpm_warp.poses import fitted_poses, in_body_frame, in_world_frame, rotation_matrices, rotation_vectors
 from sgns.arrays import check_pose, check_poses, first_pose
 from sgns.config import UserError
+from sgns_testing.runs import random_poses
 
 
 def test_rotations_agree_with_scipy() -> None:

@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from beds import cut
 
 from mpm_warp import Bed, Excavation, Material, Plate, Scene, SceneError, Solver, Wheel, effects_for
 from mpm_warp import limits as size_module
 from mpm_warp.limits import scene_size
 from mpm_warp.poses import rotate
+from sgns_testing.scenes import cut
 
 
 def test_a_scene_survives_json():

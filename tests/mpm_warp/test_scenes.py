@@ -8,9 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from beds import BlockBed, block, cut
 from scipy.spatial.transform import Rotation
-from test_solver import momenta
 
 from mpm_warp import (
     Bed,
@@ -30,6 +28,8 @@ from mpm_warp.material import static_friction
 from mpm_warp.poses import about_y, angular_velocity, multiply, rotate, sampled_poses, slerp
 from mpm_warp.rigid_body import stable_step
 from mpm_warp.scenes import curved, ramp
+from sgns_testing.scenes import BlockBed, block, cut
+from sgns_testing.solvers import momenta
 
 # --- Motion laws and paths ------------------------------------------------------------------------------
 

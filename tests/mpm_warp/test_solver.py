@@ -8,20 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
-from beds import block, cut
 
 from mpm_warp import Bed, Effects, Material, Scene, SceneError, Solver, SolverStopped
+from sgns_testing.scenes import block, cut
+from sgns_testing.solvers import momenta
 
 ELASTIC = Effects(yielding=False, rate_dependence=False, separation=False)
-
-
-def momenta(solver):
-    """Linear and angular momentum of the particles, the affine part (C dx^2 / 4) included."""
-    mass = solver._grid.particle_mass
-    x, v, c = solver._x.numpy(), solver._v.numpy(), solver._c.numpy()
-    spin = np.stack([c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], axis=-1)
-    angular = mass * (np.cross(x, v) + spin * solver.scene.bed.spacing**2 / 4)
-    return mass * v.sum(axis=0), angular.sum(axis=0)
 
 
 def test_free_fall_is_exact():

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from beds import block, cut
 
 from mpm_warp import Bed, Effects, Incline, Material, SceneError, Solver, SolverStopped, State, Walls, Wheel
 from mpm_warp.batch import all_together
 from mpm_warp.limits import Guard
+from sgns_testing.scenes import block, cut
 
 
 def wheel() -> Wheel:

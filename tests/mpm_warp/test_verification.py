@@ -13,9 +13,9 @@ import pytest
 import silo
 import slope
 import waves
-from beds import cut
 
 from mpm_warp import Bed, Material, Plate, Solver
+from sgns_testing.scenes import cut
 
 
 @pytest.mark.parametrize("kind", ["compression", "shear"])

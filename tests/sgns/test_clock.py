@@ -7,7 +7,6 @@ import time
 
 import pytest
 import torch
-from test_campaign import campaign
 
 from mpm_warp import Effects
 from sgns.clock import elapsed
@@ -16,6 +15,7 @@ from sgns.evaluate import costs as full_space_cost
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import run_cost
 from sgns.simulate.run import simulate_scene
+from sgns_testing.tiny import campaign
 
 
 @pytest.fixture(params=[0.0, -7.0], ids=["still", "back"])

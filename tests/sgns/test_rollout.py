@@ -2,8 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from meshes import box_corners, box_triangles
-from surrogates import FakeSimulator, fitted, small_dataset
 
 from sgns.config import UserError
 from sgns.data import run as chunks
@@ -11,6 +9,8 @@ from sgns.data.check import check_run
 from sgns.data.run import Run
 from sgns.model.training_range import Excess
 from sgns.rollout import RolloutTiming, bed_differences, require_known_bed, rollout_scene, unlearned
+from sgns_testing.meshes import box_corners, box_triangles
+from sgns_testing.surrogates import FakeSimulator, fitted, small_dataset
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,12 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, reduced
 
 from sgns.config import UserError
 from sgns.model.checkpoint import load_surrogate
 from sgns.simulator import Simulator
 from sgns.train.command import train
+from sgns_testing.tiny import FIT, MODEL, POLYNOMIAL, TRAINING, reduced
 
 
 @pytest.fixture(scope="module")

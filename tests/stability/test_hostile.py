@@ -25,8 +25,6 @@ import pytest
 import torch
 import yaml
 from hydra.core.global_hydra import GlobalHydra
-from synthetic import make_run
-from tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
 
 from mpm_warp import SceneError
 from mpm_warp.mesh import read_mesh
@@ -47,6 +45,8 @@ from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, read_reduced, reduce_dataset
 from sgns.simulate.scene import read_path
 from sgns.train.command import train
+from sgns_testing.runs import make_run
+from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
 
 SECRET = "canary-in-another-file"
 FEW = TRAINING | {"max_steps": 2, "validate_every": 2}

@@ -1,15 +1,25 @@
-"""Commands that are killed lose nothing: a few of the kills of experiments/stability/kills.py."""
+"""Commands that are killed lose nothing, and two processes or users that share a campaign make every run once."""
 
 from __future__ import annotations
 
 import csv
+import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+import yaml
+from kills import broken, same
 
-pytest.importorskip("fcntl", reason="needs fork and signals")
+from sgns.config import UserError
+from sgns.data.files import claimed
+from sgns.simulate.workers import simulate_campaign
+from sgns_testing.commands import environment
+from sgns_testing.tiny import campaign
+
+pytest.importorskip("fcntl", reason="needs fork, signals and file locks")
 
 KILLS = Path(__file__).parents[2] / "experiments" / "stability" / "kills.py"
 
@@ -28,3 +38,128 @@ def test_killed_commands_go_on_and_end_as_if_nothing_had_happened(tmp_path):
     for row in rows.values():
         assert int(row["kills"]) >= 2 and int(row["completed"]) == int(row["equal"]) >= 1, row
         assert row["corrupt"] == row["orphans"] == row["leftovers"] == "0", row
+
+
+# --- two processes, one campaign --------------------------------------------------------------------------
+
+NOBODY = 65534
+CLAIM = """
+import sys
+from pathlib import Path
+from sgns_testing.commands import become_ordinary
+from sgns.data.files import claimed
+become_ordinary()
+with claimed(Path(sys.argv[1])) as ours:
+    print(ours)
+"""
+DRAW = {"depth": [0.02, 0.03, 0.04, 0.05], "duration": [0.5]}
+MAKE = f"""
+import sys, pathlib
+from sgns_testing.tiny import campaign
+from sgns.simulate.workers import simulate_campaign
+if __name__ == "__main__":
+    made = campaign(pathlib.Path(sys.argv[1]), runs=4, draw={DRAW})
+    simulate_campaign(made, device="cpu", workers=1)
+"""
+RECORD = """
+import os, sys
+from pathlib import Path
+from sgns_testing.tiny import campaign
+from sgns.config import UserError
+made = campaign(Path(sys.argv[1]), seed=int(sys.argv[2]), runs=4)
+print("ready", flush=True)
+sys.stdin.readline()
+try:
+    made.record()
+except UserError as error:
+    sys.exit(str(error))
+"""
+
+
+def begin(code: str, *arguments: str) -> subprocess.Popen[str]:
+    """Another process."""
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen([sys.executable, "-c", code, *arguments], text=True, env=environment(), **pipes)
+
+
+def test_two_processes_one_of_them_killed_and_repeated(tmp_path) -> None:
+    alone = campaign(tmp_path / "alone", runs=4, draw=DRAW)
+    simulate_campaign(alone, device="cpu", workers=1)
+    script = tmp_path / "make.py"
+    script.write_text(MAKE)
+
+    def start() -> subprocess.Popen[str]:
+        command = [sys.executable, str(script), str(tmp_path / "shared")]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        return subprocess.Popen(command, text=True, env=environment(), **pipes)
+
+    one, two = start(), start()
+    deadline = time.monotonic() + 60.0
+    while not list(tmp_path.glob("shared/tiny/runs/*.h5")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    one.kill()
+    one.communicate()
+    for begin_next in (lambda: two, start):  # the third makes or clears away what the killed one had begun
+        process = begin_next()
+        said = process.communicate(timeout=100)[0]
+        assert process.returncode == 0, said
+    assert broken(tmp_path / "shared") == []
+    assert same(tmp_path / "alone", tmp_path / "shared")
+    assert not [path for path in (tmp_path / "shared").rglob("*") if path.name.endswith(".partial")]
+
+
+def test_of_two_campaigns_with_other_settings_the_second_is_refused(tmp_path) -> None:
+    for attempt in range(2):
+        folder = tmp_path / str(attempt)
+        processes = [begin(RECORD, str(folder), seed) for seed in ("0", "1")]
+        for process in processes:
+            assert process.stdout.readline() == "ready\n"
+        for process in processes:
+            process.stdin.write("\n")
+            process.stdin.flush()
+        said = [process.communicate(timeout=100)[1] for process in processes]
+        assert sorted(process.returncode for process in processes) == [0, 1], said
+        assert sum("made with other settings" in words for words in said) == 1
+        winner = [process.returncode for process in processes].index(0)
+        recorded = yaml.safe_load((folder / "tiny" / "dataset.yaml").read_text())
+        assert recorded == campaign(folder, seed=winner, runs=4).describe()
+        assert [path.name for path in (folder / "tiny").iterdir()] == ["dataset.yaml"]
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_another_user_sees_a_claim_whatever_the_umask(tmp_path, umask) -> None:
+    before = os.umask(umask)
+    try:
+        with claimed(tmp_path / "a.h5") as ours:
+            assert ours
+            (lock,) = tmp_path.iterdir()
+            if os.geteuid() == 0:
+                os.chown(lock, NOBODY, NOBODY)  # as if the other one had made it
+            assert lock.stat().st_mode & 0o006 == 0o006
+            assert begin(CLAIM, str(tmp_path / "a.h5")).communicate(timeout=100)[:2] == ("False\n", "")
+    finally:
+        os.umask(before)
+
+
+def test_a_claim_left_by_another_user_in_a_shared_folder_is_taken_over(tmp_path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("needs files of another user")
+    with claimed(tmp_path / "a.h5"):
+        (lock,) = tmp_path.iterdir()
+        lock.rename(tmp_path / "kept")
+    (tmp_path / "kept").rename(lock)  # as after a kill
+    os.chown(lock, NOBODY, NOBODY)
+    os.chown(tmp_path, NOBODY, NOBODY)
+    tmp_path.chmod(0o1777)  # sticky: nobody may remove another user's file
+    assert begin(CLAIM, str(tmp_path / "a.h5")).communicate(timeout=100)[:2] == ("True\n", "")
+
+
+def test_a_folder_of_another_user_is_named(tmp_path, monkeypatch) -> None:
+    made = campaign(tmp_path, runs=3)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", str(made.path))
+
+    monkeypatch.setattr("sgns.data.files.os.open", refuse)
+    with pytest.raises(UserError, match=r"cannot write .*dataset\.yaml: Permission denied"):
+        simulate_campaign(made, device="cpu", workers=1)

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from meshes import BOX_FACES, box_corners, write_obj
 
 from mpm_warp import Bed, Box, Cylinder, MeshBody, Push, Scene, SceneError, Solver
+from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
 BED = Bed(size=(0.32, 0.24, 0.10), spacing=0.02, headroom=0.1)
 

@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 import warp as wp
-from meshes import BOX_FACES, box_corners, write_obj
 
 from mpm_warp import Box, Cylinder, MeshBody, Plate
 from mpm_warp.kernels.signed_distance import shape_data, shape_struct, signed_distance
 from mpm_warp.launch import start_warp
+from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
 start_warp()
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from tiny import make_dataset
 
 from sgns import __version__
 from sgns.cli.commands import COMMANDS
 from sgns.cli.help import groups_of, options_of
+from sgns_testing.tiny import make_dataset
 
 # Runs `sgns train` with a training module that only holds the given body of `main(cfg)`.
 FAKE = """

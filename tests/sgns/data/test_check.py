@@ -10,11 +10,11 @@ import h5py
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
-from synthetic import make_run, make_writer, random_frame
 
 from sgns.config import UserError
 from sgns.data.check import check_run, main, run_files
 from sgns.data.run import Run
+from sgns_testing.runs import make_run, make_writer, random_frame
 
 # --- `check_run` finds every planted fault, and nothing in a good file ----------------------------------
 

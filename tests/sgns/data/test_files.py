@@ -10,10 +10,10 @@ import threading
 from pathlib import Path
 
 import pytest
-from synthetic import make_run, make_writer, random_frame
 
 from sgns.config import UserError
 from sgns.data.files import claimed, claimed_in_turn, only_here, whole_file, write_whole
+from sgns_testing.runs import make_run, make_writer, random_frame
 
 # --- A claim on a file: one process has it, and it ends with that process -------------------------------
 
@@ -212,7 +212,7 @@ def test_a_folder_without_permission_is_named(tmp_path):
 LIMITED = """
 import resource, sys
 from pathlib import Path
-from synthetic import make_run
+from sgns_testing.runs import make_run
 from sgns.config import UserError
 folder, limit = Path(sys.argv[1]), int(sys.argv[2])
 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))

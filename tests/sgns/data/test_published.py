@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -13,42 +11,10 @@ import pytest
 from mpm_warp import Wheel
 from sgns.config import UserError
 from sgns.data.published import excavation_case, fingerprint, published_dataset, read_published, wheel_case
+from sgns_testing.commands import sgns
+from sgns_testing.published import record
 
 BIN = (0.8, 0.6, 0.15)
-
-
-def sgns(folder, *arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "sgns", *arguments], cwd=folder, capture_output=True, text=True, check=False
-    )
-
-
-def varint(n):
-    out = b""
-    while n > 127:
-        out += bytes([n & 127 | 128])
-        n >>= 7
-    return out + bytes([n])
-
-
-def field(number, content):
-    return varint(number << 3 | 2) + varint(len(content)) + content
-
-
-def feature(raw):
-    return field(1, field(1, raw))
-
-
-def record(frames, types, force, contexts=None):
-    entry = lambda key, value: field(1, field(1, key.encode()) + field(2, value))  # noqa: E731
-    context = entry("particle_type", feature(np.asarray(types, "<i8").tobytes())) + entry(
-        "key", field(3, field(1, b""))
-    )
-    series = lambda rows: b"".join(field(1, feature(np.asarray(r, "<f4").tobytes())) for r in rows)  # noqa: E731
-    lists = entry("position", series(frames)) + entry("force", series(force))
-    if contexts is not None:
-        lists += entry("step_context", series(contexts))
-    return field(1, context) + field(2, lists)
 
 
 def write(folder, records, cases):

@@ -7,10 +7,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from synthetic import make_run, make_writer, random_frame, start_positions
 
 from sgns.config import UserError
 from sgns.data.run import Run
+from sgns_testing.runs import make_run, make_writer, random_frame, start_positions
 
 
 @pytest.mark.parametrize(

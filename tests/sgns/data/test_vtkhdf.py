@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from synthetic import make_run
 
 from sgns.data.run import Run
+from sgns_testing.runs import make_run
 
 
 def test_vtk_reads_the_soil_in_any_order(tmp_path):

@@ -12,10 +12,10 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from synthetic import make_run, make_writer, random_frame
 
 from sgns.config import UserError
 from sgns.data.run import Run
+from sgns_testing.runs import make_run, make_writer, random_frame
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]))
 NAMES = st.text("abc_é", min_size=1, max_size=6)

@@ -9,8 +9,6 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from surrogates import FakeSimulator, fitted, frozen_latent, small_dataset
-from synthetic import make_run
 
 from mpm_warp.poses import in_body_frame, in_world_frame
 from sgns.config import UserError
@@ -21,6 +19,8 @@ from sgns.evaluate import command as evaluate_module
 from sgns.evaluate.command import full_basis, single_thread, training_means
 from sgns.evaluate.report import write_report
 from sgns.rollout import write_rollout
+from sgns_testing.runs import make_run
+from sgns_testing.surrogates import FakeSimulator, fitted, frozen_latent, small_dataset
 
 
 @pytest.fixture(scope="module")

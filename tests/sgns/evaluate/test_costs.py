@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic import make_run
-from tiny import MODEL
 
 from sgns.config import UserError
 from sgns.evaluate import costs
 from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory
 from sgns.model.settings import ModelSettings
+from sgns_testing.runs import make_run
+from sgns_testing.tiny import MODEL
 
 # ---  ---------------------------------------------------------------------------------------------------
 

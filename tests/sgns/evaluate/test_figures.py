@@ -3,8 +3,6 @@ from types import SimpleNamespace
 import matplotlib
 import numpy as np
 import pytest
-from pictures import pixels
-from synthetic import make_run
 from tensorboard.summary.writer.record_writer import masked_crc32c
 from torch.utils.tensorboard import SummaryWriter
 
@@ -31,6 +29,8 @@ from sgns.evaluate.side_view import (
     side_views,
     view_times,
 )
+from sgns_testing.pictures import pixels
+from sgns_testing.runs import make_run
 
 # ---  ---------------------------------------------------------------------------------------------------
 

@@ -1,7 +1,5 @@
 import numpy as np
 import pytest
-from pictures import pixels
-from synthetic import make_run
 
 from sgns.data.run import Run
 from sgns.evaluate.histories import (
@@ -14,6 +12,8 @@ from sgns.evaluate.histories import (
     torque_panels,
 )
 from sgns.evaluate.metrics import PositionErrors
+from sgns_testing.pictures import pixels
+from sgns_testing.runs import make_run
 
 HISTORY = 3
 MEAN = np.array([-80.0, 0.0, 20.0])

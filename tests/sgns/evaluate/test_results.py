@@ -3,9 +3,9 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from surrogates import made_scores
 
 from sgns.evaluate.results import aggregate, overlap_warning, seen_before
+from sgns_testing.surrogates import made_scores
 
 # ---  ---------------------------------------------------------------------------------------------------
 

@@ -2,12 +2,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from synthetic import PLATE, make_run
 
 from mpm_warp.scenes import Wheel
 from sgns.data.run import Run
 from sgns.evaluate.metrics import forward_force, is_wheel, sinkage
 from sgns.evaluate.side_view import body_corners
+from sgns_testing.runs import PLATE, make_run
 
 REST = np.array([[0.3, 0.2, 0.1, 0.0, 0.0, 0.0, 1.0]])
 

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from surrogates import made_scores
 
 from sgns.evaluate.results import aggregate
 from sgns.evaluate.tables import example_row, write_csv, write_json
+from sgns_testing.surrogates import made_scores
 
 
 def test_csv_has_a_row_per_run_and_empty_cells_without_meaning(tmp_path):

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from pictures import pixels
-from surrogates import fitted
-from synthetic import make_run, start_positions
 
 from sgns.data.run import Run
 from sgns.evaluate.figures import latent_path, subspace_view
 from sgns.evaluate.solid_view import solid_views, upper_scale
+from sgns_testing.pictures import pixels
+from sgns_testing.runs import make_run, start_positions
+from sgns_testing.surrogates import fitted
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import math
 
 import pytest
-from tiny import make_dataset
 
 from sgns.config import UserError
 from sgns.data.run import Run
@@ -12,6 +11,7 @@ from sgns.frontier.solver_points import measure_reduction, wanted_of
 from sgns.frontier.study import Study
 from sgns.reduction.pca import IncrementalPCA
 from sgns.reduction.reduce import fit_runs
+from sgns_testing.tiny import make_dataset
 
 
 def study(folder, *entries):

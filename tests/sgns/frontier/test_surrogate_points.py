@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from surrogates import FakeSimulator, fitted, frozen_latent, small_dataset
-from tiny import FIT, MODEL, POLYNOMIAL, REDUCTION, TRAINING, make_dataset, reduced
 
 from mpm_warp import Solver, effects_for
 from sgns.config import UserError
@@ -35,6 +33,8 @@ from sgns.frontier.surrogate_points import (
 )
 from sgns.model.checkpoint import read_checkpoint
 from sgns.model.settings import ModelSettings
+from sgns_testing.surrogates import FakeSimulator, fitted, frozen_latent, small_dataset
+from sgns_testing.tiny import FIT, MODEL, POLYNOMIAL, REDUCTION, TRAINING, make_dataset, reduced
 
 # --- Smaller training sets: nested subsets of runs, every nth frame -------------------------------------
 

@@ -7,8 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from synthetic import random_poses
-from tiny import reduced
 
 from mpm_warp.poses import in_world_frame, rotation_matrices
 from sgns.config import UserError
@@ -22,6 +20,8 @@ from sgns.model.features import (
     slowest_travel,
     stepped_frames,
 )
+from sgns_testing.runs import random_poses
+from sgns_testing.tiny import reduced
 
 # --- The graph: which edges, and what is written on nodes and edges -------------------------------------
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from synthetic import PLATE, make_run
-from tiny import MODEL, TRAINING
 
 from sgns.config import UserError
 from sgns.model.features import BodyTrack
@@ -14,6 +12,8 @@ from sgns.model.full_space import FullSpaceDynamics, box_surface, radius_graph
 from sgns.model.network_dynamics import ModelSettings
 from sgns.train.full_space import FullSpaceRun, FullSpaceWindows, fit_normalisation, losses, train
 from sgns.train.lightning_module import TrainingSettings
+from sgns_testing.runs import PLATE, make_run
+from sgns_testing.tiny import MODEL, TRAINING
 
 # --- Body nodes lie on the surface, none twice, no hole wider than asked --------------------------------
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import MODEL, reduced
 
 from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
@@ -17,6 +16,7 @@ from sgns.model.features import BodyTrack, body_track
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
 from sgns.train.windows import TrainingWindows, fit_normalisation
+from sgns_testing.tiny import MODEL, reduced
 
 # --- One latent step and whole paths: forces add up, rollouts are steps, modes have identities ----------
 

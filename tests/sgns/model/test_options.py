@@ -6,12 +6,12 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from tiny import MODEL, TRAINING, reduced
 
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
 from sgns.train.command import prepared, train
 from sgns.train.lightning_module import TrainingSettings
+from sgns_testing.tiny import MODEL, TRAINING, reduced
 
 OPTIONS = {
     "velocity": ({"predicts": "velocity"}, {}),

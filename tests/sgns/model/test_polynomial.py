@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny import reduced
 
 from sgns.config import UserError
 from sgns.model.features import BodyTrack
@@ -28,6 +27,7 @@ from sgns.train.polynomial import (
     unfitted,
 )
 from sgns.train.windows import TrainingWindows
+from sgns_testing.tiny import reduced
 
 HISTORY = 3
 

@@ -8,13 +8,13 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from tiny import MODEL, TRAINING, reduced
 
 from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
 from sgns.model.features import nearest_rigid
 from sgns.simulator import Simulator
 from sgns.train.command import train
+from sgns_testing.tiny import MODEL, TRAINING, reduced
 
 KINDS = {
     "pose": {},

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tiny import reduced
 
 from sgns.config import UserError
 from sgns.model.training_range import NOTEWORTHY, TrainingRange, components, widths
+from sgns_testing.tiny import reduced
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,13 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from surrogates import fitted, small_dataset
-from synthetic import make_run
 
 from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.reduction.basis import CENTRINGS, Basis, reconstruction_curve
 from sgns.reduction.pca import IncrementalPCA
+from sgns_testing.runs import make_run
+from sgns_testing.surrogates import fitted, small_dataset
 
 # --- Basis: projection, energies, and the file ----------------------------------------------------------
 

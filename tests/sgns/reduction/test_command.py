@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import yaml
 from omegaconf import OmegaConf
-from tiny import REDUCTION, make_dataset
 
 from sgns.reduction.basis import reconstruction_curve
 from sgns.reduction.command import main
 from sgns.reduction.reduce import reduce_dataset
+from sgns_testing.tiny import REDUCTION, make_dataset
 
 
 def settings(folder, output, **changes):

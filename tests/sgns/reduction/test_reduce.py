@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
-from synthetic import make_run
-from tiny import MODEL, REDUCTION, TRAINING, make_dataset
 
 from sgns.config import UserError
 from sgns.data.run import Run
@@ -17,6 +15,8 @@ from sgns.reduction import reduce as module
 from sgns.reduction.basis import reconstruction_curve
 from sgns.reduction.reduce import choose_modes, reduce_dataset
 from sgns.train.command import main
+from sgns_testing.runs import make_run
+from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset
 
 # --- The number of modes that `reduction.num_modes=auto` takes ------------------------------------------
 

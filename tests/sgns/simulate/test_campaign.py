@@ -15,6 +15,7 @@ from sgns.data.dataset import SPLITS, Dataset
 from sgns.simulate import campaign as cost
 from sgns.simulate.campaign import duration_words, finishing_time, plan, require_space, run_cost, size_words
 from sgns.simulate.run import simulate_scene
+from sgns_testing.tiny import BASE, EFFECTS, campaign
 
 # --- What runs cost: counted, scheduled, and said in words ----------------------------------------------
 
@@ -79,24 +80,6 @@ def test_sizes(size, words):
 
 
 # --- Campaigns and datasets: what is drawn, how it is split, what is on disk ----------------------------
-
-BASE = {
-    "kind": "excavation",
-    "duration": 0.05,
-    "blade": {"length": 0.1, "width": 0.1, "thickness": 0.08},
-    "bed": {"size": [0.4, 0.2, 0.16], "spacing": 0.04},
-}
-EFFECTS = {"yielding": True, "rate_dependence": True, "separation": True}
-
-
-def campaign(tmp_path, seed=0, **change):
-    settings = {
-        "name": "tiny",
-        "path": tmp_path / "tiny",
-        "draw": {"rake": [0.0, 10.0], "depth": [0.02, 0.04, 0.05], "blade.friction": [0.1, 0.3]},
-        "runs": 10,
-    }
-    return plan(settings | change, BASE, EFFECTS, "float32", seed)
 
 
 def test_runs_are_different_scenes_of_the_grid(tmp_path):
@@ -244,7 +227,7 @@ def test_where_picks_runs_by_their_scene(tmp_path) -> None:
 
 
 def test_every_scene_reads_the_mesh_that_the_settings_name(tmp_path):
-    from meshes import BOX_FACES, box_corners, write_obj
+    from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
     sizes = {"one": (0.08, 0.09, 0.10), "two": (0.08, 0.09, 0.11)}
     files = [

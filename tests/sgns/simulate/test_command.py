@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
 
 import h5py
 import pytest
 from omegaconf import OmegaConf
-from test_campaign import campaign
 
 from mpm_warp import Bed, Effects, Excavation, SolverStopped
 from mpm_warp.batch import all_together
@@ -21,24 +18,12 @@ from sgns.data.run import Run
 from sgns.simulate import command as simulate
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.run import scene_stages, simulate_scene
-
-SMALL = [
-    "scene.bed.particles_per_cell=1",
-    "scene.duration=0.05",
-    "scene.bed.size=[0.4,0.2,0.16]",
-    "scene.bed.spacing=0.04",
-    "scene.blade={length: 0.1, width: 0.1, thickness: 0.08, friction: 0.3}",
-]
-
-
-def sgns(folder, *arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "sgns", *arguments], cwd=folder, capture_output=True, text=True, check=False
-    )
+from sgns_testing.commands import SHORT, sgns
+from sgns_testing.tiny import campaign
 
 
 def test_command_writes_a_complete_run(tmp_path):
-    done = sgns(tmp_path, "simulate", *SMALL, "scene.rake=5", "output=run.h5")
+    done = sgns(tmp_path, "simulate", *SHORT, "scene.rake=5", "output=run.h5")
     assert done.returncode == 0, done.stderr
     assert "particle-steps/s" in done.stdout
     assert check_run(tmp_path / "run.h5") == []
@@ -54,7 +39,7 @@ def test_command_writes_a_complete_run(tmp_path):
 
 
 def test_command_writes_fewer_particles(tmp_path):
-    done = sgns(tmp_path, "simulate", *SMALL, "scene.bed.store_every=7")
+    done = sgns(tmp_path, "simulate", *SHORT, "scene.bed.store_every=7")
     assert done.returncode == 0, done.stderr
     assert "run.h5: 200 particles (one of every 7 recorded), 4 frames" in done.stdout
     with Run(tmp_path / "run.h5") as run:
@@ -79,7 +64,7 @@ def test_command_writes_fewer_particles(tmp_path):
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, override, words):
-    done = sgns(tmp_path, "simulate", *SMALL, *override.split())
+    done = sgns(tmp_path, "simulate", *SHORT, *override.split())
     assert done.returncode == 2
     lines = done.stderr.splitlines()
     assert len(lines) == 1
@@ -89,7 +74,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, override, words):
 
 def test_nan_in_a_path(tmp_path):
     (tmp_path / "path.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0.1,0.1,0.1,0,0,0,1\n1,nan,0.1,0.1,0,0,0,1\n")
-    done = sgns(tmp_path, "simulate", *SMALL, "scene.motion=path", "scene.path=path.csv")
+    done = sgns(tmp_path, "simulate", *SHORT, "scene.motion=path", "scene.path=path.csv")
     assert done.returncode == 2
     assert "not finite in row 2, column 2" in done.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["path.csv"]
@@ -156,7 +141,7 @@ def test_a_campaign_refuses_a_pipe_before_the_first_frame(tmp_path, monkeypatch)
 
 def test_the_command_says_that_an_output_is_a_device(tmp_path):
     (tmp_path / "run.h5").symlink_to("/dev/null")
-    done = sgns(tmp_path, "simulate", *SMALL, "output=run.h5")
+    done = sgns(tmp_path, "simulate", *SHORT, "output=run.h5")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "cannot write run.h5: it is a symbolic link" in done.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]

@@ -8,9 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from meshes import BOX_FACES, box_corners, write_obj
 from omegaconf import OmegaConf
-from test_command import SMALL, sgns
 
 from mpm_warp import (
     Bed,
@@ -36,6 +34,8 @@ from sgns.data.run import Run, read_state, stopped_path
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.run import continued, simulate_scene
 from sgns.simulate.scene import recorded
+from sgns_testing.commands import SHORT, sgns
+from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
 LAST = 3  # frame before the one in which the solver stops
 
@@ -191,7 +191,7 @@ def test_what_may_not_change(stopped, arguments, words):
 
 def test_what_cannot_be_gone_on_with(tmp_path, stopped):
     kept, _ = stopped
-    assert sgns(tmp_path, "simulate", *SMALL, "output=whole.h5").returncode == 0
+    assert sgns(tmp_path, "simulate", *SHORT, "output=whole.h5").returncode == 0
     for name, words in (("whole.h5", "is a whole run"), ("none.h5", "no such run file")):
         done = sgns(tmp_path, "simulate", f"continue_from={name}")
         assert done.returncode == 2

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import pytest
 import yaml
 from hydra import compose, initialize_config_module
-from test_campaign import campaign
 
 from mpm_warp import Decision, Effects, SceneError, Tolerances
 from sgns.config import UserError
@@ -18,6 +17,7 @@ from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import plan
 from sgns.simulate.command import simulate_campaign
 from sgns.simulate.scene import asked_effects, decided, decision_summary, scene_from_config
+from sgns_testing.tiny import campaign
 
 
 def chosen(*overrides: str) -> tuple[Effects, dict[str, Decision]]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from surrogates import FakeSimulator, fitted
-from test_campaign import campaign
 
 from mpm_warp import Effects, Scene
 from sgns.config import UserError
@@ -14,6 +12,8 @@ from sgns.data.run import Run
 from sgns.reduction.reduce import check_one_bed
 from sgns.rollout import require_known_bed, rollout_scene
 from sgns.simulate.run import simulate_scene
+from sgns_testing.surrogates import FakeSimulator, fitted
+from sgns_testing.tiny import campaign
 
 
 def longer(scene, store_every=1):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import pytest
@@ -17,14 +15,9 @@ from sgns.data.run import Run
 from sgns.rollout import require_same_freedom
 from sgns.simulate.campaign import plan
 from sgns.simulate.scene import scene_from_config
+from sgns_testing.commands import sgns
 
 SHORT = ["scene=quick_wheel", "scene.settle=0.05", "scene.duration=0.1", "output=run.h5"]
-
-
-def sgns(folder, *arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "sgns", *arguments], cwd=folder, capture_output=True, text=True, check=False
-    )
 
 
 def composed(*overrides):

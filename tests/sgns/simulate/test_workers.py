@@ -11,7 +11,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_campaign import campaign
 
 from sgns.config import UserError
 from sgns.data.check import check_run
@@ -20,12 +19,13 @@ from sgns.data.run import Run
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import run_cost
 from sgns.simulate.workers import simulate_campaign
+from sgns_testing.tiny import campaign
 
 # Makes a campaign of four runs in the folder named on the command line.
 MAKE = """
 import sys, pathlib, logging
 sys.path[:0] = sys.argv[2:]
-from test_campaign import campaign
+from sgns_testing.tiny import campaign
 from sgns.simulate.command.workers import simulate_campaign
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)

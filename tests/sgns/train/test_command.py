@@ -13,7 +13,6 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
 
 from sgns.config import UserError
 from sgns.model.network_dynamics import Path
@@ -22,6 +21,7 @@ from sgns.train import command as module
 from sgns.train.callbacks import ValidationRollouts
 from sgns.train.command import main, train
 from sgns.train.lightning_module import TrainingSettings
+from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
 
 
 @pytest.fixture(scope="module")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from synthetic import make_run
 
 from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.train.full_space import FullSpaceRun, FullSpaceWindows
+from sgns_testing.runs import make_run
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset, reduced
 
 from sgns.config import UserError
 from sgns.model.checkpoint import load_surrogate
@@ -21,6 +20,7 @@ from sgns.train import command as module
 from sgns.train.callbacks import ValidationRollouts
 from sgns.train.command import train
 from sgns.train.polynomial import fit_polynomial
+from sgns_testing.tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset, reduced
 
 
 @pytest.fixture(scope="module")

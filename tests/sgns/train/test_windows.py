@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny import MODEL, reduced
 
 from sgns.config import UserError
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
 from sgns.train.windows import NoiseScales, TrainingWindows, fit_normalisation, generator, random_walk
+from sgns_testing.tiny import MODEL, reduced
 
 
 @pytest.fixture(scope="module")

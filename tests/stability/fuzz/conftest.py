@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fuzzing import OUTCOMES
-from small import TRAIN, call, small_dataset
-from synthetic import make_run
 
 from sgns.config import UserError
+from sgns_testing.commands import TRAIN, call, small_dataset
+from sgns_testing.fuzzing import OUTCOMES
+from sgns_testing.runs import make_run
 
 
 @pytest.fixture(autouse=True)

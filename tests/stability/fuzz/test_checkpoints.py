@@ -8,14 +8,13 @@ from typing import Any
 import hypothesis.strategies as st
 import pytest
 import torch
-from fuzz_values import changed, damaged
-from fuzzing import cases, refused_or_read
 from hydra import compose, initialize_config_module
 from hypothesis import given
-from small import SMALL
 
 from sgns.config import UserError
 from sgns.model.checkpoint import load_surrogate
+from sgns_testing.commands import SMALL
+from sgns_testing.fuzzing import cases, changed, damaged, refused_or_read
 
 
 def test_checkpoints(good, tmp_path) -> None:

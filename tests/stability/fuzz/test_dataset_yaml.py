@@ -9,12 +9,11 @@ from typing import Any
 
 import hypothesis.strategies as st
 import pytest
-from fuzz_values import YAML, changed
-from fuzzing import bounded, cases, refused_or_read
 from hypothesis import given
 
 from sgns.config import parse_yaml
 from sgns.data.dataset import Dataset
+from sgns_testing.fuzzing import YAML, bounded, cases, changed, refused_or_read
 
 
 @pytest.fixture

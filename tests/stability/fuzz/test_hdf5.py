@@ -9,14 +9,13 @@ from typing import Any
 import h5py
 import hypothesis.strategies as st
 import numpy as np
-from fuzz_values import VALUES, YAML, damaged
-from fuzzing import bounded, cases, refused_or_read
 from hypothesis import given
 from kills import as_bytes
 
 from sgns.data.check import check_run
 from sgns.data.run import Run
 from sgns.reduction.basis import Basis
+from sgns_testing.fuzzing import VALUES, YAML, bounded, cases, damaged, refused_or_read
 
 
 @st.composite

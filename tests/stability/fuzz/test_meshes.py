@@ -7,11 +7,10 @@ from typing import Any
 
 import hypothesis.strategies as st
 import numpy as np
-from fuzz_values import damaged
-from fuzzing import OUTCOMES, cases, refused_or_read
 from hypothesis import given
 
 from mpm_warp.mesh import closed_mesh, read_mesh
+from sgns_testing.fuzzing import OUTCOMES, cases, damaged, refused_or_read
 
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
 LINES = ["v 1 2 3", "f 1 2 3", "f 1/2 2 9", "f 1e9", "f -1 -2 -3", "v a b c", f"f {10**30} 1 2"]

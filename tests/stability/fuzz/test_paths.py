@@ -8,13 +8,12 @@ from typing import Any
 
 import hypothesis.strategies as st
 import numpy as np
-from fuzz_values import damaged
-from fuzzing import OUTCOMES, cases, refused_or_read
 from hypothesis import given
 from scipy.spatial.transform import Rotation, Slerp
 
 from mpm_warp import Scene
 from sgns.simulate.scene import read_path
+from sgns_testing.fuzzing import OUTCOMES, cases, damaged, refused_or_read
 
 COLUMNS = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 SCENE = {

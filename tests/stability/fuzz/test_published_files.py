@@ -7,12 +7,11 @@ import struct
 from typing import Any
 
 import hypothesis.strategies as st
-from fuzz_values import changed, damaged
-from fuzzing import cases, refused_or_read
 from hypothesis import given
-from test_published import record
 
 from sgns.data.published import published_dataset
+from sgns_testing.fuzzing import cases, changed, damaged, refused_or_read
+from sgns_testing.published import record
 
 
 def test_published_files(tmp_path) -> None:

@@ -8,14 +8,13 @@ from typing import Any
 
 import hypothesis.strategies as st
 import pytest
-from fuzz_values import NUMBERS, VALUES, YAML, changed
-from fuzzing import OUTCOMES, cases
 from hydra import compose, initialize_config_module
 from hypothesis import given
 from omegaconf import OmegaConf
-from small import SMALL, TRAIN, call
 
 from sgns.config import flattened
+from sgns_testing.commands import SMALL, TRAIN, call
+from sgns_testing.fuzzing import NUMBERS, OUTCOMES, VALUES, YAML, cases, changed
 
 SHOWN = st.one_of(
     NUMBERS.map(str),

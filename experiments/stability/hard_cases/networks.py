@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tiny
 from omegaconf import OmegaConf
 
 from sgns.config import UserError
@@ -18,6 +17,7 @@ from sgns.data.dataset import Dataset
 from sgns.reduction.reduce import ReducedDataset, reduce_dataset
 from sgns.simulator import Simulator
 from sgns.train.command import train
+from sgns_testing import tiny
 
 __all__ = [
     "fresh_data",
@@ -30,7 +30,7 @@ __all__ = [
     "train_synthetic",
 ]
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 # Kept until the process ends.
 _FOLDER = tempfile.TemporaryDirectory(prefix="sgns-stability-")
 

@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from beds import BlockBed, block, cut
-from case import Case
-from measures import energies, frames_of, shares, stopped_with, top_speed, volume_gain, work_on_soil
 
 from mpm_warp import Bed, Box, Column, Effects, Excavation, Incline, Push, Scene, Solver, Walls
 from mpm_warp.diagnostics import leakage
+from sgns_testing.scenes import BlockBed, block, cut
+
+from .case import Case
+from .measures import energies, frames_of, shares, stopped_with, top_speed, volume_gain, work_on_soil
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,13 @@ from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
-from beds import cut
-from case import Case
-from measures import blade_shares, frames_of, refused, stopped_with
 
 from mpm_warp import Bed, Effects, Material, Scene, Solver, Walls
 from mpm_warp.scene import MOST_COURANT
+from sgns_testing.scenes import cut
+
+from .case import Case
+from .measures import blade_shares, frames_of, refused, stopped_with
 
 ELASTIC = Effects(yielding=False, rate_dependence=False)
 

@@ -12,9 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from case import Case
-from refusals import unsaid
-from trained import quick_data, quick_network, simulator_of, synthetic_data, synthetic_network
 
 from sgns.data.check import check_run
 from sgns.data.run import Run
@@ -23,6 +20,10 @@ from sgns.reduction.reduce import ReducedDataset, ReducedRun
 from sgns.rollout import write_rollout
 from sgns.simulator import Simulator
 from sgns.states import Rollout
+
+from .case import Case
+from .measures import unsaid
+from .networks import quick_data, quick_network, simulator_of, synthetic_data, synthetic_network
 
 __all__ = ["CASES"]
 

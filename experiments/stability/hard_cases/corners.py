@@ -6,10 +6,11 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from case import Case
-from measures import blade_shares, frames_of, shares, top_speed, volume_gain
 
 from mpm_warp import Bed, Effects, Excavation, Material, Plate, Solver, SolverStopped, Wheel
+
+from .case import Case
+from .measures import blade_shares, frames_of, shares, top_speed, volume_gain
 
 CUT_BED = Bed(spacing=0.02)
 WHEEL_BED = Bed(size=(0.40, 0.19, 0.0583), spacing=0.04 / 3.0, particles_per_cell=4.0, headroom=0.10)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from synthetic import make_run
 
 from mpm_warp.poses import in_world_frame
 from sgns.data.run import Run
@@ -17,6 +16,7 @@ from sgns.evaluate.results import Scores
 from sgns.model.training_range import Excess
 from sgns.reduction.basis import Basis
 from sgns.reduction.pca import IncrementalPCA
+from sgns_testing.runs import make_run
 
 
 @dataclass

@@ -14,16 +14,17 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from case import Case
-from refusals import unsaid
 from torch import nn
-from trained import fresh_data, poisoned, synthetic_data, synthetic_network, train_synthetic
 
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.simulator import Simulator
 from sgns.train.callbacks import StepProgress
 from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
 from sgns.train.windows import TrainingWindows
+
+from .case import Case
+from .measures import unsaid
+from .networks import fresh_data, poisoned, synthetic_data, synthetic_network, train_synthetic
 
 __all__ = ["CASES"]
 

@@ -13,14 +13,15 @@ import h5py
 import numpy as np
 import torch
 import yaml
-from case import Case
-from refusals import unsaid
-from tiny import REDUCTION, make_dataset
 
 from sgns.data.dataset import Dataset
 from sgns.reduction.basis import Basis
 from sgns.reduction.pca import IncrementalPCA
 from sgns.reduction.reduce import reduce_dataset
+from sgns_testing.tiny import REDUCTION, make_dataset
+
+from .case import Case
+from .measures import unsaid
 
 __all__ = ["CASES"]
 

@@ -7,15 +7,16 @@ from typing import Any
 
 import torch
 import yaml
-from synthetic import make_run
 
 from sgns.data.dataset import Dataset
 from sgns.reduction.reduce import ReducedDataset, reduce_dataset
+from sgns.simulate.campaign import Campaign, plan
+from sgns_testing.runs import make_run
 
 # Matrices this small are slower on several threads, and results must not depend on the number of cores.
 torch.set_num_threads(1)
 
-__all__ = ["FIT", "MODEL", "POLYNOMIAL", "REDUCTION", "TRAINING", "make_dataset", "reduced"]
+__all__ = ["FIT", "MODEL", "POLYNOMIAL", "REDUCTION", "TRAINING", "campaign", "make_dataset", "reduced"]
 
 MODEL: dict[str, Any] = {
     "kind": "network",
@@ -96,3 +97,23 @@ def make_dataset(folder: Path, frames: int = 14, **kw: Any) -> Dataset:
 def reduced(folder: Path, **kw: Any) -> ReducedDataset:
     """The tiny dataset in its basis."""
     return reduce_dataset(make_dataset(folder, **kw), REDUCTION, progress=False)
+
+
+BASE = {
+    "kind": "excavation",
+    "duration": 0.05,
+    "blade": {"length": 0.1, "width": 0.1, "thickness": 0.08},
+    "bed": {"size": [0.4, 0.2, 0.16], "spacing": 0.04},
+}
+EFFECTS = {"yielding": True, "rate_dependence": True, "separation": True}
+
+
+def campaign(folder: Path, seed: int = 0, **change: Any) -> Campaign:
+    """Ten small cuts; keyword arguments change the settings of the dataset."""
+    settings = {
+        "name": "tiny",
+        "path": folder / "tiny",
+        "draw": {"rake": [0.0, 10.0], "depth": [0.02, 0.04, 0.05], "blade.friction": [0.1, 0.3]},
+        "runs": 10,
+    }
+    return plan(settings | change, BASE, EFFECTS, "float32", seed)

@@ -9,13 +9,14 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from beds import cut
-from case import Case
-from measures import blade_shares, frames_of, refused, shares, stopped_with, top_speed, volume_gain
-from meshes import box_corners, box_triangles, write_obj
 
 from mpm_warp import Effects, Excavation, MeshBody, Plate, Push, Solver
 from mpm_warp.diagnostics import leakage
+from sgns_testing.meshes import box_corners, box_triangles, write_obj
+from sgns_testing.scenes import cut
+
+from .case import Case
+from .measures import blade_shares, frames_of, refused, shares, stopped_with, top_speed, volume_gain
 
 IN_SOIL = 0.06
 """Height of the centre of the plate of `cut` when its tip is 4 cm deep [m]."""

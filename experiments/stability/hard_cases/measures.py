@@ -1,14 +1,17 @@
-"""What hard cases measure on a solver's frames. All are 0 or more, and the smaller the better."""
+"""What hard cases measure. All are 0 or more, and the smaller the better."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
 from mpm_warp import Frame, Scene, SceneError, Solver, SolverStopped
 from mpm_warp.diagnostics import leakage
 from mpm_warp.poses import rotate
+from sgns.config import UserError
 
 __all__ = [
     "blade_force",
@@ -19,6 +22,7 @@ __all__ = [
     "shares",
     "stopped_with",
     "top_speed",
+    "unsaid",
     "volume_gain",
     "work_on_soil",
 ]
@@ -146,3 +150,14 @@ def stopped_with(scene: Scene, words: str, **settings) -> tuple[float, str]:
     except SolverStopped as error:
         return float(words not in str(error) or "\n" in str(error)), str(error)
     return 1.0, "it went on to the end"
+
+
+def unsaid(act: Callable[[], Any], *words: str) -> tuple[float, str]:
+    """How many of some words the one line of a refusal lacks; NaN if nothing is refused."""
+    try:
+        act()
+    except UserError as error:
+        line = str(error)
+        lacking = [word for word in words if word not in line]
+        return len(lacking) + line.count("\n"), f"lacks {', '.join(lacking)}: {line}" if lacking else ""
+    return math.nan, "nothing was refused"

@@ -8,14 +8,15 @@ from functools import partial
 
 import numpy as np
 import warp as wp
-from beds import block, cut
-from case import Case
-from measures import frames_of
 
 from mpm_warp import Effects, Material, Solver
 from mpm_warp.kernels.constitutive import constitutive
 from mpm_warp.kernels.fluidity import soil_parameters, soil_struct
 from mpm_warp.launch import start_warp
+from sgns_testing.scenes import block, cut
+
+from .case import Case
+from .measures import frames_of
 
 SAND = Material()
 LAWS = {

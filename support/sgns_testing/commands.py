@@ -1,0 +1,96 @@
+"""Settings with which every command takes a second, and commands called here or in processes of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+
+from sgns.cli.commands import main
+from sgns.simulate.scene import scene_from_config
+from sgns_testing.tiny import make_dataset
+
+__all__ = [
+    "REDUCED", "SHORT", "SMALL", "TRAIN",
+    "become_ordinary", "call", "environment", "files", "sgns", "small_dataset",
+]  # fmt: skip
+
+SMALL = [
+    *("scene.bed.size=[0.4,0.2,0.16]", "scene.bed.spacing=0.04", "scene.duration=0.2", "scene.speed=0.05"),
+    *("scene.blade.length=0.1", "scene.blade.width=0.1", "scene.blade.thickness=0.08"),
+]
+SHORT = [
+    *("scene.bed.size=[0.4,0.2,0.16]", "scene.bed.spacing=0.04", "scene.bed.particles_per_cell=1"),
+    *("scene.duration=0.05", "scene.blade={length: 0.1, width: 0.1, thickness: 0.08, friction: 0.3}"),
+]
+REDUCED = ["reduction.max_modes=6", "reduction.num_modes=3"]
+TRAIN = [
+    *REDUCED,
+    *("model.hidden_width=8", "model.message_passing_steps=1", "training.threads=1"),
+    *("training.max_steps=2", "training.validate_every=2", "training.warmup_steps=0"),
+]
+
+
+def call(*arguments: str) -> tuple[int, str]:
+    """Status of a command and what it says on standard error."""
+    GlobalHydra.instance().clear()
+    said, before = io.StringIO(), sys.argv
+    sys.argv = ["sgns", *arguments]
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            status = main()
+    finally:
+        sys.argv = before
+    return status, said.getvalue()
+
+
+def sgns(folder: Path, *arguments: str, **settings: Any) -> subprocess.CompletedProcess[str]:
+    """A command in a process of its own, called in a folder; keyword arguments as of `subprocess.run`."""
+    command = [sys.executable, "-m", "sgns", *arguments]
+    return subprocess.run(command, **{"cwd": folder, "capture_output": True, "text": True} | settings)
+
+
+def environment() -> dict[str, str]:
+    """Of a process that finds this package, too."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Everything in a folder, the records that commands write about themselves left out."""
+    kept = (path for path in folder.rglob("*") if path.is_file() and path.parent.name != "tensorboard")
+    return {
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in kept
+        if p.suffix != ".log" and ".hydra" not in p.parts
+    }
+
+
+def small_dataset(folder: Path) -> None:
+    """Synthetic runs of as many particles as the small scene has, and that say they are of it: what is trained on them
+    can roll the scene out."""
+    GlobalHydra.instance().clear()
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        scene = scene_from_config(compose("simulate", SMALL))
+    make_dataset(folder, n=len(scene.stored), arrangement_hash=scene.arrangement_hash, scene=scene.to_dict())
+
+
+def become_ordinary() -> None:
+    """Give up root's rights over other people's files, so that permissions count; nothing happens to other users."""
+    if not hasattr(os, "geteuid") or os.geteuid() != 0:
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    header, data = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
+    if libc.capget(header, data) != 0:
+        raise OSError(ctypes.get_errno(), "capget")
+    for index in range(3):  # effective, permitted, inheritable
+        data[index] &= ~(1 << 1 | 1 << 2)  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH of capabilities(7)
+    if libc.capset(header, data) != 0:
+        raise OSError(ctypes.get_errno(), "capset")

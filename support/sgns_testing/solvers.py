@@ -1,0 +1,33 @@
+"""What tests look at inside a solver."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+
+def momenta(solver):
+    """Linear and angular momentum of the particles, the affine part (C dx^2 / 4) included."""
+    mass = solver._grid.particle_mass
+    x, v, c = solver._x.numpy(), solver._v.numpy(), solver._c.numpy()
+    spin = np.stack([c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], axis=-1)
+    angular = mass * (np.cross(x, v) + spin * solver.scene.bed.spacing**2 / 4)
+    return mass * v.sum(axis=0), angular.sum(axis=0)
+
+
+def launches(solver):
+    """At a remap, in a step and at its end."""
+    return [*solver._to_grid, *solver._begin, *solver._step, solver._from_grid]
+
+
+def compiled_source(launch):
+    """What Warp compiled for a kernel with a module of its own, from its cache."""
+    launch.load()
+    (newest, *_) = sorted(
+        Path(wp.config.kernel_cache_dir).glob(f"wp_{launch.kernel.alone.module.name}_*/*.cpp"),
+        key=lambda file: file.stat().st_mtime,
+        reverse=True,
+    )
+    return newest.read_text()
