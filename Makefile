@@ -49,8 +49,10 @@ frontier: setup ## what accuracy costs in time: the quick study, 9 minutes on tw
 test: setup ## run the tests
 	$(BIN)/python -m pytest
 
-stability: setup ## measure the hard cases (about half an hour of one core; goes on where it stopped)
+stability: setup ## hard cases, kills, full disks and random input (most of an hour of one core; the hard cases go on where they stopped)
 	$(BIN)/python experiments/stability/run.py --workers $(WORKERS)
+	$(BIN)/python -m pytest -m long tests/stability
+	SGNS_FUZZ=20 $(BIN)/python -m pytest -s --timeout 1200 tests/stability/fuzz
 
 lint: setup ## check the code's style and format
 	$(BIN)/ruff check .

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 import torch
+
+if TYPE_CHECKING:
+    from sgns.reduction.reduce import ReducedDataset
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # figures without a screen, in child processes too
 torch.set_num_threads(1)  # the tests' networks are so small that more threads only wait for each other
@@ -19,3 +23,22 @@ def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir()
     monkeypatch.chdir(folder)
     return folder
+
+
+class Trained(NamedTuple):
+    """A training and what it was of."""
+
+    data: ReducedDataset
+    output: Path
+
+
+@pytest.fixture(scope="session")
+def trained_briefly(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    """The tiny dataset and a network trained on it for two steps: to be read and copied, never changed."""
+    from sgns.train.command import train
+    from sgns_testing.tiny import BRIEF, MODEL, reduced
+
+    folder = tmp_path_factory.mktemp("trained")
+    data = reduced(folder / "data")
+    train(data, num_modes=4, model=MODEL, training=BRIEF, output=folder / "out")
+    return Trained(data, folder / "out")

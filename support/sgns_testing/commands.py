@@ -1,16 +1,17 @@
-"""Settings with which every command takes a second, and commands called here or in processes of their own."""
+"""Settings with which every command takes a second, and how tests call them."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
 import io
+import logging
 import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
+import torch
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 
@@ -20,7 +21,7 @@ from sgns_testing.tiny import make_dataset
 
 __all__ = [
     "REDUCED", "SHORT", "SMALL", "TRAIN",
-    "become_ordinary", "call", "environment", "files", "sgns", "small_dataset",
+    "become_ordinary", "call", "environment", "files", "refused", "sgns", "small_dataset",
 ]  # fmt: skip
 
 SMALL = [
@@ -39,23 +40,40 @@ TRAIN = [
 ]
 
 
-def call(*arguments: str) -> tuple[int, str]:
-    """Status of a command and what it says on standard error."""
+def call(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """A command, called in this process: its status, and what it says on standard output and standard error."""
     GlobalHydra.instance().clear()
-    said, before = io.StringIO(), sys.argv
+    root, before, said = logging.getLogger(), sys.argv, (io.StringIO(), io.StringIO())
+    handlers, level, threads = root.handlers[:], root.level, torch.get_num_threads()
     sys.argv = ["sgns", *arguments]
     try:
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+        with contextlib.redirect_stdout(said[0]), contextlib.redirect_stderr(said[1]):
             status = main()
     finally:
         sys.argv = before
-    return status, said.getvalue()
+        for handler in set(root.handlers) - set(handlers):  # Hydra's
+            handler.close()
+        root.handlers[:] = handlers
+        root.setLevel(level)
+        torch.set_num_threads(threads)
+    return subprocess.CompletedProcess(arguments, status, *(one.getvalue() for one in said))
 
 
-def sgns(folder: Path, *arguments: str, **settings: Any) -> subprocess.CompletedProcess[str]:
-    """A command in a process of its own, called in a folder; keyword arguments as of `subprocess.run`."""
-    command = [sys.executable, "-m", "sgns", *arguments]
-    return subprocess.run(command, **{"cwd": folder, "capture_output": True, "text": True} | settings)
+def refused(*arguments: str) -> str:
+    """The one line with which a command ends that has wrong settings or cannot go on."""
+    done = call(*arguments)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done
+    return done.stderr
+
+
+def sgns(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """`call` in a folder."""
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        return call(*arguments)
+    finally:
+        os.chdir(before)
 
 
 def environment() -> dict[str, str]:

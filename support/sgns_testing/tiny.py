@@ -16,7 +16,17 @@ from sgns_testing.runs import make_run
 # Matrices this small are slower on several threads, and results must not depend on the number of cores.
 torch.set_num_threads(1)
 
-__all__ = ["FIT", "MODEL", "POLYNOMIAL", "REDUCTION", "TRAINING", "campaign", "make_dataset", "reduced"]
+__all__ = [
+    "BRIEF",
+    "FIT",
+    "MODEL",
+    "POLYNOMIAL",
+    "REDUCTION",
+    "TRAINING",
+    "campaign",
+    "make_dataset",
+    "reduced",
+]
 
 MODEL: dict[str, Any] = {
     "kind": "network",
@@ -65,6 +75,7 @@ TRAINING: dict[str, Any] = {
     "resume": "auto",
     "threads": None,
 }
+BRIEF = TRAINING | {"max_steps": 2, "validate_every": 2}
 REDUCTION: dict[str, Any] = {
     "num_modes": 4,
     "max_modes": 6,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from sgns.data.files import whole_file, write_whole
 from sgns.evaluate.figures import read_log
 from sgns.reduction.reduce import reduce_dataset
 from sgns.train.command import train
-from sgns_testing.commands import REDUCED, SMALL, TRAIN, call, environment, files, small_dataset
+from sgns_testing.commands import REDUCED, SMALL, TRAIN, call, environment, files, refused, small_dataset
 from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
 
 resource = pytest.importorskip("resource", reason="needs limits on a process")
@@ -207,7 +208,13 @@ def test_a_disk_that_is_full_for_the_basis_leaves_the_earlier_one(tmp_path) -> N
 # --- a disk that is really full, or only to be read ------------------------------------------------------
 
 NETWORK = [*TRAIN, *TRAINING_STEPS]
-POLYNOMIAL = [*REDUCED, "model=polynomial", "training.noises=[0.1]", "training.penalties=[0.01]"]
+POLYNOMIAL = [
+    *REDUCED,
+    "training.threads=1",
+    "model=polynomial",
+    "training.noises=[0.1]",
+    "training.penalties=[0.01]",
+]
 MOUNTED = 16 << 20
 """Size of the file system [bytes]."""
 
@@ -238,113 +245,127 @@ def leave(disk: Path, free: int) -> Path:
     return filler
 
 
-@pytest.fixture(scope="module")
-def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data and checkpoints that commands need, and what they make of them undisturbed."""
-    folder = tmp_path_factory.mktemp("elsewhere")
-    small_dataset(folder / "given" / "data")
-    for name, arguments in COMMANDS.items():
-        if name == "evaluate":  # takes long, and its tables have times of the clock in them
-            continue
-        shutil.copytree(folder / "given" / "data", folder / name / "data")
-        status, said = call(*placed(arguments, folder / name, folder))
-        assert status == 0, said
-    return folder
-
-
 COMMANDS = {
     "network": ["train", "dataset.path={here}/data", *NETWORK, "output={here}/out"],
     "polynomial": ["train", "dataset.path={here}/data", *POLYNOMIAL, "output={here}/out"],
     "simulate": ["simulate", *SMALL, "output={here}/run.h5"],
     "campaign": ["simulate", *CAMPAIGN, "dataset.path={here}/made"],
     "reduce": ["reduce", "dataset.path={here}/data", *REDUCED, "output={here}/out"],
-    "rollout": ["rollout", *SMALL, "checkpoint={there}/network/out/best.ckpt", "output={here}/run.h5"],
+    "rollout": ["rollout", *SMALL, "checkpoint={network}/out/best.ckpt", "output={here}/run.h5"],
     "rollout of polynomials": [
-        *("rollout", *SMALL, "checkpoint={there}/polynomial/out/best.ckpt", "output={here}/run.h5"),
+        *("rollout", *SMALL, "checkpoint={polynomial}/out/best.ckpt", "output={here}/run.h5"),
     ],
     "evaluate": [
-        *("evaluate", "dataset.path={here}/data", "checkpoint={there}/network/out/best.ckpt"),
+        *("evaluate", "dataset.path={here}/data", "checkpoint={network}/out/best.ckpt"),
         "output={here}/out",
     ],
 }
 
 
-def placed(arguments: list[str], here: Path, there: Path) -> list[str]:
-    """Arguments with their folders."""
-    return [
-        argument.format(here=here, there=there) if "/" in argument else argument for argument in arguments
-    ]
+def placed(name: str, here: Path, undisturbed: Undisturbed) -> list[str]:
+    """A command's arguments with their folders."""
+    needed = [one for one in ("network", "polynomial") if f"{{{one}}}" in " ".join(COMMANDS[name])]
+    places = {"here": here} | {one: undisturbed(one) for one in needed}
+    return [argument.format(**places) if "/" in argument else argument for argument in COMMANDS[name]]
+
+
+class Undisturbed:
+    """What commands make of the small dataset undisturbed, each made when first asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.data = folder / "given"
+        small_dataset(self.data)
+
+    def __call__(self, name: str) -> Path:
+        made = self.folder / name
+        if not made.exists():
+            shutil.copytree(self.data, made / "data")
+            done = call(*placed(name, made, self))
+            assert done.returncode == 0, done.stderr
+        return made
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+    return Undisturbed(tmp_path_factory.mktemp("undisturbed"))
 
 
 @pytest.fixture
 def no_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     """The disk was empty enough when the command began: others fill it up."""
-    for module in ("simulate", "campaign_runs", "rollout", "cost"):
-        monkeypatch.setattr(f"sgns.{module}.require_space", lambda *_: None, raising=False)
+    for module in ("command", "workers", "campaign"):
+        monkeypatch.setattr(f"sgns.simulate.{module}.require_space", lambda *_: None)
 
 
 FREE = {
-    "network": [280_000, 400_000],
-    "polynomial": [210_000],
     "simulate": [100_000],
-    "campaign": [250_000],
     "reduce": [100_000],
     "rollout": [0],
     "rollout of polynomials": [100_000],
+    "polynomial": [210_000],
+    "network": [280_000, 400_000],
+    "campaign": [250_000],
     "evaluate": [400_000],
 }
 """Bytes that each command finds free: it gets into its work, and some of its files are complete."""
 if more := os.environ.get("SGNS_FREE"):
     FREE = {name: [int(free) for free in more.split(",")] for name in FREE}
+TAKES_LONG = ("network", "campaign", "evaluate")
 
 
-@pytest.mark.parametrize(("name", "free"), [(name, free) for name in FREE for free in FREE[name]])
-def test_a_full_disk(name, free, elsewhere, disk, no_estimate, empty_folder) -> None:
-    shutil.copytree(elsewhere / "given" / "data", disk / "data")
+@pytest.mark.parametrize(
+    ("name", "free"),
+    [
+        pytest.param(name, free, marks=[pytest.mark.long] * (name in TAKES_LONG))
+        for name in FREE
+        for free in FREE[name]
+    ],
+)
+def test_a_full_disk(name, free, undisturbed, disk, no_estimate, empty_folder) -> None:
+    shutil.copytree(undisturbed.data, disk / "data")
     filler = leave(disk, free)
     before = files(disk)
-    arguments = placed(COMMANDS[name], disk, elsewhere)
-    status, said = call(*arguments)
-    if status == 0:
+    arguments = placed(name, disk, undisturbed)
+    done = call(*arguments)
+    if done.returncode == 0:
         assert "SGNS_FREE" in os.environ, "the disk was not full"
         return
-    assert status == 2 and said.count("\n") == 1 and "No space left on device" in said, said
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done
+    assert "No space left on device" in done.stderr
     assert {path: files(disk).get(path) for path in before} == before
     assert broken(disk) == []
     assert not list(disk.rglob("*.partial"))
 
     filler.unlink()
-    status, said = call(*arguments)
-    assert status == 0, said
-    if name == "evaluate":
+    done = call(*arguments)
+    assert done.returncode == 0, done.stderr
+    if name == "evaluate":  # its tables have times of the clock in them
         assert broken(disk) == [] and (disk / "out" / "report.html").stat().st_size > 0
     else:
-        assert same(elsewhere / name, disk)
+        assert same(undisturbed(name), disk)
 
 
 def test_a_run_that_would_not_fit_is_not_begun(disk, empty_folder) -> None:
     leave(disk, 24 * 4096)
-    status, said = call("simulate", *SMALL, f"output={disk / 'run.h5'}")
-    assert status == 2 and said.count("\n") == 1 and "98 kB are free; free some space" in said, said
+    said = refused("simulate", *SMALL, f"output={disk / 'run.h5'}")
+    assert re.search(r"\b9\d kB are free; free some space", said), said
     assert [path.name for path in disk.iterdir()] == ["filler"]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_disk_that_can_only_be_read(name, elsewhere, disk, empty_folder) -> None:
-    shutil.copytree(elsewhere / "given" / "data", disk / "data")
+def test_a_disk_that_can_only_be_read(name, undisturbed, disk, empty_folder) -> None:
+    shutil.copytree(undisturbed.data, disk / "data")
     before = files(disk)
     mount("-o", "remount,ro", str(disk))
-    status, said = call(*placed(COMMANDS[name], disk, elsewhere))
-    assert status == 2 and said.count("\n") == 1 and "Read-only file system" in said, said
+    assert "Read-only file system" in refused(*placed(name, disk, undisturbed))
     assert files(disk) == before
 
 
-def test_data_on_a_disk_that_can_only_be_read(elsewhere, disk, empty_folder) -> None:
+def test_data_on_a_disk_that_can_only_be_read(undisturbed, disk, empty_folder) -> None:
     """What is reduced can be trained on and evaluated."""
-    shutil.copytree(elsewhere / "reduce" / "data", disk / "data")
+    shutil.copytree(undisturbed("reduce") / "data", disk / "data")
     mount("-o", "remount,ro", str(disk))
-    status, said = call(
-        "train", f"dataset.path={disk / 'data'}", *POLYNOMIAL, f"output={empty_folder / 'out'}"
-    )
-    assert status == 0, said
-    assert same(elsewhere / "polynomial" / "out", empty_folder / "out")
+    done = call("train", f"dataset.path={disk / 'data'}", *POLYNOMIAL, f"output={empty_folder / 'out'}")
+    assert done.returncode == 0, done.stderr
+    assert same(undisturbed("polynomial") / "out", empty_folder / "out")

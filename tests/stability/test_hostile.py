@@ -24,11 +24,9 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from hydra.core.global_hydra import GlobalHydra
 
 from mpm_warp import SceneError
 from mpm_warp.mesh import read_mesh
-from sgns.cli.commands import main
 from sgns.config import UserError, parse_yaml
 from sgns.data.check import check_run
 from sgns.data.dataset import Dataset
@@ -45,11 +43,11 @@ from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, read_reduced, reduce_dataset
 from sgns.simulate.scene import read_path
 from sgns.train.command import train
+from sgns_testing.commands import refused
 from sgns_testing.runs import make_run
-from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
+from sgns_testing.tiny import BRIEF, MODEL, REDUCTION, make_dataset, reduced
 
 SECRET = "canary-in-another-file"
-FEW = TRAINING | {"max_steps": 2, "validate_every": 2}
 
 
 @pytest.fixture
@@ -58,13 +56,10 @@ def canary(tmp_path: Path) -> Path:
     return tmp_path / "canary"
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def trained(trained_briefly) -> Path:
     """A good checkpoint."""
-    folder = tmp_path_factory.mktemp("trained")
-    settings = TRAINING | {"max_steps": 2, "validate_every": 2}
-    train(reduced(folder / "data"), num_modes=4, model=MODEL, training=settings, output=folder / "out")
-    return folder / "out" / "best.ckpt"
+    return trained_briefly.output / "best.ckpt"
 
 
 class Touch:
@@ -75,16 +70,6 @@ class Touch:
 
     def __reduce__(self):
         return (Path.touch, (self.canary,))
-
-
-def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
-    """The line with which a command refuses its settings."""
-    GlobalHydra.instance().clear()
-    monkeypatch.setattr(sys, "argv", ["sgns", *arguments])
-    assert main() == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1, said
-    return said
 
 
 # --- checkpoints ------------------------------------------------------------------------------------------
@@ -109,16 +94,12 @@ def test_pickles_in_checkpoints(trained, tmp_path, canary) -> None:
     assert not canary.exists()
 
 
-def test_a_hostile_last_checkpoint_is_not_gone_on_from(tmp_path, canary) -> None:
-    data = reduced(tmp_path / "data")
-    output = tmp_path / "out"
-    settings = TRAINING | {"max_steps": 2, "validate_every": 2}
-    train(data, num_modes=4, model=MODEL, training=settings, output=output)
+def test_a_hostile_last_checkpoint_is_not_gone_on_from(halfway, canary) -> None:
+    data, output = halfway
     content = torch.load(output / "last.ckpt", weights_only=True)
     torch.save(content | {"loops": Touch(canary)}, output / "last.ckpt")
-    (output / "training.json").unlink()
     with pytest.raises(UserError, match="cannot be read as a checkpoint"):
-        train(data, num_modes=4, model=MODEL, training=settings, output=output)
+        train(data, num_modes=4, model=MODEL, training=BRIEF, output=output)
     assert not canary.exists()
 
 
@@ -224,14 +205,12 @@ def test_a_checkpoint_whose_parts_overlap(trained, tmp_path) -> None:
     assert "overlap" in str(caught.value.__cause__)
 
 
-@pytest.fixture(scope="module")
-def halfway(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReducedDataset, Path]:
-    """A dataset and the folder of a training of it that was stopped."""
-    folder = tmp_path_factory.mktemp("halfway")
-    data = reduced(folder / "data")
-    train(data, num_modes=4, model=MODEL, training=FEW, output=folder / "out")
-    (folder / "out" / "training.json").unlink()
-    return data, folder / "out"
+@pytest.fixture
+def halfway(trained_briefly, tmp_path) -> tuple[ReducedDataset, Path]:
+    """A dataset and a copy of a training of it that was stopped."""
+    output = shutil.copytree(trained_briefly.output, tmp_path / "out")
+    (output / "training.json").unlink()
+    return trained_briefly.data, output
 
 
 def odd_state(content: dict[str, Any]) -> None:
@@ -265,10 +244,9 @@ def infinite_state(content: dict[str, Any]) -> None:
         infinite_state,
     ],
 )
-def test_trainings_that_cannot_be_gone_on_from(halfway, tmp_path, damage) -> None:
-    data, there = halfway
-    shutil.copytree(there, tmp_path / "out")
-    last = tmp_path / "out" / "last.ckpt"
+def test_trainings_that_cannot_be_gone_on_from(halfway, damage) -> None:
+    data, output = halfway
+    last = output / "last.ckpt"
     content = torch.load(last, weights_only=True)
     damage(content)
     torch.save(content, last)
@@ -276,19 +254,18 @@ def test_trainings_that_cannot_be_gone_on_from(halfway, tmp_path, damage) -> Non
     with pytest.raises(
         UserError, match=r"last\.ckpt cannot be gone on from .*training\.resume=false"
     ) as caught:
-        train(data, num_modes=4, model=MODEL, training=FEW, output=tmp_path / "out")
+        train(data, num_modes=4, model=MODEL, training=BRIEF, output=output)
     assert "\n" not in str(caught.value) and last.read_bytes() == before
 
 
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "null", '{"skill": "x", "seconds": 1}', "[" * 10**5, "\0" * 100]
 )
-def test_a_complete_training_whose_summary_is_damaged(halfway, tmp_path, text) -> None:
-    data, there = halfway
-    shutil.copytree(there, tmp_path / "out")
-    (tmp_path / "out" / "training.json").write_text(text)
+def test_a_complete_training_whose_summary_is_damaged(halfway, text) -> None:
+    data, output = halfway
+    (output / "training.json").write_text(text)
     with pytest.raises(UserError, match=r"training\.json is not the summary of a training"):
-        train(data, num_modes=4, model=MODEL, training=FEW, output=tmp_path / "out")
+        train(data, num_modes=4, model=MODEL, training=BRIEF, output=output)
 
 
 # --- settings ---------------------------------------------------------------------------------------------
@@ -305,10 +282,10 @@ def test_a_complete_training_whose_summary_is_damaged(halfway, tmp_path, text) -
         "++hydra.job_logging.handlers.console.stream=ext://hostile_module.x",
     ],
 )
-def test_targets_in_overrides(empty_folder, canary, override, capsys, monkeypatch) -> None:
+def test_targets_in_overrides(empty_folder, canary, override, monkeypatch) -> None:
     (empty_folder / "hostile_module.py").write_text(f"open({str(canary)!r}, 'w')")
     monkeypatch.syspath_prepend(empty_folder)
-    said = refused(capsys, monkeypatch, "simulate", override.replace("CANARY", str(canary)))
+    said = refused("simulate", override.replace("CANARY", str(canary)))
     assert "cannot name Python objects" in said
     assert not canary.exists()
 
@@ -323,11 +300,11 @@ def test_targets_in_overrides(empty_folder, canary, override, capsys, monkeypatc
         "scene:\n  name: !!python/object/new:pathlib.Path ['CANARY']",
     ],
 )
-def test_files_of_settings(empty_folder, canary, text, capsys, monkeypatch) -> None:
+def test_files_of_settings(empty_folder, canary, text, monkeypatch) -> None:
     folder = empty_folder / "conf" / "experiment"
     folder.mkdir(parents=True)
     (folder / "x.yaml").write_text("# @package _global_\n" + text.replace("CANARY", str(canary)))
-    said = refused(capsys, monkeypatch, "simulate", "--config-dir", "conf", "experiment=x")
+    said = refused("simulate", "--config-dir", "conf", "experiment=x")
     assert "cannot name Python objects" in said or "could not determine a constructor" in said
     assert not canary.exists()
 
@@ -383,20 +360,20 @@ def experiments(empty_folder, canary) -> Path:
         ["experiment=good,bad", "hydra.sweeper.max_batch_size=2"],
     ],
 )
-def test_targets_in_sweeps_before_the_first_job(experiments, canary, overrides, capsys, monkeypatch) -> None:
+def test_targets_in_sweeps_before_the_first_job(experiments, canary, overrides, monkeypatch) -> None:
     monkeypatch.setattr("sgns.simulate.command.main", lambda cfg: canary.touch())
     arguments = [override.replace("CANARY", str(canary)) for override in overrides]
-    said = refused(capsys, monkeypatch, "simulate", "-m", "--config-dir", str(experiments), *arguments)
+    said = refused("simulate", "-m", "--config-dir", str(experiments), *arguments)
     assert "cannot name Python objects" in said
     assert not canary.exists()
 
 
-def test_targets_in_a_later_batch_of_a_sweep(experiments, canary, capsys, monkeypatch) -> None:
+def test_targets_in_a_later_batch_of_a_sweep(experiments, canary, monkeypatch) -> None:
     seeds = []
     monkeypatch.setattr("sgns.simulate.command.main", lambda cfg: seeds.append(cfg.seed))
     batches = "hydra.sweeper.max_batch_size=1"  # each is put together when its turn comes
     sweep = ["-m", "--config-dir", str(experiments), "experiment=good,bad", batches]
-    assert "cannot name Python objects" in refused(capsys, monkeypatch, "simulate", *sweep).splitlines()[-1]
+    assert "cannot name Python objects" in refused("simulate", *sweep).splitlines()[-1]
     assert seeds == [3] and not canary.exists()
 
 
@@ -404,10 +381,8 @@ def test_targets_in_a_later_batch_of_a_sweep(experiments, canary, capsys, monkey
     "override",
     [f"+hydra.callbacks.x={{a: 1}},{{{TOUCH}}}", "hydra.launcher._target_=os.system,pathlib.Path.touch"],
 )
-def test_hydras_own_settings_cannot_be_swept_over(
-    empty_folder, canary, override, capsys, monkeypatch
-) -> None:
-    said = refused(capsys, monkeypatch, "simulate", "-m", override.replace("CANARY", str(canary)))
+def test_hydras_own_settings_cannot_be_swept_over(empty_folder, canary, override, monkeypatch) -> None:
+    said = refused("simulate", "-m", override.replace("CANARY", str(canary)))
     assert "Sweeping over Hydra's configuration is not supported" in said
     assert not canary.exists()
 

@@ -8,7 +8,7 @@ from functools import cache, partial
 import numpy as np
 
 from mpm_warp import Bed, Effects, Material, Scene, Solver, Walls
-from mpm_warp.scene import MOST_COURANT
+from mpm_warp.scene import LEAST_COURANT, MOST_COURANT
 from sgns_testing.scenes import cut
 
 from .case import Case
@@ -134,7 +134,7 @@ CASES = [
         limit=0.0,
         unit="",
         measure=partial(
-            refused, lambda: cut(courant=1.05 * MOST_COURANT), f"allowed: above 0, at most {MOST_COURANT}"
+            refused, lambda: cut(courant=1.05 * MOST_COURANT), f"allowed: {LEAST_COURANT:g} to {MOST_COURANT}"
         ),
         quick=True,
     ),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import cache
 from types import SimpleNamespace
+from unittest import mock
 
 import pytest
 from hydra import compose, initialize_config_module
@@ -15,31 +17,29 @@ from sgns.simulate import command as simulate
 from sgns.simulate.campaign import plan, run_cost
 
 
-@pytest.fixture
-def planned(monkeypatch, tmp_path):
+@cache
+def planned(name, *overrides):
     """The campaign of `sgns simulate dataset=<name> <overrides>`."""
-
-    def planned(name, *overrides):
-        task = [f"dataset={name}", *overrides]
-        current = SimpleNamespace(overrides=SimpleNamespace(task=task))
-        monkeypatch.setattr(simulate.HydraConfig, "get", lambda: current)
-        with initialize_config_module("sgns.conf", version_base="1.3"):
-            cfg = compose("simulate", task)
-            settings = OmegaConf.to_container(cfg.dataset, resolve=True)
-            return plan(settings, simulate._base_scene(settings), {}, "float32", cfg.seed)
-
-    return planned
+    task = [f"dataset={name}", *overrides]
+    current = SimpleNamespace(overrides=SimpleNamespace(task=task))
+    with (
+        mock.patch.object(simulate.HydraConfig, "get", lambda: current),
+        initialize_config_module("sgns.conf", version_base="1.3"),
+    ):
+        cfg = compose("simulate", task)
+        settings = OmegaConf.to_container(cfg.dataset, resolve=True)
+        return plan(settings, simulate._base_scene(settings), {}, "float32", cfg.seed)
 
 
 @pytest.mark.parametrize("name", [name for name in options_of("dataset") if name != "published"])
-def test_every_dataset_has_valid_scenes_that_share_a_bed(planned, name):
+def test_every_dataset_has_valid_scenes_that_share_a_bed(name):
     campaign = planned(name)
     assert campaign.name == name
     assert len({scene.arrangement_hash for scene in campaign.scenes.values()}) == 1
     assert all(count > 0 for count in Counter(campaign.split.values()).values())
 
 
-def test_the_papers_excavation(planned):
+def test_the_papers_excavation():
     campaign = planned("paper_excavation")
     scenes = list(campaign.scenes.values())
     assert len({(s.motion, s.rake, s.depth, s.speed) for s in scenes}) == 250
@@ -48,7 +48,7 @@ def test_the_papers_excavation(planned):
     assert sum(run_cost(s).size for s in scenes) == pytest.approx(250 * 46e6, rel=0.01)
 
 
-def test_the_desktop_excavation_is_part_of_the_papers(planned):
+def test_the_desktop_excavation_is_part_of_the_papers():
     whole = {(s.motion, s.rake, s.depth, s.speed) for s in planned("paper_excavation").scenes.values()}
     part = {(s.motion, s.rake, s.depth, s.speed) for s in planned("desktop_excavation").scenes.values()}
     assert len(part) == 60 and part < whole
@@ -56,7 +56,7 @@ def test_the_desktop_excavation_is_part_of_the_papers(planned):
         assert min(Counter(values).values()) >= 12
 
 
-def test_the_command_line_comes_after_what_the_dataset_changes(planned):
+def test_the_command_line_comes_after_what_the_dataset_changes():
     def recorded(*overrides):
         return next(iter(planned("desktop_excavation", *overrides).scenes.values())).bed.store_every
 
@@ -65,6 +65,6 @@ def test_the_command_line_comes_after_what_the_dataset_changes(planned):
     assert recorded("dataset.change={bed.store_every: 4}") == 4
 
 
-def test_a_change_that_is_no_group_is_refused(planned):
+def test_a_change_that_is_no_group_is_refused():
     with pytest.raises(UserError, match=r"dataset\.change is 3; it must be a group"):
         planned("desktop_excavation", "dataset.change=3")

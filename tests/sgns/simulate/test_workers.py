@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 import subprocess
 import sys
@@ -19,14 +18,14 @@ from sgns.data.run import Run
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import run_cost
 from sgns.simulate.workers import simulate_campaign
+from sgns_testing.commands import environment
 from sgns_testing.tiny import campaign
 
 # Makes a campaign of four runs in the folder named on the command line.
 MAKE = """
 import sys, pathlib, logging
-sys.path[:0] = sys.argv[2:]
 from sgns_testing.tiny import campaign
-from sgns.simulate.command.workers import simulate_campaign
+from sgns.simulate.workers import simulate_campaign
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     simulate_campaign(campaign(pathlib.Path(sys.argv[1]), runs=4), device="cpu", workers=1)
@@ -208,8 +207,9 @@ def test_a_run_that_another_process_makes_is_left_to_it(tmp_path, caplog, batch)
 def test_two_processes_on_an_empty_folder_make_every_run_once(tmp_path):
     script = tmp_path / "make.py"
     script.write_text(MAKE)
-    command = [sys.executable, str(script), str(tmp_path), os.path.dirname(__file__)]
-    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    command = [sys.executable, str(script), str(tmp_path)]
+    pipes = {"stdout": subprocess.PIPE, "text": True, "env": environment()}
+    processes = [subprocess.Popen(command, **pipes) for _ in range(2)]
     said = [process.communicate(timeout=100)[0] for process in processes]
     assert [process.returncode for process in processes] == [0, 0]
     c = campaign(tmp_path, runs=4)
@@ -221,8 +221,8 @@ def test_two_processes_on_an_empty_folder_make_every_run_once(tmp_path):
 
 
 def test_two_processes_may_compile_into_an_empty_cache_at_once(tmp_path):
-    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": environment}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    pipes["env"] = environment() | {"WARP_CACHE_PATH": str(tmp_path)}
     processes = [subprocess.Popen([sys.executable, "-c", COMPILE], **pipes) for _ in range(2)]
     for process in processes:
         assert process.stdout.readline() == "ready\n"

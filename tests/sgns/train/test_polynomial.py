@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +18,7 @@ from sgns.train import command as module
 from sgns.train.callbacks import ValidationRollouts
 from sgns.train.command import train
 from sgns.train.polynomial import fit_polynomial
+from sgns_testing.commands import call
 from sgns_testing.tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset, reduced
 
 
@@ -152,21 +151,16 @@ def test_the_commands(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     dataset = ["dataset=quick", "dataset.path=data"]
 
-    def call(*arguments: str) -> tuple[int, str]:
-        command = [sys.executable, "-m", "sgns", *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
-        return done.returncode, done.stderr
-
     train_it = ["train", *dataset, "model=polynomial", "reduction.num_modes=4", "training.threads=1"]
-    assert call(*train_it, "output=out")[0] == 0
+    assert call(*train_it, "output=out").returncode == 0
     assert {path.name for path in Path("out").iterdir()} == {
         ".hydra",
         "best.ckpt",
         "tensorboard",
         "training.json",
     }
-    assert call("evaluate", *dataset, "checkpoint=out/best.ckpt", "output=report")[0] == 0
+    assert call("evaluate", *dataset, "checkpoint=out/best.ckpt", "output=report").returncode == 0
     assert Path("report/report.html").exists()
-    status, line = call(*train_it, "output=other", "preset=paper")
-    assert status == 2 and "model.body_nodes is unknown" in line
+    done = call(*train_it, "output=other", "preset=paper")
+    assert done.returncode == 2 and "model.body_nodes is unknown" in done.stderr
     assert not Path("other").exists()

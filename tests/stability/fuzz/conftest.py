@@ -26,8 +26,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a dataset of the small bed, a checkpoint, a run, a basis and everything else that is read."""
     folder = tmp_path_factory.mktemp("good")
     small_dataset(folder / "data")
-    status, said = call("train", f"dataset.path={folder / 'data'}", *TRAIN, f"output={folder / 'out'}")
-    assert status == 0, said
+    done = call("train", f"dataset.path={folder / 'data'}", *TRAIN, f"output={folder / 'out'}")
+    assert done.returncode == 0, done.stderr
     make_run(folder / "run.h5", frames=4, n=6, m=3)
     return folder
 

@@ -29,13 +29,13 @@ def test_checkpoints(good, tmp_path) -> None:
 
         main(cfg)
 
-    @cases(50)
+    @cases(15)
     @given(changed(card))
     def other_card(changed_card: Any) -> None:
         torch.save({"state_dict": state, "hyper_parameters": changed_card}, path)
         refused_or_read(play)
 
-    @cases(30)
+    @cases(8)
     @given(
         st.sampled_from(sorted(state)),
         st.sampled_from(["missing", "huge", "shape", "type", "nan", "sparse", "none"]),
@@ -56,7 +56,7 @@ def test_checkpoints(good, tmp_path) -> None:
         torch.save({"state_dict": tensors, "hyper_parameters": card}, path)
         refused_or_read(play)
 
-    @cases(30)
+    @cases(8)
     @given(damaged((good / "out" / "best.ckpt").read_bytes()))
     def damage(content: bytes) -> None:
         path.write_bytes(content)

@@ -112,7 +112,7 @@ def test_runs(good, tmp_path) -> None:
     whole, path = (good / "run.h5").read_bytes(), tmp_path / "a.h5"
     names, attributes = datasets_of(good / "run.h5")
 
-    @cases(110)
+    @cases(30)
     @given(spoiled(names, attributes))
     def check(actions: list[tuple[Any, ...]]) -> None:
         path.write_bytes(whole)
@@ -129,7 +129,7 @@ def test_runs_cut_short_or_changed(good, tmp_path) -> None:
     whole, path = (good / "run.h5").read_bytes(), tmp_path / "a.h5"
     known = as_bytes(read_run(good / "run.h5"))
 
-    @cases(60)
+    @cases(20)
     @given(damaged(whole))
     def check(content: bytes) -> None:
         path.write_bytes(content)
@@ -146,7 +146,7 @@ def test_bases(good, tmp_path) -> None:
     whole, path = basis.read_bytes(), tmp_path / "basis.h5"
     names, attributes = datasets_of(basis)
 
-    @cases(40)
+    @cases(12)
     @given(spoiled(names, attributes))
     def spoil_it(actions: list[tuple[Any, ...]]) -> None:
         path.write_bytes(whole)
@@ -154,7 +154,7 @@ def test_bases(good, tmp_path) -> None:
             spoil(file, actions)
         refused_or_read(lambda: Basis.load(path))
 
-    @cases(30)
+    @cases(10)
     @given(damaged(whole))
     def damage_it(content: bytes) -> None:
         path.write_bytes(content)
