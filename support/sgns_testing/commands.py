@@ -49,6 +49,8 @@ def call(*arguments: str) -> subprocess.CompletedProcess[str]:
     try:
         with contextlib.redirect_stdout(said[0]), contextlib.redirect_stderr(said[1]):
             status = main()
+    except SystemExit as stop:
+        status = stop.code or 0
     finally:
         sys.argv = before
         for handler in set(root.handlers) - set(handlers):  # Hydra's

@@ -16,6 +16,7 @@ from hydra import compose, initialize_config_module
 from sgns import __version__
 from sgns.cli.commands import COMMANDS
 from sgns.cli.help import groups_of, options_of
+from sgns_testing.commands import call
 from sgns_testing.tiny import make_dataset
 
 # Runs `sgns train` with a training module that only holds the given body of `main(cfg)`.
@@ -29,8 +30,8 @@ sys.exit(sgns.cli.main())
 """
 
 
-def call(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run `sgns` with the arguments."""
+def call_process(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run `sgns` with the arguments, in a process of its own."""
     return subprocess.run(
         [sys.executable, "-m", "sgns", *arguments], capture_output=True, text=True, timeout=100
     )
@@ -62,9 +63,9 @@ def test_the_console_script_runs_in_an_empty_folder(empty_folder: Path) -> None:
 
 def test_help_lists_every_command_quickly() -> None:
     start = time.perf_counter()
-    result = call("--help")
+    result = call_process("--help")
     assert time.perf_counter() - start < 5  # no torch, no warp: a fraction of a second on an idle machine
-    assert result.returncode == 0 and call().stdout == result.stdout
+    assert result.returncode == 0 and call_process().stdout == result.stdout
     for name, command in COMMANDS.items():
         assert f"  {name} " in result.stdout and command.summary in result.stdout
 
@@ -121,7 +122,7 @@ def test_every_option_of_every_group_composes(command: str) -> None:
 
 
 def test_settings_can_be_shown(empty_folder: Path) -> None:
-    result = call("train", "--cfg", "job")
+    result = call_process("train", "--cfg", "job")
     assert result.returncode == 0 and not result.stderr
     assert "num_modes:" in result.stdout and "\noutput: outputs/train/" in result.stdout
     assert not list(empty_folder.iterdir())
@@ -292,7 +293,7 @@ def test_output_is_the_run_folder(arguments: list[str], folders: list[str], empt
 
 
 def test_settings_before_and_after_flags(empty_folder: Path) -> None:
-    result = call("train", "seed=3", "--cfg", "job", "device=cuda")
+    result = call_process("train", "seed=3", "--cfg", "job", "device=cuda")
     assert result.returncode == 0, result.stderr
     assert "seed: 3" in result.stdout and "device: cuda" in result.stdout
 
@@ -302,7 +303,7 @@ def test_the_arguments_of_a_process_that_lightning_starts(empty_folder: Path) ->
     result = call_fake("import sys; print(sys.argv[1:])", "seed=3")
     assert result.stdout == "['train', 'seed=3']\n"
     added = ['hydra.run.dir="a/b"', "hydra.job.name=train_ddp_process_1", "hydra.output_subdir=null"]
-    child = call("train", "--cfg", "job", *added)
+    child = call_process("train", "--cfg", "job", *added)
     assert child.returncode == 0 and "num_modes:" in child.stdout
 
 
