@@ -184,28 +184,16 @@ def inverted() -> tuple[float, str]:
 
 CASES = [
     *(
-        Case(
-            name=f"no pressure: {law}",
-            hard="p down to 1e-30 Pa and a block that flies apart: square roots and quotients of p",
-            must="finite, shear stress within the cone, momentum conserved",
-            quantity="largest share of a bound",
-            limit=1.01,
-            unit="",
-            measure=partial(no_pressure, law),
-            quick=law == "saturating mu(I)",
-        )
+        Case(f"no pressure: {law}",
+             "p down to 1e-30 Pa and a block that flies apart: square roots and quotients of p",
+             "finite, shear stress within the cone, momentum conserved", "largest share of a bound", 1.01, "",
+             partial(no_pressure, law), quick=law == "saturating mu(I)")
         for law in LAWS
     ),
     *(
-        Case(
-            name=f"mu at mu_{'s' if friction == 'static' else '2'}{which}",
-            hard=f"the rate is zero or infinite there; xi has a pole{seed}",
-            must="mu does not jump and stays below mu_2",
-            quantity="jump of mu beyond that of the trial",
-            limit=limit,
-            unit="",
-            measure=partial(near, friction, laws),
-        )
+        Case(f"mu at mu_{'s' if friction == 'static' else '2'}{which}",
+             f"the rate is zero or infinite there; xi has a pole{seed}", "mu does not jump and stays below mu_2",
+             "jump of mu beyond that of the trial", limit, "", partial(near, friction, laws))
         for friction in ("static", "limit")
         for which, laws, limit, seed in (
             ("", ("saturating mu(I)", "steady nonlocality"), 1e-6, ""),
@@ -213,38 +201,16 @@ CASES = [
         )
     ),
     *(
-        Case(
-            name=f"grains of 1 nm, {name}",
-            hard="d -> 0: rates of 1e15 1/s in the formulas",
-            must="the force of constant friction",
-            quantity="change of the force",
-            limit=1.0,
-            unit="%",
-            measure=partial(tiny_grains, effects),
-        )
+        Case(f"grains of 1 nm, {name}", "d -> 0: rates of 1e15 1/s in the formulas", "the force of constant friction",
+             "change of the force", 1.0, "%", partial(tiny_grains, effects))
         for name, effects in (
             ("mu(I)", Effects()),
             ("dynamic fluidity", Effects(fluidity=True)),
             ("steady nonlocality", Effects(nonlocality=True)),
         )
     ),
-    Case(
-        name="grains of 10 m",
-        hard="I far beyond I_0",
-        must="no more force than with friction mu_2",
-        quantity="force beyond it",
-        limit=2.0,
-        unit="%",
-        measure=huge_grains,
-    ),
-    Case(
-        name="particles turned inside out",
-        hard="the log of a negative number",
-        must="finite, shear stress within the cone",
-        quantity="shear stress over its bound",
-        limit=1.01,
-        unit="",
-        measure=inverted,
-        quick=True,
-    ),
-]
+    Case("grains of 10 m", "I far beyond I_0", "no more force than with friction mu_2", "force beyond it", 2.0, "%",
+         huge_grains),
+    Case("particles turned inside out", "the log of a negative number", "finite, shear stress within the cone",
+         "shear stress over its bound", 1.01, "", inverted, quick=True),
+]  # fmt: skip

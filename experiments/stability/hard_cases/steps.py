@@ -114,118 +114,43 @@ def compressed_beyond_the_step() -> tuple[float, str]:
 
 CASES = [
     *(
-        Case(
-            name=f"step at {share:g} of its limit",
-            hard="a shallow limit between right and silently wrong",
-            must="the force does not depend on the step",
-            quantity="change of the force against a tenth of the limit",
-            limit=3.0,
-            unit="%",
-            measure=partial(step_error, share),
-            quick=share == 1.0,
-        )
+        Case(f"step at {share:g} of its limit", "a shallow limit between right and silently wrong",
+             "the force does not depend on the step", "change of the force against a tenth of the limit", 3.0, "%",
+             partial(step_error, share), quick=share == 1.0)
         for share in (0.2, 0.5, 0.9, 1.0)
     ),
-    Case(
-        name="step at 1.05 of its limit",
-        hard="beyond the limit forces shrink and nothing looks wrong",
-        must="refused with the allowed range",
-        quantity="scenes accepted",
-        limit=0.0,
-        unit="",
-        measure=partial(
-            refused, lambda: cut(courant=1.05 * MOST_COURANT), f"allowed: {LEAST_COURANT:g} to {MOST_COURANT}"
-        ),
-        quick=True,
-    ),
-    Case(
-        name="soil stiffens beyond its step",
-        hard="soft soil compresses under its own weight, and its waves become faster than the step allows",
-        must="stops and says so",
-        quantity="runs not stopped",
-        limit=0.0,
-        unit="",
-        measure=compressed_beyond_the_step,
-        quick=True,
-    ),
+    Case("step at 1.05 of its limit", "beyond the limit forces shrink and nothing looks wrong",
+         "refused with the allowed range", "scenes accepted", 0.0, "",
+         partial( refused, lambda: cut(courant=1.05 * MOST_COURANT), f"allowed: {LEAST_COURANT:g} to {MOST_COURANT}" ),
+         quick=True),
+    Case("soil stiffens beyond its step",
+         "soft soil compresses under its own weight, and its waves become faster than the step allows",
+         "stops and says so", "runs not stopped", 0.0, "", compressed_beyond_the_step, quick=True),
     *(
-        Case(
-            name=f"E = {modulus:.0e} Pa, column settles",
-            hard="strains from a fifth (soft) to 2e-5 (stiff): each range of the elastic update, and float32",
-            must="sinks as far as the log law says",
-            quantity="error of the sinking",
-            limit=6.0,
-            unit="%",
-            measure=partial(settling_error, modulus),
-        )
+        Case(f"E = {modulus:.0e} Pa, column settles",
+             "strains from a fifth (soft) to 2e-5 (stiff): each range of the elastic update, and float32",
+             "sinks as far as the log law says", "error of the sinking", 6.0, "%",
+             partial(settling_error, modulus))
         for modulus in (1e4, 1e5, 1e6, 1e7, 1e8)
     ),
     *(
-        Case(
-            name=f"E = {modulus:.0e} Pa, cut",
-            hard="a blade in soil far softer or stiffer than any sand",
-            must="force, speed, leakage and volume stay bounded",
-            quantity="largest share of a limit",
-            limit=1.0,
-            unit="",
-            measure=partial(soft_or_stiff_cut, modulus),
-        )
+        Case(f"E = {modulus:.0e} Pa, cut", "a blade in soil far softer or stiffer than any sand",
+             "force, speed, leakage and volume stay bounded", "largest share of a limit", 1.0, "",
+             partial(soft_or_stiff_cut, modulus))
         for modulus in (1e4, 1e8)
     ),
-    Case(
-        name="float32 against float64, force",
-        hard="static strains of 1e-4 in single precision",
-        must="the force is that of double precision",
-        quantity="difference of the mean force",
-        limit=1.0,
-        unit="%",
-        measure=partial(precision_gap, "force"),
-        quick=True,
-    ),
-    Case(
-        name="float32 against float64, positions",
-        hard="rounding at every step",
-        must="particles are where double precision has them",
-        quantity="largest difference after 0.2 s",
-        limit=0.1,
-        unit="mm",
-        measure=partial(precision_gap, "position"),
-    ),
-    Case(
-        name="bed at rest for 20 s in float32",
-        hard="velocities of rounding errors only",
-        must="soil at rest stays at rest",
-        quantity="largest displacement",
-        limit=0.2,
-        unit="mm",
-        measure=creep_in_float32,
-    ),
-    Case(
-        name="a million substeps",
-        hard="rounding and drift add up",
-        must="a bed at rest stays where it is",
-        quantity="largest displacement",
-        limit=0.2,
-        unit="mm",
-        measure=a_million_steps,
-    ),
-    Case(
-        name="same seed twice",
-        hard="a random bed",
-        must="bit-equal on the CPU",
-        quantity="numbers that differ",
-        limit=0.0,
-        unit="",
-        measure=partial(twice, Effects()),
-        quick=True,
-    ),
-    Case(
-        name="same seed twice, steady nonlocality",
-        hard="iterations that go on from the last step",
-        must="bit-equal on the CPU",
-        quantity="numbers that differ",
-        limit=0.0,
-        unit="",
-        measure=partial(twice, Effects(nonlocality=True)),
-    ),
-]
+    Case("float32 against float64, force", "static strains of 1e-4 in single precision",
+         "the force is that of double precision", "difference of the mean force", 1.0, "%",
+         partial(precision_gap, "force"), quick=True),
+    Case("float32 against float64, positions", "rounding at every step",
+         "particles are where double precision has them", "largest difference after 0.2 s", 0.1, "mm",
+         partial(precision_gap, "position")),
+    Case("bed at rest for 20 s in float32", "velocities of rounding errors only", "soil at rest stays at rest",
+         "largest displacement", 0.2, "mm", creep_in_float32),
+    Case("a million substeps", "rounding and drift add up", "a bed at rest stays where it is", "largest displacement",
+         0.2, "mm", a_million_steps),
+    Case("same seed twice", "a random bed", "bit-equal on the CPU", "numbers that differ", 0.0, "",
+         partial(twice, Effects()), quick=True),
+    Case("same seed twice, steady nonlocality", "iterations that go on from the last step", "bit-equal on the CPU",
+         "numbers that differ", 0.0, "", partial(twice, Effects(nonlocality=True))),
+]  # fmt: skip

@@ -207,16 +207,8 @@ CASES = [
         "speed, leakage and volume stay bounded, and soil comes to rest",
         jumps_between_frames,
     ),
-    Case(
-        name="tool 10 cm further within a substep",
-        hard="a jump in its path: no step is short enough",
-        must="stops and says where",
-        quantity="runs not stopped",
-        limit=0.0,
-        unit="",
-        measure=jumps_within_a_substep,
-        quick=True,
-    ),
+    Case("tool 10 cm further within a substep", "a jump in its path: no step is short enough", "stops and says where",
+         "runs not stopped", 0.0, "", jumps_within_a_substep, quick=True),
     _shares(
         "tool appears in the soil",
         "springs of the contact are pressed by centimetres",
@@ -224,15 +216,8 @@ CASES = [
         appears_in_soil,
     ),
     _shares("tool turns back at once", "friction and the trench behind it", BOUNDED, turns_back),
-    Case(
-        name="tool at rest for 60 s",
-        hard="stressed soil, held for 150 000 substeps",
-        must="soil does not creep",
-        quantity="largest displacement from 1 s on",
-        limit=1.0,
-        unit="mm",
-        measure=creep,
-    ),
+    Case("tool at rest for 60 s", "stressed soil, held for 150 000 substeps", "soil does not creep",
+         "largest displacement from 1 s on", 1.0, "mm", creep),
     _shares("tool shakes at 50 Hz", "1 mm to each side: 0.3 m/s, 16 g", BOUNDED, shakes),
     _shares(
         "tool leaves and comes back",
@@ -242,29 +227,15 @@ CASES = [
     ),
     _shares("tool spins at 3 turns per second", "edges at 1.8 m/s", "speed and leakage stay bounded", spins),
     *(
-        Case(
-            name=f"plate {cells:g} spacings thick at {speed:g} m/s",
-            hard="both sides share grid nodes",
-            must="no soil comes through",
-            quantity="leakage",
-            limit=1.0,
-            unit="%",
-            measure=partial(thin, cells, speed),
-            quick=(cells, speed) == (0.5, 1.0),
-        )
+        Case(f"plate {cells:g} spacings thick at {speed:g} m/s", "both sides share grid nodes",
+             "no soil comes through", "leakage", 1.0, "%", partial(thin, cells, speed),
+             quick=(cells, speed) == (0.5, 1.0))
         for cells, speed in ((2.0, 1.0), (0.5, 0.2), (0.5, 1.0))
     ),
     _refused("plate a tenth of a spacing thick", "soil would pass through", "refused", too_thin),
     _refused("tool through the floor", "no room for soil under it", "refused", through_the_floor),
-    Case(
-        name="mesh with flipped normals",
-        hard="inside and outside change places",
-        must="turned round: the same force",
-        quantity="change of the force",
-        limit=0.1,
-        unit="%",
-        measure=flipped_mesh,
-    ),
+    Case("mesh with flipped normals", "inside and outside change places", "turned round: the same force",
+         "change of the force", 0.1, "%", flipped_mesh),
     _refused("mesh with one flipped triangle", "no inside", "refused", one_flipped_triangle),
     _refused("mesh with a hole", "no inside", "refused", open_mesh),
-]
+]  # fmt: skip
