@@ -159,6 +159,7 @@ def main() -> int:
     parser.add_argument("commands", nargs="*", help=f"of {', '.join(COMMANDS)}; all of them by default")
     parser.add_argument("--kills", type=int, default=20, help="of each command, at least")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    parser.add_argument("--data", type=Path, help="dataset for reduce and train in place of that of simulate")
     parser.add_argument("--table", type=Path, default=Path(__file__).with_name("kills.csv"))
     asked = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
@@ -167,7 +168,7 @@ def main() -> int:
         importlib.import_module(cli.COMMANDS[command].module)
     done = {row.command: row for row in read_rows(asked.table)}
     with tempfile.TemporaryDirectory(prefix="sgns_kills_") as name:
-        bench = Bench(Path(name))
+        bench = Bench(Path(name), asked.data)
         for command in asked.commands or COMMANDS:
             if command in done and done[command].kills >= asked.kills:
                 log.info("%s: already in %s", command, asked.table)
@@ -187,8 +188,9 @@ def nothing_lost(row: Row) -> bool:
 class Bench:
     """Undisturbed results of all commands, each made when first needed, and room for disturbed ones."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, data: Path | None = None) -> None:
         self.folder = folder
+        self.data = data
         self.seconds: dict[str, float] = {}
         """Processor time of each undisturbed command [s]."""
         self.writes: dict[str, int] = {}
@@ -257,7 +259,7 @@ class Bench:
         folder.mkdir(parents=True, exist_ok=True)
         if "dataset.path={data}" not in COMMANDS[command] or command == "simulate":
             return set()
-        source, data = self.undisturbed("simulate") / "data", folder / "data"
+        source, data = self.data or self.undisturbed("simulate") / "data", folder / "data"
         if not data.exists():
             shutil.copytree(source, data)
         return {data / path.relative_to(source) for path in source.rglob("*")}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import io
 import logging
 import os
@@ -21,7 +20,7 @@ from sgns_testing.tiny import make_dataset
 
 __all__ = [
     "REDUCED", "SHORT", "SMALL", "TRAIN",
-    "become_ordinary", "call", "environment", "files", "refused", "sgns", "small_dataset",
+    "call", "environment", "files", "refused", "sgns", "small_dataset",
 ]  # fmt: skip
 
 SMALL = [
@@ -100,17 +99,3 @@ def small_dataset(folder: Path) -> None:
     with initialize_config_module("sgns.conf", version_base="1.3"):
         scene = scene_from_config(compose("simulate", SMALL))
     make_dataset(folder, n=len(scene.stored), arrangement_hash=scene.arrangement_hash, scene=scene.to_dict())
-
-
-def become_ordinary() -> None:
-    """Give up root's rights over other people's files, so that permissions count; nothing happens to other users."""
-    if not hasattr(os, "geteuid") or os.geteuid() != 0:
-        return
-    libc = ctypes.CDLL(None, use_errno=True)
-    header, data = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
-    if libc.capget(header, data) != 0:
-        raise OSError(ctypes.get_errno(), "capget")
-    for index in range(3):  # effective, permitted, inheritable
-        data[index] &= ~(1 << 1 | 1 << 2)  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH of capabilities(7)
-    if libc.capset(header, data) != 0:
-        raise OSError(ctypes.get_errno(), "capset")

@@ -10,7 +10,6 @@ import yaml
 
 from sgns.data.dataset import Dataset
 from sgns.reduction.reduce import ReducedDataset, reduce_dataset
-from sgns.simulate.campaign import Campaign, plan
 from sgns_testing.runs import make_run
 
 # Matrices this small are slower on several threads, and results must not depend on the number of cores.
@@ -23,7 +22,6 @@ __all__ = [
     "POLYNOMIAL",
     "REDUCTION",
     "TRAINING",
-    "campaign",
     "make_dataset",
     "reduced",
 ]
@@ -108,23 +106,3 @@ def make_dataset(folder: Path, frames: int = 14, **kw: Any) -> Dataset:
 def reduced(folder: Path, **kw: Any) -> ReducedDataset:
     """The tiny dataset in its basis."""
     return reduce_dataset(make_dataset(folder, **kw), REDUCTION, progress=False)
-
-
-BASE = {
-    "kind": "excavation",
-    "duration": 0.05,
-    "blade": {"length": 0.1, "width": 0.1, "thickness": 0.08},
-    "bed": {"size": [0.4, 0.2, 0.16], "spacing": 0.04},
-}
-EFFECTS = {"yielding": True, "rate_dependence": True, "separation": True}
-
-
-def campaign(folder: Path, seed: int = 0, **change: Any) -> Campaign:
-    """Ten small cuts; keyword arguments change the settings of the dataset."""
-    settings = {
-        "name": "tiny",
-        "path": folder / "tiny",
-        "draw": {"rake": [0.0, 10.0], "depth": [0.02, 0.04, 0.05], "blade.friction": [0.1, 0.3]},
-        "runs": 10,
-    }
-    return plan(settings | change, BASE, EFFECTS, "float32", seed)

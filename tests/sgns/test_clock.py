@@ -15,7 +15,7 @@ from sgns.evaluate import costs as full_space_cost
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import run_cost
 from sgns.simulate.run import simulate_scene
-from sgns_testing.tiny import campaign
+from sgns_testing.campaigns import campaign
 
 
 @pytest.fixture(params=[0.0, -7.0], ids=["still", "back"])

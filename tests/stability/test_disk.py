@@ -113,7 +113,7 @@ def test_an_error_of_the_disk_names_the_file(tmp_path) -> None:
 
 ORDINARY = """
 import sys
-from sgns_testing.commands import become_ordinary
+from sgns_testing.permissions import become_ordinary
 from sgns.cli import main
 become_ordinary()
 sys.exit(main())

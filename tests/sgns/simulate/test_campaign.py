@@ -15,7 +15,7 @@ from sgns.data.dataset import SPLITS, Dataset
 from sgns.simulate import campaign as cost
 from sgns.simulate.campaign import duration_words, finishing_time, plan, require_space, run_cost, size_words
 from sgns.simulate.run import simulate_scene
-from sgns_testing.tiny import BASE, EFFECTS, campaign
+from sgns_testing.campaigns import BASE, EFFECTS, campaign
 
 # --- What runs cost: counted, scheduled, and said in words ----------------------------------------------
 

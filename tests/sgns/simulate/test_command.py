@@ -18,8 +18,8 @@ from sgns.data.run import Run
 from sgns.simulate import command as simulate
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.run import scene_stages, simulate_scene
+from sgns_testing.campaigns import campaign
 from sgns_testing.commands import SHORT, sgns
-from sgns_testing.tiny import campaign
 
 
 def test_command_writes_a_complete_run(tmp_path):

@@ -17,7 +17,7 @@ from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import plan
 from sgns.simulate.command import simulate_campaign
 from sgns.simulate.scene import asked_effects, decided, decision_summary, scene_from_config
-from sgns_testing.tiny import campaign
+from sgns_testing.campaigns import campaign
 
 
 def chosen(*overrides: str) -> tuple[Effects, dict[str, Decision]]:

@@ -12,8 +12,8 @@ from sgns.data.run import Run
 from sgns.reduction.reduce import check_one_bed
 from sgns.rollout import require_known_bed, rollout_scene
 from sgns.simulate.run import simulate_scene
+from sgns_testing.campaigns import campaign
 from sgns_testing.surrogates import FakeSimulator, fitted
-from sgns_testing.tiny import campaign
 
 
 def longer(scene, store_every=1):

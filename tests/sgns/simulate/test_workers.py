@@ -18,13 +18,13 @@ from sgns.data.run import Run
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import run_cost
 from sgns.simulate.workers import simulate_campaign
+from sgns_testing.campaigns import campaign
 from sgns_testing.commands import environment
-from sgns_testing.tiny import campaign
 
 # Makes a campaign of four runs in the folder named on the command line.
 MAKE = """
 import sys, pathlib, logging
-from sgns_testing.tiny import campaign
+from sgns_testing.campaigns import campaign
 from sgns.simulate.workers import simulate_campaign
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
