@@ -612,81 +612,61 @@ def test_names_of_runs_do_not_leave_the_dataset(tmp_path) -> None:
 # --- everything else that is read -------------------------------------------------------------------------
 
 
-def test_numpy_archives_with_objects_are_nothing_that_is_read(tmp_path, canary) -> None:
-    np.savez(tmp_path / "a.npz", x=np.array([Touch(canary)], dtype=object))
-    content = (tmp_path / "a.npz").read_bytes()
-    for name, read in (
-        ("a.ckpt", load_surrogate),
-        ("a.h5", Run),
-        ("basis.h5", Basis.load),
-        ("a.csv", read_path),
-    ):
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(UserError):
-            read(tmp_path / name)
-    for name in ("a.stl", "a.obj"):
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(SceneError):
-            read_mesh(tmp_path / name)
-    (tmp_path / "metadata.json").write_text(json.dumps({"dataset_split": {}}))
-    (tmp_path / "valid.tfrecord").write_bytes(content)
-    with pytest.raises(UserError):
-        read_published(tmp_path)
+READERS = {
+    "a.stl": (read_mesh, SceneError, None),
+    "a.obj": (read_mesh, SceneError, None),
+    "a.csv": (read_path, UserError, "cannot read"),
+    "a.ckpt": (load_surrogate, UserError, None),
+    "a.h5": (Run, UserError, None),
+    "basis.h5": (Basis.load, UserError, None),
+    "dataset.yaml": (lambda path: Dataset.open(path.parent), UserError, None),
+    "reduced.h5": (read_reduced, (OSError, ValueError), None),  # what makes it be reduced again
+    "training.json": (
+        lambda path: network_costs(path.with_name("best.ckpt"), {}),
+        UserError,
+        r"training\.json",
+    ),
+    "tensorboard/events.out.tfevents.1.x": (lambda path: read_log(path.parent), UserError, "tfevents"),
+    "points.csv": (read_points, UserError, r"points\.csv"),
+    "observed.npz": (read_observation, UserError, "observed"),
+    "timed.json": (read_record, UserError, r"timed\.json"),
+    "points/a.json": (lambda path: Store(path.parents[1]).points(), UserError, r"a\.json"),
+    "valid.tfrecord": (lambda path: read_published(path.parent), UserError, None),
+}
+"""What is read -> how, how it is refused, and in which words."""
+
+
+def read(path: Path, name: str) -> None:
+    """Have a file refused that is not what its name says."""
+    path.with_name("metadata.json").write_text(json.dumps({"dataset_split": {}}))
+    reader, error, words = READERS[name]
+    with pytest.raises(error, match=words):
+        reader(path)
+
+
+@pytest.mark.parametrize("name", ["a.ckpt", "a.h5", "basis.h5", "a.csv", "a.stl", "a.obj", "valid.tfrecord"])
+def test_numpy_archives_with_objects_are_nothing_that_is_read(tmp_path, canary, name) -> None:
+    with (tmp_path / name).open("wb") as file:
+        np.savez(file, x=np.array([Touch(canary)], dtype=object))
+    read(tmp_path / name, name)
     assert not canary.exists()
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "too large", "folder"])
-def test_inputs_that_never_end(tmp_path, kind) -> None:
-    def place(name: str) -> Path:
-        path = tmp_path / name
-        if kind == "pipe":
-            os.mkfifo(path)
-        elif kind == "device":
-            path.symlink_to("/dev/zero")
-        elif kind == "folder":
-            path.mkdir()
-        else:
-            with path.open("wb") as file:
-                file.truncate(1 << 40)  # without a block on the disk
-        return path
-
-    for name in ("a.stl", "a.obj"):
-        with pytest.raises(SceneError):
-            read_mesh(place(name))
-    with pytest.raises(UserError, match="cannot read"):
-        read_path(place("a.csv"))
-    with pytest.raises(UserError):
-        load_surrogate(place("a.ckpt"))
-    with pytest.raises(UserError):
-        Run(place("a.h5"))
-    with pytest.raises(UserError):
-        Basis.load(place("basis.h5"))
-    place("dataset.yaml")
-    with pytest.raises(UserError):
-        Dataset.open(tmp_path)
-    with pytest.raises((OSError, ValueError)):  # what makes it be reduced again
-        read_reduced(place("reduced.h5"))
-    with pytest.raises(UserError, match=r"training\.json"):
-        place("training.json")
-        network_costs(tmp_path / "best.ckpt", {})
-    (tmp_path / "tensorboard").mkdir()
-    with pytest.raises(UserError, match="tfevents"):
-        place("tensorboard/events.out.tfevents.1.x")
-        read_log(tmp_path / "tensorboard")
-    with pytest.raises(UserError, match=r"points\.csv"):
-        read_points(place("points.csv"))
-    with pytest.raises(UserError, match="observed"):
-        read_observation(place("observed.npz"))
-    with pytest.raises(UserError, match=r"timed\.json"):
-        read_record(place("timed.json"))
-    (tmp_path / "points").mkdir()
-    with pytest.raises(UserError, match=r"a\.json"):
-        place("points/a.json")
-        Store(tmp_path).points()
-    (tmp_path / "metadata.json").write_text(json.dumps({"dataset_split": {}}))
-    place("valid.tfrecord")
-    with pytest.raises(UserError):
-        read_published(tmp_path)
+@pytest.mark.parametrize("name", READERS)
+def test_inputs_that_never_end(tmp_path, name, kind) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        with path.open("wb") as file:
+            file.truncate(1 << 40)  # without a block on the disk
+    read(path, name)
 
 
 def test_published_runs_of_nothing_but_one_byte(tmp_path) -> None:

@@ -38,6 +38,7 @@ def killed_often(table: Path, *arguments: str) -> dict[str, dict[str, str]]:
     return rows
 
 
+@pytest.mark.timeout(600)
 def test_a_killed_training_goes_on_and_ends_as_if_nothing_had_happened(tmp_path):
     make_dataset(tmp_path / "data", frames=40)
     rows = killed_often(tmp_path / "kills.csv", "--kills", "1", "--data", str(tmp_path / "data"), "train")
