@@ -114,3 +114,14 @@ def test_the_lock_file_pins_every_dependency_within_its_range(project: dict) -> 
         for pin in locked[canonicalize_name(asked.name)]:
             (exact,) = pin.specifier
             assert exact.operator == "==" and asked.specifier.contains(exact.version), pin
+
+
+def test_the_tests_that_hold_the_rules_of_safety_are_there() -> None:
+    named = set(re.findall(r"`(test_\w+)`", (ROOT / "docs/safety.md").read_text()))
+    defined = {
+        node.name
+        for path in (ROOT / "tests").rglob("test_*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef)
+    }
+    assert len(named) > 20 and named <= defined, sorted(named - defined)
