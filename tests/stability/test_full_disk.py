@@ -137,7 +137,8 @@ def test_a_full_disk(name, free, elsewhere, disk, no_estimate, empty_folder) -> 
 def test_a_run_that_would_not_fit_is_not_begun(disk, empty_folder) -> None:
     leave(disk, 24 * 4096)
     status, said = call("simulate", *SMALL, f"output={disk / 'run.h5'}")
-    assert status == 2 and said.count("\n") == 1 and "98 kB are free; free some space" in said, said
+    assert status == 2 and said.count("\n") == 1, said
+    assert "94 kB are free; free some space" in said  # the lock of the output takes a page
     assert [path.name for path in disk.iterdir()] == ["filler"]
 
 
