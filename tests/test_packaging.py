@@ -92,7 +92,9 @@ def test_only_the_whole_lightning_is_imported() -> None:
 
 
 def test_public_names_load_when_used() -> None:
-    assert sgns.UserError is not None and set(sgns.__all__) <= set(dir(sgns))
+    assert set(sgns.__all__) <= set(dir(sgns))
+    for name in sgns.__all__:
+        assert getattr(sgns, name) is not None
     with pytest.raises(AttributeError, match="public names"):
         _ = sgns.no_such_name
 
