@@ -12,7 +12,7 @@ NOT_LOCKED := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cub
 	nvidia-nvshmem-cu13 nvidia-nvtx
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo frontier test stability lint lock clean
+.PHONY: help setup demo frontier test stability lint docs lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -57,6 +57,10 @@ stability: setup ## hard cases, kills, full disks and random input (most of an h
 lint: setup ## check the code's style and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+docs: setup ## build the documentation's site in build/site
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
 
 lock: ## renew requirements.lock: the newest releases that pyproject.toml allows, with hashes, for Python 3.10 to 3.13
 	$(PYTHON) -m venv --clear build/lock

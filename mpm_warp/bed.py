@@ -229,7 +229,7 @@ class Bed:
     particles_per_cell: float = 1.0
     """Particles per grid cell of a full bed."""
     arrangement: str = "lattice"
-    """lattice | jittered | poisson (arrangement.py)."""
+    """lattice | jittered | poisson (see `arrange`)."""
     seed: int = 0
     """Of the random arrangements."""
     mirrored: bool = False

@@ -47,7 +47,7 @@ class Body(ABC):
     """What a solver asks of any body. The body frame's origin is its centre of mass."""
 
     surface: ClassVar[str]
-    """Which signed distance it has: box | cylinder | mesh (shapes.py)."""
+    """Which signed distance it has: box | cylinder | mesh (kernels/signed_distance.py)."""
     friction: float
 
     @property

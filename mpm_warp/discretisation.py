@@ -21,7 +21,7 @@ from .state import SceneError
 def lay_grid(
     scene: Scene, real: type, time_step: float, particle_volume: float, symmetric: bool
 ) -> tuple[Any, dict[int, np.ndarray]]:
-    """The grid's struct, and for each axis that has ghost layers these and their images (images.py).
+    """The grid's struct, and for each axis that has ghost layers these and their images (kernels/ghost_nodes.py).
 
     Walls fall on nodes where the bin is a whole number of cells; otherwise the grid is centred in x and y, which
     keeps the scene's mirror symmetry, and the nodes just outside the bin are the walls. With `symmetric` the grid
@@ -68,14 +68,14 @@ def lay_grid(
 
 
 def _part_in_bin(distance: float) -> float:
-    """How much of a node's spline (splines.py) lies in the bin, for a node 0 to 0.5 cells outside of it [-]."""
+    """How much of a node's spline lies in the bin, for a node 0 to 0.5 cells outside of it [-]."""
     return 0.5 - 0.75 * distance + distance**3 / 3.0
 
 
 # --- Mirror symmetry about the vertical plane at mid-width, y = Ly / 2 ----------------------------------
 # Where a scene has it, the half with y >= Ly / 2 is computed and the whole is put together from it. Ghost
 # nodes across
-# the plane are images of nodes on this side (images.py), so half and whole agree to round-off. Particles on the plane
+# the plane are images of nodes on this side, so half and whole agree to round-off. Particles on the plane
 # are their own images: they come first and count half.
 
 _SAME = 1e-6  # positions closer than this are the same [grid spacings]

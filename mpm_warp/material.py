@@ -75,7 +75,7 @@ class Material:
     friction_angle: float | None = None
     """Angle of internal friction [degrees]; None: `static_friction` holds."""
     friction_map: str = "tan"
-    """How the angle becomes mu_s: tan | sin | triaxial (friction.py)."""
+    """How the angle becomes mu_s: tan | sin | triaxial (see `static_friction`)."""
     nonlocal_amplitude: float = 0.48
     """A: reach of cooperative flow in grain diameters [-]. Used by the effect `nonlocality`."""
     fluidity_time: float = 2.0e-4

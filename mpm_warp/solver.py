@@ -192,7 +192,7 @@ class Solver:
         nodes = self._grid.nx * self._grid.ny * self._grid.nz
         self._momentum, self._velocity, self._before, self._impulse = (
             wp.zeros(nodes + 1, dtype=vec4, device=device)
-            for _ in range(4)  # + 1: see rows.py
+            for _ in range(4)  # + 1: see kernels/node_rows.py
         )
         cooperative = self.effects.nonlocality
         self._cooperation = wp.zeros(nodes + 1 if cooperative else 0, dtype=vec4, device=device)

@@ -92,7 +92,9 @@ def test_only_the_whole_lightning_is_imported() -> None:
 
 
 def test_public_names_load_when_used() -> None:
-    assert sgns.UserError is not None and set(sgns.__all__) <= set(dir(sgns))
+    assert set(sgns.__all__) <= set(dir(sgns))
+    for name in sgns.__all__:
+        assert getattr(sgns, name) is not None
     with pytest.raises(AttributeError, match="public names"):
         _ = sgns.no_such_name
 
@@ -114,3 +116,14 @@ def test_the_lock_file_pins_every_dependency_within_its_range(project: dict) -> 
         for pin in locked[canonicalize_name(asked.name)]:
             (exact,) = pin.specifier
             assert exact.operator == "==" and asked.specifier.contains(exact.version), pin
+
+
+def test_the_tests_that_hold_the_rules_of_safety_are_there() -> None:
+    named = set(re.findall(r"`(test_\w+)`", (ROOT / "docs/safety.md").read_text()))
+    defined = {
+        node.name
+        for path in (ROOT / "tests").rglob("test_*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef)
+    }
+    assert len(named) > 20 and named <= defined, sorted(named - defined)

@@ -44,7 +44,7 @@ class ContactLaw:
     bilateral: bool = False
     """Soil in contact may not leave along the normal."""
     free: bool = False
-    """The body's height is not prescribed but computed (axle.py)."""
+    """The body's height is not prescribed but computed (see `axle_step`)."""
     torque: bool = True
     """The moment of the soil's push is added up."""
 

@@ -57,7 +57,7 @@ def test_a_trial_ends_and_takes_some_time(tmp_path, odd_clock, monkeypatch):
     monkeypatch.setattr(
         campaign_runs, "_barrier", type("Barrier", (), {"wait": lambda self, timeout: None})()
     )
-    counts, seconds = campaign_runs._try([scene.to_dict()], [Effects()], "cpu", "float32")
+    counts, seconds = campaign_runs._try([(scene.to_dict(), scene.mesh)], [Effects()], "cpu", "float32")
     assert counts == [scene.frame_count - 1]
     assert seconds > 0.0
 

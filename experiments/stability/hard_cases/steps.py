@@ -8,7 +8,8 @@ from functools import cache, partial
 import numpy as np
 
 from mpm_warp import Bed, Effects, Material, Scene, Solver, Walls
-from mpm_warp.scene import LEAST_COURANT, MOST_COURANT
+from mpm_warp.ranges import LEAST_COURANT
+from mpm_warp.scene import MOST_COURANT
 from sgns_testing.scenes import cut
 
 from .case import Case

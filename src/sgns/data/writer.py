@@ -206,7 +206,7 @@ class RunWriter:
         remove_stopped(self.path)
 
     def stop(self, wall_time_s: float, reason: str, state: State | None = None) -> Path:
-        """Complete the file with the frames so far, as a stopped run beside the one it was to be (stopped.py).
+        """Complete the file with the frames so far, as a stopped run beside the one it was to be (run.py).
 
         Args:
             wall_time_s: time it took so far [s].

@@ -28,7 +28,7 @@ class Point:
     """One row of points.csv. A number that is not known, or has no meaning for this kind of point, is NaN.
 
     Errors are against the most accurate run of the study (row `reference`), pooled over the study's cases of the
-    scene (comparison.py); they are filled in when points are gathered, all other fields when a point is measured.
+    scene (observation.py); they are filled in when points are gathered, all other fields when a point is measured.
     """
 
     study: str
@@ -69,7 +69,7 @@ class Point:
     repeats: float = math.nan
     """How many repeats, or stretches of one run, the median is of."""
     workload_wall_s_per_simulated_s: float = math.nan
-    """The reference workload (timing.py), before and after, on the same core; processor time if that was shared."""
+    """The reference workload (study.py), before and after, on the same core; processor time if that was shared."""
     ratio: float = math.nan
     """`cost` / workload_wall_s_per_simulated_s."""
     includes: str = ""
