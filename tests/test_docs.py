@@ -17,12 +17,12 @@ import yaml
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from synthetic import make_run
-from tiny import MODEL, TRAINING, reduced
 
 import mpm_warp
 from sgns.cli import COMMANDS
 from sgns.train.command import train
+from sgns_testing.runs import make_run
+from sgns_testing.tiny import MODEL, TRAINING, reduced
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
