@@ -14,10 +14,10 @@ from pathlib import Path
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
+from sgns.frontier.measure import observed
 from sgns.frontier.observation import compare, errors
 from sgns.frontier.point import Point
 from sgns.frontier.study import Study, composed_scene
-from sgns.frontier.surrogate_points import observed
 from sgns.simulator import Simulator
 
 SHOWN = ("force_nrmse", "draft_mean_error", "vertical_mean_error", "position_rmse_mm", "surface_rmse_mm")

@@ -38,23 +38,14 @@ OWN = {
 
 @dataclass(frozen=True)
 class Wish:
-    """What a person needs.
+    """What a person needs."""
 
-    Attributes:
-        scene: whose points are looked at.
-        errors: column of `Point` → largest error, in the column's unit.
-        time: longest wall time of a step of `STEP` [s], or None.
-        particles: whether the positions of all particles are wanted in every step.
-        bands: column → how wrong the reference itself may be.
-        columns: key of `error` → the column it is about.
-    """
-
-    scene: str
-    errors: Mapping[str, float]
-    time: float | None
-    particles: bool
-    bands: Mapping[str, float]
-    columns: Mapping[str, str]
+    scene: str  # whose points are looked at
+    errors: Mapping[str, float]  # column of `Point` → largest error, in the column's unit
+    time: float | None  # longest wall time of a step of `STEP` [s], or None
+    particles: bool  # whether the positions of all particles are wanted in every step
+    bands: Mapping[str, float]  # column → how wrong the reference itself may be
+    columns: Mapping[str, str]  # key of `error` → the column it is about
 
     def step_time(self, point: Point) -> float:
         """Wall time of a step of a point [s]; NaN if it is not known."""

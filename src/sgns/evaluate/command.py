@@ -34,9 +34,9 @@ from sgns.evaluate.results import (
     Evaluation,
     NetworkTiming,
     aggregate,
-    overlap_warning,
     run_scores,
     seen_before,
+    seen_warning,
 )
 from sgns.evaluate.tables import write_tables
 from sgns.evaluate.words import describe, forward_name, short_names
@@ -241,7 +241,7 @@ def evaluate(
 def log_summary(evaluation: Evaluation, report: Path) -> None:
     """The main numbers on the terminal."""
     total, timing = evaluation.total, evaluation.timing
-    if warning := overlap_warning(evaluation):
+    if warning := seen_warning(evaluation):
         log.warning("%s", warning)
     log.info("%d %s runs of %s", len(evaluation.runs), evaluation.split, evaluation.dataset)
     log.info(

@@ -41,15 +41,10 @@ SPACINGS_PER_COLUMN = 2.0
 
 @dataclass(frozen=True)
 class SurfaceGrid:
-    """Columns of a height map.
+    """Columns of a height map."""
 
-    Attributes:
-        x_edges: borders of the columns along x [m], shape (nx + 1,), increasing, equally spaced.
-        y_edges: borders of the columns along y [m], shape (ny + 1,), increasing, equally spaced.
-    """
-
-    x_edges: np.ndarray
-    y_edges: np.ndarray
+    x_edges: np.ndarray  # borders of the columns along x [m], shape (nx + 1,), increasing, equally spaced
+    y_edges: np.ndarray  # borders of the columns along y [m], shape (ny + 1,), increasing, equally spaced
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -145,41 +140,25 @@ NEGLIGIBLE_SHARE = 0.05
 
 @dataclass(frozen=True)
 class ParticleErrors:
-    """Mean-square position errors of one run's particles, over axes and the frames after the history.
+    """Mean-square position errors of one run's particles, over axes and the frames after the history."""
 
-    Attributes:
-        reduction: PCA⁻¹PCA(truth) − truth [m²], shape (n,).
-        network: prediction − PCA⁻¹PCA(truth) [m²], shape (n,).
-    """
-
-    reduction: np.ndarray
-    network: np.ndarray
+    reduction: np.ndarray  # PCA⁻¹PCA(truth) − truth [m²], shape (n,)
+    network: np.ndarray  # prediction − PCA⁻¹PCA(truth) [m²], shape (n,)
 
 
 @dataclass(frozen=True)
 class PositionErrors:
-    """Mean-square position errors of one run at every frame after the history.
+    """Mean-square position errors of one run at every frame after the history."""
 
-    Attributes:
-        time: time of the frames [s], shape (t,).
-        reduction: PCA⁻¹PCA(truth) − truth [m²], shape (t,).
-        network: prediction − PCA⁻¹PCA(truth) [m²], shape (t,); the paper's figure.
-        total: prediction − truth [m²], shape (t,).
-        frozen: last frame of the history, kept − truth [m²], shape (t,).
-        constant_velocity: last step of the history, continued − truth [m²], shape (t,).
-        surface: height map of the prediction − of the truth [m²], shape (t,).
-        surface_frozen: height map of the last frame of the history − of the truth [m²], shape (t,).
-        particles: the same run, by particle instead of by frame; None if only frames were asked for.
-    """
-
-    time: np.ndarray
-    reduction: np.ndarray
-    network: np.ndarray
-    total: np.ndarray
-    frozen: np.ndarray
-    constant_velocity: np.ndarray
-    surface: np.ndarray
-    surface_frozen: np.ndarray
+    time: np.ndarray  # time of the frames [s], shape (t,)
+    reduction: np.ndarray  # PCA⁻¹PCA(truth) − truth [m²], shape (t,)
+    network: np.ndarray  # prediction − PCA⁻¹PCA(truth) [m²], shape (t,); the paper's figure
+    total: np.ndarray  # prediction − truth [m²], shape (t,)
+    frozen: np.ndarray  # last frame of the history, kept − truth [m²], shape (t,)
+    constant_velocity: np.ndarray  # last step of the history, continued − truth [m²], shape (t,)
+    surface: np.ndarray  # height map of the prediction − of the truth [m²], shape (t,)
+    surface_frozen: np.ndarray  # height map of the last frame of the history − of the truth [m²], shape (t,)
+    # the same run, by particle instead of by frame; None if only frames were asked for
     particles: ParticleErrors | None = None
 
     def mse(self, name: str) -> float:
@@ -197,15 +176,10 @@ class PositionErrors:
 
 @dataclass(frozen=True)
 class BodyErrors:
-    """How far a predicted body is from its true place, over the frames after the history.
+    """How far a predicted body is from its true place, over the frames after the history."""
 
-    Attributes:
-        mse: mean-square distance of the centres of mass [m²].
-        sinkage_mae: mean absolute error of a wheel's sinkage [m]; NaN for other bodies.
-    """
-
-    mse: float
-    sinkage_mae: float
+    mse: float  # mean-square distance of the centres of mass [m²]
+    sinkage_mae: float  # mean absolute error of a wheel's sinkage [m]; NaN for other bodies
 
 
 PRESCRIBED = BodyErrors(0.0, math.nan)
@@ -214,23 +188,14 @@ PRESCRIBED = BodyErrors(0.0, math.nan)
 
 @dataclass(frozen=True)
 class VectorErrors:
-    """Sums from which every metric of a predicted force or torque follows; sums of runs add up.
+    """Sums from which every metric of a predicted force or torque follows; sums of runs add up."""
 
-    Attributes:
-        samples: number of frames.
-        absolute: Σ |prediction − truth| per world axis, shape (3,).
-        squared: Σ (prediction − truth)², shape (3,).
-        truth_squared: Σ truth², shape (3,).
-        truth_sum: Σ truth, shape (3,).
-        prediction_sum: Σ prediction, shape (3,).
-    """
-
-    samples: int
-    absolute: np.ndarray
-    squared: np.ndarray
-    truth_squared: np.ndarray
-    truth_sum: np.ndarray
-    prediction_sum: np.ndarray
+    samples: int  # number of frames
+    absolute: np.ndarray  # Σ |prediction − truth| per world axis, shape (3,)
+    squared: np.ndarray  # Σ (prediction − truth)², shape (3,)
+    truth_squared: np.ndarray  # Σ truth², shape (3,)
+    truth_sum: np.ndarray  # Σ truth, shape (3,)
+    prediction_sum: np.ndarray  # Σ prediction, shape (3,)
 
     @classmethod
     def compare(cls, truth: np.ndarray, prediction: np.ndarray) -> VectorErrors:

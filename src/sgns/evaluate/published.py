@@ -76,7 +76,7 @@ def evaluate_published(
     total = aggregate(scores)
     log.info("%s", "\n".join(score_lines([*scores, total])))
     output.mkdir(parents=True, exist_ok=True)
-    write_csv(output / "metrics.csv", [*scores, total])
+    write_csv(output / "metrics.csv", [score.row() for score in (*scores, total)])
     write_json(
         output / "metrics.json",
         {

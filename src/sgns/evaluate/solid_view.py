@@ -12,12 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
+from scipy.spatial import ConvexHull, QhullError
 
-from sgns.evaluate.figures import DPI, NETWORK, PICTURE_WIDTH, TRUTH, new_figure, styled
+from sgns.evaluate.figures import DPI, PICTURE_WIDTH, TRUTH, new_figure, styled
 from sgns.evaluate.metrics import particle_spacing
-from sgns.evaluate.side_view import SPEED, STEEL, body_corners, nice
+from sgns.evaluate.side_view import SPEED, STEEL, body_corners, draw_force, hull, nice
 
-# --- A picture of particles and a convex body in space, drawn into a depth buffer: what is nearer hides the
+# --- Particles and a convex body in space, drawn into a depth buffer: what is nearer hides the rest -----
 # Parallel projection, so that lengths along an axis are the same everywhere in the picture.
 # Letters: n particles, k corners of the body, (h, w) rows and columns of the picture.
 
@@ -27,15 +28,10 @@ LIGHT = np.array([-0.35, 0.55, 0.76])
 
 @dataclass(frozen=True)
 class Camera:
-    """Direction of view.
+    """Direction of view."""
 
-    Attributes:
-        azimuth: of the camera about z, from +x towards +y [degrees].
-        elevation: of the camera above the horizon [degrees].
-    """
-
-    azimuth: float = -60.0
-    elevation: float = 28.0
+    azimuth: float = -60.0  # of the camera about z, from +x towards +y [degrees]
+    elevation: float = 28.0  # of the camera above the horizon [degrees]
 
     @property
     def axes(self) -> np.ndarray:
@@ -153,36 +149,20 @@ def brightness(normal: np.ndarray) -> float:
 
 
 def hull_triangles(points: np.ndarray) -> np.ndarray:
-    """Triangles that make up the convex hull of a few points (k, 3), shape (t, 3, 3).
+    """Triangles that make up the convex hull of points (k, 3), shape (t, 3, 3).
 
-    A plane through three points is a face if all others lie on one side of it; a face is drawn as a fan about
-    one of its corners.
+    Of points in a plane they make up one face, of points on a line there are none.
     """
-    triples = np.array(list(itertools.combinations(range(len(points)), 3))).reshape(-1, 3)
-    a, b, c = (points[triples[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1)
-    size = float(np.ptp(points, axis=0).max(initial=0.0))
-    proper = lengths > 1e-6 * size**2
-    normals = normals[proper] / lengths[proper, None]
-    heights = np.einsum("tkj,tj->tk", points[None] - a[proper, None], normals)
-    near = 1e-6 * size
-    is_face = (heights <= near).all(axis=1) | (heights >= -near).all(axis=1)
-    corners, first = np.unique(np.abs(heights[is_face]) <= near, axis=0, return_index=True)
-    fans = [fan(points[on], normal) for on, normal in zip(corners, normals[is_face][first], strict=True)]
-    return np.concatenate(fans) if fans else np.empty((0, 3, 3))
+    try:
+        return points[ConvexHull(points).simplices]
+    except QhullError:
+        middle = points.mean(axis=0)
+        plane = np.linalg.svd(points - middle, full_matrices=False)[2][:2]
+        ring = middle + hull((points - middle) @ plane.T) @ plane
+        return np.stack([np.broadcast_to(ring[0], ring[2:].shape), ring[1:-1], ring[2:]], axis=1)
 
 
-def fan(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Triangles (t, 3, 3) of a flat convex face with corners (c, 3) in any order."""
-    spokes = corners - corners.mean(axis=0)
-    right = spokes[np.argmax(np.linalg.norm(spokes, axis=1))]
-    order = np.argsort(np.arctan2(spokes @ np.cross(normal, right), spokes @ right))
-    ring = corners[order]
-    return np.stack([np.broadcast_to(ring[0], ring[2:].shape), ring[1:-1], ring[2:]], axis=1)
-
-
-# --- The whole bed in three dimensions with its tool: the simulated one, the predicted one and their differ
+# --- The whole bed with its tool: simulated, predicted, and their difference ---------------------------
 
 # No error looks like the paper; the larger, the darker.
 ERROR = LinearSegmentedColormap.from_list("error", ["#f2f2ee", "#9cc3dd", "#3d7fb1", "#22356f", "#0c0c26"])
@@ -194,19 +174,12 @@ TOOL_ABOVE = 0.22
 
 @dataclass(frozen=True)
 class Colouring:
-    """What colours the particles, and how.
+    """What colours the particles, and how."""
 
-    Attributes:
-        label: of the colour bar.
-        values: shape (n,).
-        scale: range of the colours.
-        colours: from low to high.
-    """
-
-    label: str
-    values: np.ndarray
-    scale: Normalize
-    colours: LinearSegmentedColormap
+    label: str  # of the colour bar
+    values: np.ndarray  # shape (n,)
+    scale: Normalize  # range of the colours
+    colours: LinearSegmentedColormap  # from low to high
 
 
 def solid_views(truth: Any, prediction: Any, frame: int, start: np.ndarray) -> Mapping[str, Figure]:
@@ -289,7 +262,11 @@ def solid_figure(
     axis.set_axis_off()
     axis.set_title(title)
     draw_directions(axis, camera, left_bottom, right_top)
-    draw_force(axis, camera, run, frame, strongest, right_top[0] - left_bottom[0])
+    if strongest > 0.0:
+        scale = ARROW_SHARE * (right_top[0] - left_bottom[0]) / strongest
+        foot = camera.project(run.pose[frame, :3])[:2]
+        tip = foot + camera.project(run.force[frame])[:2] * scale
+        draw_force(axis, run, run.force[frame], foot, tip, clip=False)
     bar = figure.colorbar(
         ScalarMappable(colouring.scale, colouring.colours),
         ax=axis,
@@ -318,20 +295,4 @@ def draw_directions(axis: Axes, camera: Camera, low: np.ndarray, high: np.ndarra
         fontsize=8,
         ha="center",
         va="top",
-    )
-
-
-def draw_force(axis: Axes, camera: Camera, run: Any, frame: int, strongest: float, width: float) -> None:
-    """The force on the body as an arrow from its centre of mass, and its size."""
-    force = np.asarray(run.force[frame])
-    size = float(np.linalg.norm(force))
-    colour = TRUTH if run.producer == "mpm" else NETWORK
-    if not 0.0 < size < np.inf:
-        return
-    foot = camera.project(run.pose[frame, :3])[:2]
-    tip = foot + camera.project(force)[:2] * ARROW_SHARE * width / strongest
-    arrow = {"arrowstyle": "-|>", "color": colour, "linewidth": 2.0, "shrinkA": 0.0, "shrinkB": 0.0}
-    axis.annotate("", xy=tip, xytext=foot, arrowprops=arrow, annotation_clip=False)
-    axis.text(
-        0.99, 0.97, f"{size:.0f} N", color=colour, fontsize=9, ha="right", va="top", transform=axis.transAxes
     )

@@ -6,6 +6,8 @@ import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from functools import reduce
+from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +18,9 @@ from sgns.arrays import require_shapes
 from sgns.config import UserError
 from sgns.data.files import whole_file
 from sgns.data.small_files import read_arrays
-from sgns.evaluate.metrics import SurfaceGrid, VectorErrors, height_map
+from sgns.evaluate.metrics import SurfaceGrid, VectorErrors, height_error, height_map
 
-# --- What is kept of a run so that it can be compared with runs of the same scene on other beds of particle
+# --- What is kept of a run ------------------------------------------------------------------------------
 # Forces, torques and poses are kept in every frame. The soil is kept a few times a second, in two forms that do not
 # depend on which particles stand for it:
 #
@@ -44,25 +46,16 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
 
 @dataclass(frozen=True)
 class Observation:
-    """One run, whoever made it.
+    """One run, whoever made it."""
 
-    Attributes:
-        time: of the frames [s], shape (T,).
-        force: by the soil on the body [N], shape (T, 3); frame 0 is at rest.
-        torque: about its centre of mass [N m], shape (T, 3).
-        pose: of the body, shape (T, 7).
-        soil_time: when the soil was observed [s], shape (K,).
-        moved: displacement of the soil around the lattice points since the start [m], shape (K, P, 3), float32.
-        surface: height of the columns [m], shape (K, nx, ny); NaN where a column is empty.
-    """
-
-    time: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
-    pose: np.ndarray
-    soil_time: np.ndarray
+    time: np.ndarray  # of the frames [s], shape (T,)
+    force: np.ndarray  # by the soil on the body [N], shape (T, 3); frame 0 is at rest
+    torque: np.ndarray  # about its centre of mass [N m], shape (T, 3)
+    pose: np.ndarray  # of the body, shape (T, 7)
+    soil_time: np.ndarray  # when the soil was observed [s], shape (K,)
+    # displacement of the soil around the lattice points since the start [m], shape (K, P, 3), float32
     moved: np.ndarray
-    surface: np.ndarray
+    surface: np.ndarray  # height of the columns [m], shape (K, nx, ny); NaN where a column is empty
 
     def save(self, file: Path) -> None:
         """Write it, complete or not at all."""
@@ -196,37 +189,27 @@ def observe_arrays(
     return observer.finish()
 
 
-# --- How far observed runs are from reference runs of the same scenes, on whatever particles either was mad
-# Definitions are those of docs/conventions.md where it has them. Frame 0, at rest, does not count. Forces,
-# torques and
-# poses of a run with another frame rate are interpolated in time at the reference's frames, its soil at the times
-# at which the reference's soil was observed.
-
-QUARTERS = (1, 2, 3, 4)
+# --- How far observed runs are from reference runs of the same scenes, on whatever particles --------------
+# Definitions are those of docs/conventions.md where it has them. Frame 0, at rest, does not count. Forces, torques and
+# poses of a run with another frame rate are interpolated in time at the reference's frames, its soil at the times at
+# which the reference's soil was observed.
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One run beside its reference.
+    """One run beside its reference."""
 
-    Attributes:
-        force: by quarter of the run, four `VectorErrors` [N].
-        torque: of the whole run [N m].
-        position: mean-square difference of displacement at every observed time but the first [m²], shape (K - 1,).
-        surface: mean-square difference of the last surface [m²].
-        sinkage: mean absolute difference of the body's height [m].
-    """
-
-    force: tuple[VectorErrors, ...]
-    torque: VectorErrors
+    force: tuple[VectorErrors, ...]  # by quarter of the run, four `VectorErrors` [N]
+    torque: VectorErrors  # of the whole run [N m]
+    # mean-square difference of displacement at every observed time but the first [m²], shape (K - 1,)
     position: np.ndarray
-    surface: float
-    sinkage: float
+    surface: float  # mean-square difference of the last surface [m²]
+    sinkage: float  # mean absolute difference of the body's height [m]
 
     @property
     def whole_force(self) -> VectorErrors:
         """Of all quarters."""
-        return sum(self.force[1:], start=self.force[0])
+        return reduce(add, self.force)
 
     def position_at(self, quarter: int) -> float:
         """Mean-square difference of displacement at the end of a quarter of the run, 1 to 4 [m²]."""
@@ -257,7 +240,7 @@ def compare(run: Observation, reference: Observation) -> Comparison:
         force=tuple(VectorErrors.compare(reference.force[1:][part], force[part]) for part in quarters),
         torque=VectorErrors.compare(reference.torque[1:], torque),
         position=mean_squares(run, reference),
-        surface=height_difference(run.surface[-1], reference.surface[-1]),
+        surface=height_error(run.surface[-1], reference.surface[-1]),
         sinkage=float(np.abs(heights - reference.pose[1:, 2]).mean()),
     )
 
@@ -285,12 +268,6 @@ def mean_squares(run: Observation, reference: Observation) -> np.ndarray:
     return (difference**2).mean(axis=1)
 
 
-def height_difference(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean-square difference of two height maps [m²] over the columns that both fill."""
-    both = np.isfinite(a) & np.isfinite(b)
-    return float(np.mean((a[both] - b[both]) ** 2)) if both.any() else math.nan
-
-
 def errors(comparisons: Sequence[Comparison], *, free_body: bool = False) -> dict[str, float]:
     """Errors of a point over its cases, by the names of the columns of `Point`.
 
@@ -300,11 +277,8 @@ def errors(comparisons: Sequence[Comparison], *, free_body: bool = False) -> dic
         comparisons: of each case.
         free_body: whether the body's height is part of the answer.
     """
-    force = sum((c.whole_force for c in comparisons[1:]), start=comparisons[0].whole_force)
-    torque = sum((c.torque for c in comparisons[1:]), start=comparisons[0].torque)
-    quarters = [
-        sum((c.force[q - 1] for c in comparisons[1:]), start=comparisons[0].force[q - 1]) for q in QUARTERS
-    ]
+    force = reduce(add, (c.whole_force for c in comparisons))
+    torque = reduce(add, (c.torque for c in comparisons))
     found = {
         "force_nrmse": force.overall_nrmse,
         "draft_nrmse": float(force.nrmse[0]),
@@ -316,8 +290,9 @@ def errors(comparisons: Sequence[Comparison], *, free_body: bool = False) -> dic
         "surface_rmse_mm": _root_mm([c.surface for c in comparisons]),
         "sinkage_error_mm": 1e3 * float(np.mean([c.sinkage for c in comparisons])) if free_body else math.nan,
     }
-    found |= {f"force_nrmse_q{q}": quarters[q - 1].overall_nrmse for q in QUARTERS}
-    found |= {f"position_rmse_mm_q{q}": _root_mm([c.position_at(q) for c in comparisons]) for q in QUARTERS}
+    for q in range(1, 5):
+        found[f"force_nrmse_q{q}"] = reduce(add, (c.force[q - 1] for c in comparisons)).overall_nrmse
+        found[f"position_rmse_mm_q{q}"] = _root_mm([c.position_at(q) for c in comparisons])
     for name, values in (
         ("force_nrmse", [c.whole_force.overall_nrmse for c in comparisons]),
         ("position_rmse_mm", [_root_mm([c.position.mean()]) for c in comparisons]),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import logging
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -14,13 +13,15 @@ from sgns.config import UserError
 from sgns.data.files import whole_file
 from sgns.data.small_files import read_table
 
-log = logging.getLogger(__name__)
-
-
-# --- One operating point: a way to get the motion of the soil, what it costs and how wrong it is. One row o
-
 SHARED = 1.1  # wall time over processor time from which a core counts as shared
 KINDS = ("solver", "reduction", "surrogate", "full space")
+ERRORS = {
+    "force_nrmse": "force, NRMSE [-]",
+    "position_rmse_mm": "displacement of the soil, RMSE [mm]",
+    "surface_rmse_mm": "surface at the end, RMSE [mm]",
+    "sinkage_error_mm": "sinkage, mean absolute error [mm]",
+}
+"""Column → what it is, of the errors that points are compared by."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Point:
     """One row of points.csv. A number that is not known, or has no meaning for this kind of point, is NaN.
 
     Errors are against the most accurate run of the study (row `reference`), pooled over the study's cases of the
-    scene (comparison.py); they are filled in when points are gathered, all other fields when a point is measured.
+    scene (observation.py); they are filled in when points are gathered, all other fields when a point is measured.
     """
 
     study: str
@@ -69,7 +70,7 @@ class Point:
     repeats: float = math.nan
     """How many repeats, or stretches of one run, the median is of."""
     workload_wall_s_per_simulated_s: float = math.nan
-    """The reference workload (timing.py), before and after, on the same core; processor time if that was shared."""
+    """The reference workload (study.py), before and after, on the same core; processor time if that was shared."""
     ratio: float = math.nan
     """`cost` / workload_wall_s_per_simulated_s."""
     includes: str = ""
@@ -160,7 +161,10 @@ class Point:
 
     def row(self) -> dict[str, Any]:
         """Plain values by column, numbers to five digits, empty where not known."""
-        return {key: _written(value) for key, value in asdict(self).items()}
+        return {
+            key: value if not isinstance(value, float) else "" if math.isnan(value) else f"{value:.5g}"
+            for key, value in asdict(self).items()
+        }
 
     @classmethod
     def from_row(cls, row: dict[str, Any]) -> Point:
@@ -175,7 +179,7 @@ class Point:
             if given is None or given == "":
                 continue
             try:
-                values[field.name] = value = _KINDS_OF_VALUE[str(field.type)](given)
+                values[field.name] = value = _READERS[str(field.type)](given)
                 if isinstance(value, float) and (
                     math.isinf(value) or (field.name in _ABOVE_ZERO and value <= 0.0)
                 ):
@@ -195,13 +199,7 @@ _ABOVE_ZERO = (
     "decoded_wall_s_per_simulated_s",
 )
 """Columns that others are divided by."""
-_KINDS_OF_VALUE = {"str": str, "float": float, "bool": lambda v: {"True": True, "False": False}[str(v)]}
-
-
-def _written(value: Any) -> Any:
-    if isinstance(value, float):
-        return "" if math.isnan(value) else f"{value:.5g}"
-    return value
+_READERS = {"str": str, "float": float, "bool": lambda v: {"True": True, "False": False}[str(v)]}
 
 
 def write_points(file: Path, points: Iterable[Point]) -> None:
@@ -226,7 +224,7 @@ def read_points(file: Path) -> list[Point]:
         raise UserError(f"{file} is no table of operating points: {error}") from None
 
 
-# --- Errors of the points that are there, and which of them nobody beats --------------------------------
+# --- Which points nobody beats --------------------------------------------------------------------------
 
 
 def usable(point: Point) -> bool:
@@ -236,10 +234,10 @@ def usable(point: Point) -> bool:
 
 def effective_error(point: Point, column: str, bands: Mapping[str, float]) -> float:
     """An error, but never less than what the reference itself may be wrong by; NaN if it is not known."""
-    band = bands.get(column, 0.0)
     if point.axis == "reference":
-        return band if column in bands else math.nan
-    return max(getattr(point, column), band) if not math.isnan(getattr(point, column)) else math.nan
+        return bands.get(column, math.nan)
+    error = getattr(point, column)
+    return error if math.isnan(error) else max(error, bands.get(column, 0.0))
 
 
 def front(points: Iterable[Point], column: str, bands: Mapping[str, float]) -> list[Point]:

@@ -9,7 +9,7 @@ import shlex
 import statistics
 import subprocess
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -20,6 +20,7 @@ import torch
 import yaml
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig
 
 from mpm_warp import Frame, Scene, Solver, effects_for
 from sgns import __version__
@@ -29,15 +30,13 @@ from sgns.data.files import write_whole
 from sgns.data.small_files import read_json, read_text
 from sgns.evaluate.costs import command_line, cpu_model
 from sgns.frontier.observation import Observation, read_observation
-from sgns.frontier.point import SHARED, Point
+from sgns.frontier.point import ERRORS, SHARED, Point
 from sgns.simulate.scene import scene_from_config
 
 # --- Wall times that can be compared: one core, warm, medians, beside a workload that is always the same
-# The reference workload is the default scene of `sgns simulate` (the paper's bin at 20 mm, 4 particles per
-# cell, half of
-# it computed) while the plate cuts. Its time is taken just before and just after what is measured, on the
-# same core, so
-# that ratios to it hold on a machine whose speed changes.
+# The reference workload is the default scene of `sgns simulate` (the paper's bin at 20 mm, 4 particles per cell, half
+# of it computed) while the plate cuts. Its time is taken just before and just after what is measured, on the same
+# core, so that ratios to it hold on a machine whose speed changes.
 
 FRAMES = 8  # of one measurement of the workload
 STRETCHES = 2  # of which the median is taken, before and after each
@@ -59,13 +58,23 @@ def one_core(last: bool = False) -> Iterator[None]:
             os.sched_setaffinity(0, cores)
 
 
-def composed_scene(overrides: Sequence[str]) -> tuple[Scene, Any]:
-    """The scene and all settings of `sgns simulate` with these overrides."""
+def stopwatch() -> Callable[[], tuple[float, float]]:
+    """A function that tells the wall and the processor time since now [s]."""
+    began, clock = time.perf_counter(), time.process_time()
+    return lambda: (elapsed(began, time.perf_counter()), elapsed(clock, time.process_time()))
+
+
+def composed(command: str, overrides: Sequence[str]) -> DictConfig:
+    """All settings of a command with these overrides."""
     if GlobalHydra.instance().is_initialized():
-        cfg = compose("simulate", list(overrides))
-    else:
-        with initialize_config_module("sgns.conf", version_base="1.3"):
-            cfg = compose("simulate", list(overrides))
+        return compose(command, list(overrides))
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        return compose(command, list(overrides))
+
+
+def composed_scene(overrides: Sequence[str]) -> tuple[Scene, DictConfig]:
+    """The scene and all settings of `sgns simulate` with these overrides."""
+    cfg = composed("simulate", overrides)
     return scene_from_config(cfg), cfg
 
 
@@ -73,8 +82,11 @@ class Workload:
     """The reference workload, warm."""
 
     def __init__(self) -> None:
-        self._scene, _ = composed_scene(["scene=excavation"])
         self._frames: Iterator[Frame] = iter(())
+
+    @cached_property
+    def _scene(self) -> Scene:
+        return composed_scene(["scene=excavation"])[0]
 
     def measure(self) -> list[float]:
         """Wall seconds per simulated second of each of a few stretches; processor seconds where the core was shared."""
@@ -84,10 +96,10 @@ class Workload:
                 self._frames = Solver(self._scene, effects_for(self._scene)[0]).frames()
                 for _ in range(2):  # the first frame loads kernels, the second is the first that computes
                     next(self._frames)
-            began, processor = time.perf_counter(), time.process_time()
+            watch = stopwatch()
             done = sum(1 for _ in zip(range(FRAMES), self._frames, strict=False))
             if done == FRAMES:
-                wall, processor = elapsed(began, time.perf_counter()), elapsed(processor, time.process_time())
+                wall, processor = watch()
                 seconds = processor if wall > SHARED * processor else wall
                 found.append(seconds * self._scene.frame_rate / FRAMES)
         return found or self.measure()
@@ -133,17 +145,11 @@ def made_here() -> dict[str, str]:
 @cache
 def commit() -> str:
     """Short name of the commit this package runs from; empty if it is no checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     try:
-        asked = subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=10,
-        )
-    except (OSError, subprocess.TimeoutExpired):
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
         return ""
-    return asked.stdout.strip() if asked.returncode == 0 else ""
 
 
 # --- Points in a folder, one file each, so that a study goes on where it stopped ------------------------
@@ -213,7 +219,6 @@ def name_of(scene: str, kind: str, label: str) -> str:
 
 AXES = ("solver", "reduction", "surrogate")
 """Groups of points that one command, or one process of several, measures."""
-BANDS = ("force_nrmse", "position_rmse_mm", "surface_rmse_mm", "sinkage_error_mm")
 
 
 @dataclass(frozen=True)
@@ -317,9 +322,9 @@ class Study:
             for key in ("scene", "dataset", "cases", "reference"):
                 if not isinstance(scene, Mapping) or not scene.get(key):
                     raise UserError(f"study.scenes.{name}.{key} is missing; see conf/study/quick.yaml")
-            if wrong := set(scene.get("bands") or ()) - set(BANDS):
+            if wrong := set(scene.get("bands") or ()) - set(ERRORS):
                 raise UserError(
-                    f"study.scenes.{name}.bands has no key {min(wrong)!r}; allowed: {', '.join(BANDS)}"
+                    f"study.scenes.{name}.bands has no key {min(wrong)!r}; allowed: {', '.join(ERRORS)}"
                 )
         return cls(str(settings["name"]), tuple(StudyScene(n, s) for n, s in scenes.items()), folder)
 

@@ -4,7 +4,7 @@ from pictures import pixels
 from synthetic import make_run
 
 from sgns.data.run import Run
-from sgns.evaluate.histories import (
+from sgns.evaluate.figures import (
     Curve,
     Panel,
     error_panels,

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from sgns.cli.help import options_of
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
-from sgns.frontier import solver_points
+from sgns.frontier import measure
 from sgns.frontier import study as timing
 from sgns.frontier.command import axes_of, main
 from sgns.frontier.point import read_points
@@ -77,7 +77,7 @@ def test_what_is_there_is_not_measured_again(folder: Path, monkeypatch: pytest.M
     def refuse(*_: object) -> None:
         raise AssertionError("measured again")
 
-    monkeypatch.setattr(solver_points, "measured", refuse)
+    monkeypatch.setattr(measure, "solver_point", refuse)
     before = (folder / "points.csv").read_bytes()
     main(settings(folder))
     assert (folder / "points.csv").read_bytes() == before

@@ -16,10 +16,8 @@ from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.data.writer import RunWriter
 from sgns.evaluate.command import evaluate
-from sgns.frontier import surrogate_points
-from sgns.frontier import surrogate_points as timed_training
-from sgns.frontier.study import Study, composed_scene
-from sgns.frontier.surrogate_points import (
+from sgns.frontier import measure
+from sgns.frontier.measure import (
     EveryNthFrame,
     TrainingPlan,
     every_nth_frame,
@@ -33,6 +31,7 @@ from sgns.frontier.surrogate_points import (
     training_settings,
     with_training_runs,
 )
+from sgns.frontier.study import Study, composed_scene
 from sgns.model.checkpoint import read_checkpoint
 from sgns.model.settings import ModelSettings
 
@@ -102,7 +101,7 @@ NETWORK = {"model": MODEL, "training": TRAINING, **NAMES}
 
 @pytest.fixture
 def data(tmp_path, monkeypatch):
-    monkeypatch.setattr(surrogate_points, "seconds_per_step", lambda *_: 0.01)
+    monkeypatch.setattr(measure, "seconds_per_step", lambda *_: 0.01)
     return reduced(tmp_path / "data")
 
 
@@ -137,7 +136,7 @@ def test_what_is_complete_is_taken_and_what_is_not_is_begun_anew(data, tmp_path)
 
 
 def test_other_settings_have_another_folder(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(surrogate_points, "train", lambda *_, output, **__: output.mkdir(parents=True))
+    monkeypatch.setattr(measure, "train", lambda *_, output, **__: output.mkdir(parents=True))
     wider = NETWORK | {"model": MODEL | {"hidden_width": 8}}
     done = {
         train_for(seconds, data, settings, tmp_path / "kept", seed).checkpoint
@@ -168,7 +167,7 @@ def test_a_step_with_more_windows_takes_longer(tmp_path):
 
 
 def test_a_clock_that_stands_still_gives_no_number_of_steps(tmp_path, monkeypatch):
-    monkeypatch.setattr(timed_training.time, "process_time", lambda: 1.0)
+    monkeypatch.setattr(measure.time, "process_time", lambda: 1.0)
     with pytest.raises(UserError, match="the processor's clock stands still"):
         train_for(0.2, reduced(tmp_path / "data"), NETWORK, tmp_path / "kept")
 
@@ -354,9 +353,9 @@ def tiny(data_of_surrogate_points, monkeypatch):
         "preset": {"name": "tiny"},
         "dataset": {"name": "tiny", "path": str(data_of_surrogate_points)},
     }
-    monkeypatch.setattr(surrogate_points, "Workload", NoWorkload)
-    monkeypatch.setattr(surrogate_points, "seconds_per_step", lambda *_: 0.01)
-    monkeypatch.setattr(surrogate_points, "training_settings", lambda *_: settings)
+    monkeypatch.setattr(measure, "Workload", NoWorkload)
+    monkeypatch.setattr(measure, "seconds_per_step", lambda *_: 0.01)
+    monkeypatch.setattr(measure, "training_settings", lambda *_: settings)
 
 
 @pytest.mark.usefixtures("tiny")
@@ -390,7 +389,7 @@ def test_points_from_training_to_observation(tmp_path):
 
 @pytest.mark.usefixtures("tiny")
 def test_a_rollout_that_leaves_the_numbers_is_said_and_not_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(surrogate_points, "finite_frames", lambda _: 7)
+    monkeypatch.setattr(measure, "finite_frames", lambda _: 7)
     asked = study(tmp_path, {"axis": "preset", "label": "whole"}, training={"seconds": 0.1})
     measure_surrogates(asked)
     [(point, cases)] = asked.store.points()

@@ -7,8 +7,8 @@ from tiny import make_dataset
 
 from sgns.config import UserError
 from sgns.data.run import Run
-from sgns.frontier import solver_points as reduction_points
-from sgns.frontier.solver_points import measure_reduction, wanted_of
+from sgns.frontier import measure
+from sgns.frontier.measure import measure_reduction, reduction_points
 from sgns.frontier.study import Study
 from sgns.reduction.pca import IncrementalPCA
 from sgns.reduction.reduce import fit_runs
@@ -28,10 +28,8 @@ class NoWorkload:
 @pytest.fixture
 def measured(tmp_path, monkeypatch):
     make_dataset(tmp_path / "data")
-    monkeypatch.setattr(reduction_points, "Workload", NoWorkload)
-    monkeypatch.setattr(
-        reduction_points, "training_settings", lambda *_: {"dataset": {"path": tmp_path / "data"}}
-    )
+    monkeypatch.setattr(measure, "Workload", NoWorkload)
+    monkeypatch.setattr(measure, "training_settings", lambda *_: {"dataset": {"path": tmp_path / "data"}})
     asked = study(
         tmp_path / "out",
         {"centring": "particle_axis", "modes": [1, 2, 4, 500]},
@@ -56,7 +54,7 @@ def test_a_point_for_each_number_of_modes_that_there_is(measured):
 
 def test_what_is_there_is_not_measured_again(measured, monkeypatch):
     asked, _ = measured
-    monkeypatch.setattr(reduction_points, "fit_runs", lambda *_: pytest.fail("fitted again"))
+    monkeypatch.setattr(measure, "fit_runs", lambda *_: pytest.fail("fitted again"))
     for name in ("particle_axis, r 500",):  # cannot be had, so it is asked for each time
         assert not asked.store.has("cut", "reduction", name)
     measure_reduction(study(asked.folder, {"centring": "particle_axis", "modes": [1, 2, 4]}))
@@ -72,7 +70,7 @@ def test_what_is_there_is_not_measured_again(measured, monkeypatch):
 )
 def test_bad_entries_are_one_line(tmp_path, entry, line):
     with pytest.raises(UserError, match=line):
-        list(wanted_of(study(tmp_path, entry).scenes[0]))
+        list(reduction_points(study(tmp_path, entry).scenes[0]))
 
 
 def test_one_stream_is_the_same_as_by_hand(tmp_path):
