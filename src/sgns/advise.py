@@ -18,9 +18,7 @@ from sgns.frontier.point import Point, effective_error, read_points, usable
 
 log = logging.getLogger(__name__)
 
-
-STEP = 1.0 / 60.0
-"""Simulated time of one step: what `time` is the wall time of [s]."""
+STEP = 1.0 / 60.0  # simulated time of one step: what `time` is the wall time of [s]
 # Key of `error` → column, what one of its units is of the key's, and words. Lengths are metres in settings.
 ERRORS = {
     "force": ("force_nrmse", 1.0, "force NRMSE", ""),
@@ -28,12 +26,7 @@ ERRORS = {
     "surface": ("surface_rmse_mm", 1e3, "surface at the end", " mm"),
     "sinkage": ("sinkage_error_mm", 1e3, "sinkage", " mm"),
 }
-OWN = {
-    "force": "own_force_nrmse",
-    "position": "own_position_rmse_mm",
-    "surface": "own_surface_rmse_mm",
-    "sinkage": "own_sinkage_error_mm",
-}
+OWN = {key: f"own_{column}" for key, (column, *_) in ERRORS.items()}
 
 
 @dataclass(frozen=True)

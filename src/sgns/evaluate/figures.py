@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -61,19 +60,8 @@ STYLE: dict[str, Any] = {
     "lines.linewidth": 1.6,
     "text.parse_math": False,  # names of runs may hold anything
 }
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def styled(draw: Callable[P, R]) -> Callable[P, R]:
-    """Draws in the project's style and leaves matplotlib's settings as they were."""
-
-    @functools.wraps(draw)
-    def inside(*args: P.args, **kwargs: P.kwargs) -> R:
-        with matplotlib.rc_context(STYLE):
-            return draw(*args, **kwargs)
-
-    return inside
+styled = matplotlib.rc_context(STYLE)
+"""Draws in the project's style and leaves matplotlib's settings as they were."""
 
 
 def new_figure(width: float, height: float, layout: str = "constrained", dpi: int = DPI) -> Figure:
@@ -96,12 +84,9 @@ def png(figure: Figure) -> bytes:
 
 @styled
 def profile_figure(runs: Mapping[str, Any], frames: Sequence[int], grid: SurfaceGrid) -> Figure:
-    """Height of the surface along the middle of the bed, at some frames.
+    """Height of the surface along the middle of the bed, a panel for each of some frames.
 
-    Args:
-        runs: `Run`s by name; `truth` is drawn black, `network` blue.
-        frames: one panel each.
-        grid: columns of the height map; the two rows of columns next to mid-width are averaged.
+    The two rows of columns next to mid-width are averaged.
     """
     figure = new_figure(PICTURE_WIDTH, 1.45 * len(frames) + 0.8)
     axes = figure.subplots(len(frames), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
@@ -140,12 +125,8 @@ def middle_line(run: Any, frame: int, grid: SurfaceGrid, middle: slice) -> np.nd
 
 @styled
 def energy_figure(energy: np.ndarray, displacement_energy: np.ndarray, num_modes: int) -> Figure:
-    """What the modes do not hold of the training data's variance.
-
-    Args:
-        energy: the paper's cumulative energy for r = 1 … R, shape (R,).
-        displacement_energy: share of the variance about each particle's mean place, shape (R,).
-        num_modes: modes that the network uses.
+    """What r = 1 … R modes do not hold of the training data's variance: of the paper's cumulative energy, and of the
+    share of the variance about each particle's mean place, shape (R,) each.
     """
     figure = new_figure(PICTURE_WIDTH, 3.4)
     axis = figure.subplots()
@@ -188,12 +169,7 @@ def reconstruction_figure(
         fitted = [1e3 * math.sqrt(max(training[r - 1], 0.0)) for r in shown]
         axis.loglog(shown, fitted, color=BASELINE, linestyle="--", marker=".", label="training runs")
     axis.loglog(
-        shown,
-        [1e3 * math.sqrt(test[r]) for r in shown],
-        color=ACCENT,
-        marker="o",
-        markersize=4,
-        label=label,
+        shown, [1e3 * math.sqrt(test[r]) for r in shown], color=ACCENT, marker="o", markersize=4, label=label
     )
     if network_rmse_mm is not None and math.isfinite(network_rmse_mm) and network_rmse_mm > 0.0:
         axis.axhline(network_rmse_mm, color=NETWORK, label="rollout of the network")
@@ -271,15 +247,8 @@ def compared(
     history: int,
     baseline: float | None = None,
 ) -> Panel:
-    """A panel with the truth, the prediction after its history, and perhaps a constant baseline.
-
-    Args:
-        label: of the vertical axis.
-        read: history (T,) of a `Run`.
-        truth: the simulated `Run`; None for a path that was never simulated.
-        prediction: the predicted `Run`.
-        history: frames that are no predictions.
-        baseline: the training runs' mean.
+    """A panel with the truth (None for a path that was never simulated), the prediction after its history, and
+    perhaps a constant baseline, the training runs' mean; `read` takes the values (T,) from a `Run`.
     """
     time = prediction.time
     curves = [Curve("network", time[history:], read(prediction)[history:], NETWORK)]
@@ -533,11 +502,7 @@ def latent_path(run: Run, basis: Basis) -> np.ndarray:
 def subspace_view(truth: Run, prediction: Run, paths: tuple[np.ndarray, np.ndarray], frame: int) -> Figure:
     """Modes, body points and force at one frame, with the way that the modes have come.
 
-    Args:
-        truth: the simulated run.
-        prediction: the predicted run, whose body is drawn.
-        paths: `latent_path` of the two [m], shape (T, r, 3) each.
-        frame: to draw.
+    `paths` are the `latent_path` of the two runs [m], shape (T, r, 3) each.
     """
     figure = new_figure(PICTURE_WIDTH, 4.3)
     axis = figure.add_subplot(projection="3d")

@@ -119,7 +119,7 @@ def render_report(evaluation: Evaluation, groups: Sequence[FigureGroup]) -> str:
 def main_numbers(evaluation: Evaluation) -> list[tuple[str, str]]:
     """The four numbers that matter most, with words."""
     total = evaluation.total
-    ratio = total.solver_rate / evaluation.timing.stepping
+    ratio = total.solver_rate / evaluation.timing.rollout
     if math.isnan(ratio):
         speed = "–", "speed beside the solver, whose time is not recorded"
     elif ratio >= 1.0:

@@ -17,6 +17,7 @@ from sgns.evaluate.metrics import (
     BodyErrors,
     PositionErrors,
     VectorErrors,
+    rms_mm,
     skill,
 )
 from sgns.reduction.basis import Basis, ReductionCurves
@@ -51,11 +52,11 @@ class Scores:
 
     def rmse_mm(self, name: str) -> float:
         """Root of a mean-square error [mm]."""
-        return 1e3 * math.sqrt(self.mse[name]) if self.mse[name] >= 0.0 else math.nan
+        return rms_mm(self.mse[name])
 
-    def skill(self, baseline: str = "frozen", error: str = "total") -> float:
+    def skill(self, baseline: str = "frozen") -> float:
         """1 − MSE / MSE of a baseline; for several runs 1 − Σ MSE / Σ MSE of the baseline."""
-        return skill([self.mse[error]], [self.mse[baseline]])
+        return skill([self.mse["total"]], [self.mse[baseline]])
 
     def row(self) -> dict[str, Any]:
         """Everything as plain numbers by column name; the unit is the end of the name."""
@@ -100,17 +101,9 @@ def run_scores(
     mean_torque: np.ndarray,
     body: BodyErrors = PRESCRIBED,
 ) -> Scores:
-    """Scores of one run.
+    """Scores of one run over the frames after its history.
 
-    Args:
-        name: of the run.
-        positions: its position errors.
-        truth: the simulated `Run`.
-        prediction: the predicted `Run`.
-        history: frames at the start that count in no metric.
-        mean_force: mean force of the training split [N], shape (3,).
-        mean_torque: mean torque of the training split [N m], shape (3,).
-        body: how far the body is from its true place; by default its path was given.
+    The mean force [N] and torque [N m] of the training split are baselines, shape (3,) each.
     """
     force = VectorErrors.compare(truth.force[history:], prediction.force[history:])
     mean = VectorErrors.compare(truth.force[history:], mean_force)
@@ -196,12 +189,12 @@ class EvaluatedRun:
 class NetworkTiming:
     """Wall seconds per simulated second of the network: medians of warm repeats on one thread."""
 
-    stepping: float  # steps with force and torque; the soil stays in the subspace
-    decoding: float  # the same, and every frame decoded to all particles
+    rollout: float  # steps with force and torque; the soil stays in the subspace
+    decoded: float  # the same, and every frame decoded to all particles
     repeats: int  # number of timed repeats
     run: str  # run that was timed
-    stepping_bytes: float = math.nan  # peak memory of the whole process while it steps; NaN if not known
-    decoding_bytes: float = math.nan  # the same while it decodes
+    rollout_bytes: float = math.nan  # peak memory of the whole process while it steps; NaN if not known
+    decoded_bytes: float = math.nan  # the same while it decodes
 
 
 @dataclass(frozen=True)
@@ -254,7 +247,7 @@ class Evaluation:
     full_space: FullSpaceCost | None = None
     # mean torque of the training split [N m], shape (3,)
     mean_torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    # losses and validation scores by step, as `training_curves.read_log` gives them
+    # losses and validation scores by step, as `figures.read_log` gives them
     training_log: Mapping[str, np.ndarray] = field(default_factory=dict)
     # names of the evaluated runs that the basis and the network were fitted on
     trained_on: Sequence[str] = ()

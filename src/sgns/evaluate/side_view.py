@@ -5,8 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -96,8 +95,7 @@ def view_times(run: Any, history: int, count: int = 3) -> list[int]:
     return [round(first + (last - first) * 0.9 * (k + 1) / count) for k in range(count)]
 
 
-@dataclass(frozen=True)
-class Scales:
+class Scales(NamedTuple):
     """What makes several side views comparable."""
 
     chosen: np.ndarray  # which particles lie near mid-width, shape (n,)
@@ -107,23 +105,11 @@ class Scales:
     z_limits: tuple[float, float]  # of the picture [m]
     spacing: float  # between particles [m]
 
-    @property
-    def aspect(self) -> float:
-        """Height of a view over its width."""
-        return (self.z_limits[1] - self.z_limits[0]) / (self.x_limits[1] - self.x_limits[0])
-
-    def disc(self, width: float) -> float:
-        """Diameter [points] of a particle's disc in a view so many inches wide: the room that it has."""
-        return max(1.4, 0.98 * self.spacing * 72.0 * width / (self.x_limits[1] - self.x_limits[0]))
-
 
 def common_scales(runs: Sequence[Any], frames: Sequence[int], start: np.ndarray) -> Scales:
-    """Scales for all views of some runs at some frames; the first run sets the colours.
+    """Scales for all views of some `Run`s at some frames; the first run sets the colours.
 
-    Args:
-        runs: `Run`s.
-        frames: frames that will be drawn.
-        start: common start of the particles [m], shape (n, 3).
+    `start` are the particles at rest [m], shape (n, 3).
     """
     chosen, spacing = middle_slice(start), particle_spacing(start)
     fastest = max(float(np.percentile(slice_speed(runs[0], frame, chosen), 99.5)) for frame in frames)
@@ -151,12 +137,9 @@ def slice_speed(run: Any, frame: int, chosen: np.ndarray) -> np.ndarray:
 
 @styled
 def side_views(runs: Mapping[str, Any], frames: Sequence[int], start: np.ndarray) -> Figure:
-    """Soil near mid-width coloured by speed, body and force, at some frames (rows) of runs (columns).
+    """Soil near mid-width coloured by speed, body and force, at some frames (rows) of runs by title (columns).
 
-    Args:
-        runs: title → `Run`; all runs share scales of colour and force.
-        frames: frames to draw.
-        start: common start of the particles [m], shape (n, 3): which of them are near mid-width.
+    All share scales of colour and force; `start` are the particles at rest [m], shape (n, 3).
     """
     panel, width = (5.4, 4.95) if len(runs) > 1 else (7.2, 6.15)  # [inches], with and without labels
     scales = common_scales(list(runs.values()), frames, start)
@@ -166,13 +149,7 @@ def side_views(runs: Mapping[str, Any], frames: Sequence[int], start: np.ndarray
 
 @styled
 def side_view(runs: Mapping[str, Any], frame: int, scales: Scales) -> Figure:
-    """The same at one frame, the runs above each other in one narrow picture.
-
-    Args:
-        runs: title → `Run`.
-        frame: frame to draw.
-        scales: of this and other pictures.
-    """
+    """The same at one frame, the runs above each other in one narrow picture."""
     views = [[(title, run, frame)] for title, run in runs.items()]
     return draw_views(views, scales, PICTURE_WIDTH, PICTURE_WIDTH - 0.75)
 
@@ -181,15 +158,24 @@ def draw_views(
     views: Sequence[Sequence[tuple[str, Any, int]]], scales: Scales, whole_width: float, width: float
 ) -> Figure:
     """Rows of views (title, run, frame) in a picture so many inches wide, each view without its labels `width`."""
-    height = len(views) * (width * scales.aspect + 0.38) + 1.0
+    inches = width / np.ptp(scales.x_limits)  # per metre
+    disc = max(
+        1.4, 0.98 * scales.spacing * 72.0 * inches
+    )  # diameter of a particle [points]: the room that it has
+    height = len(views) * (inches * np.ptp(scales.z_limits) + 0.38) + 1.0
     figure = new_figure(whole_width, height, "compressed")
     axes = figure.subplots(len(views), len(views[0]), squeeze=False, sharex=True, sharey=True)
     for axis, (title, run, frame) in zip(axes.flat, itertools.chain(*views), strict=True):
         positions = slice_positions(run, frame, scales.chosen)
         speed = slice_speed(run, frame, scales.chosen)
-        draw_soil(axis, positions, speed, scales.speed, scales.disc(width))
+        order = np.argsort(speed)  # the fast ones on top
+        x, _, z = positions[order].T
+        axis.scatter(x, z, c=speed[order], s=disc**2, cmap=SPEED, norm=scales.speed, linewidths=0.0)
         outline = body_outline(run, frame)
-        draw_body(axis, outline)
+        if len(outline) >= 3:
+            axis.add_patch(Polygon(outline, facecolor=STEEL, edgecolor="black", linewidth=0.8, zorder=3))
+        else:  # seen edge-on
+            axis.plot(*outline.T, color=STEEL, linewidth=3.0, zorder=3)
         force = run.force[frame, [0, 2]]
         size = float(np.linalg.norm(force)) * scales.arrow
         if size > 0.0:
@@ -213,23 +199,6 @@ def draw_views(
     )
     bar.set_label("speed of the soil [m/s]")
     return figure
-
-
-def draw_soil(axis: Axes, positions: np.ndarray, speed: np.ndarray, scale: Normalize, size: float) -> None:
-    """Particles (k, 3) as discs of a diameter in points, coloured by speed (k,)."""
-    order = np.argsort(speed)  # the fast ones on top
-    x, _, z = positions[order].T
-    axis.scatter(x, z, c=speed[order], s=size**2, cmap=SPEED, norm=scale, linewidths=0.0)
-
-
-def draw_body(axis: Axes, outline: np.ndarray) -> None:
-    """The body's outline: a filled shape, or a line if it is seen edge-on."""
-    if len(outline) >= 3:
-        axis.add_patch(
-            Polygon(outline, closed=True, facecolor=STEEL, edgecolor="black", linewidth=0.8, zorder=3)
-        )
-    else:
-        axis.plot(outline[:, 0], outline[:, 1], color=STEEL, linewidth=3.0, zorder=3)
 
 
 def draw_force(

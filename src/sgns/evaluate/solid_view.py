@@ -49,10 +49,7 @@ class Camera:
 class DepthBuffer:
     """A picture that remembers how near each of its points is.
 
-    Args:
-        low: right and up of the lower left corner [m], shape (2,).
-        high: of the upper right corner [m], shape (2,).
-        width: columns.
+    Its lower left and upper right corner lie at `low` and `high`, right and up [m]; it has `width` columns.
     """
 
     def __init__(self, low: np.ndarray, high: np.ndarray, width: int) -> None:
@@ -67,20 +64,12 @@ class DepthBuffer:
     def extent(self) -> tuple[float, float, float, float]:
         """Left, right, bottom and top [m]; row 0 is the bottom."""
         height, width = self.nearness.shape
-        return (
-            self.low[0],
-            self.low[0] + width * self.pixel,
-            self.low[1],
-            self.low[1] + height * self.pixel,
-        )
+        return (self.low[0], self.low[0] + width * self.pixel, self.low[1], self.low[1] + height * self.pixel)
 
     def spheres(self, centres: np.ndarray, radius: float, colours: np.ndarray) -> None:
-        """Particles as shaded spheres.
+        """Particles as shaded spheres of a radius [m].
 
-        Args:
-            centres: right, up, nearness [m], shape (n, 3).
-            radius: [m].
-            colours: red, green, blue, shape (n, 3).
+        Their centres are right, up and nearness [m], their colours red, green and blue, shape (n, 3) each.
         """
         reach = max(1, int(np.ceil(radius / self.pixel)))
         offsets = np.arange(-reach, reach + 1)
@@ -107,12 +96,7 @@ class DepthBuffer:
         self.colour[row[order], column[order]] = colours[order]
 
     def triangles(self, corners: np.ndarray, colour: np.ndarray) -> None:
-        """Flat faces of one colour.
-
-        Args:
-            corners: right, up, nearness [m], shape (t, 3, 3): triangles, corners, coordinates.
-            colour: red, green, blue, shape (3,).
-        """
+        """Flat faces of one colour (3,); corners are right, up and nearness [m], shape (triangles, 3, 3)."""
         for triangle in corners:
             normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
             length = float(np.linalg.norm(normal))
@@ -172,45 +156,28 @@ ARROW_SHARE = 0.25
 TOOL_ABOVE = 0.22
 
 
-@dataclass(frozen=True)
-class Colouring:
-    """What colours the particles, and how."""
-
-    label: str  # of the colour bar
-    values: np.ndarray  # shape (n,)
-    scale: Normalize  # range of the colours
-    colours: LinearSegmentedColormap  # from low to high
-
-
 def solid_views(truth: Any, prediction: Any, frame: int, start: np.ndarray) -> Mapping[str, Figure]:
     """Three pictures of one moment: displacement, simulated and predicted, and the distance between them.
 
-    Args:
-        truth: the simulated `Run`.
-        prediction: the predicted `Run`.
-        frame: to draw.
-        start: common start of the particles [m], shape (n, 3).
+    `start` are the particles at rest [m], shape (n, 3).
     """
-    runs = {"simulated (MPM)": truth, "network": prediction}
-    positions = {title: run.positions(slice(frame, frame + 1))[0] for title, run in runs.items()}
-    moved = {title: 1e3 * np.linalg.norm(p - start, axis=1) for title, p in positions.items()}
-    error = 1e3 * np.linalg.norm(positions["network"] - positions["simulated (MPM)"], axis=1)
-    displacement = upper_scale(moved["simulated (MPM)"])
-    strongest = max(float(np.linalg.norm(run.force[frame])) for run in runs.values())
-    views = {
-        title: (run, positions[title], Colouring("displacement [mm]", moved[title], displacement, SPEED))
-        for title, run in runs.items()
-    }
-    views["network, its error"] = (
-        prediction,
-        positions["network"],
-        Colouring("distance from the simulated place [mm]", error, upper_scale(error), ERROR),
+    true, predicted = (run.positions(slice(frame, frame + 1))[0] for run in (truth, prediction))
+    moved, moved_predicted, error = (
+        1e3 * np.linalg.norm(difference, axis=1)
+        for difference in (true - start, predicted - start, predicted - true)
     )
+    strongest = max(float(np.linalg.norm(run.force[frame])) for run in (truth, prediction))
+    displacement = "displacement [mm]", ScalarMappable(upper_scale(moved), SPEED)
+    distance = "distance from the simulated place [mm]", ScalarMappable(upper_scale(error), ERROR)
     return {
         title: solid_figure(
-            f"{title}, t = {run.time[frame]:.2f} s", run, frame, p, colouring, start, strongest
+            f"{title}, t = {run.time[frame]:.2f} s", run, frame, positions, values, *colours, start, strongest
         )
-        for title, (run, p, colouring) in views.items()
+        for title, run, positions, values, colours in (
+            ("simulated (MPM)", truth, true, moved, displacement),
+            ("network", prediction, predicted, moved_predicted, displacement),
+            ("network, its error", prediction, predicted, error, distance),
+        )
     }
 
 
@@ -226,20 +193,15 @@ def solid_figure(
     run: Any,
     frame: int,
     positions: np.ndarray,
-    colouring: Colouring,
+    values: np.ndarray,
+    label: str,
+    colours: ScalarMappable,
     start: np.ndarray,
     strongest: float,
 ) -> Figure:
-    """Particles as spheres, the body, and the force on it.
+    """Particles (n, 3) [m] as spheres coloured by values (n,), and the body of a run with the force on it.
 
-    Args:
-        title: of the picture.
-        run: `Run` that the body and the force are taken from.
-        frame: to draw.
-        positions: of the particles [m], shape (n, 3).
-        colouring: of the particles.
-        start: common start of the particles [m], shape (n, 3), which sets the frame of the picture.
-        strongest: force [N] that has the longest arrow.
+    The particles at rest, `start`, set the frame of the picture; the force `strongest` [N] has the longest arrow.
     """
     camera, spacing = Camera(), particle_spacing(start)
     low, high = start.min(axis=0) - spacing, start.max(axis=0) + spacing
@@ -251,8 +213,7 @@ def solid_figure(
     left_bottom, right_top = box[:, :2].min(axis=0), box[:, :2].max(axis=0)
 
     buffer = DepthBuffer(left_bottom, right_top, width=round(DPI * (PICTURE_WIDTH - 0.2)))
-    colours = colouring.colours(colouring.scale(colouring.values))[:, :3]
-    buffer.spheres(camera.project(positions), 0.55 * spacing, colours)
+    buffer.spheres(camera.project(positions), 0.55 * spacing, colours.to_rgba(values)[:, :3])
     buffer.triangles(camera.project(hull_triangles(corners)), np.array(to_rgb(STEEL)))
 
     height, width = buffer.nearness.shape
@@ -267,15 +228,8 @@ def solid_figure(
         foot = camera.project(run.pose[frame, :3])[:2]
         tip = foot + camera.project(run.force[frame])[:2] * scale
         draw_force(axis, run, run.force[frame], foot, tip, clip=False)
-    bar = figure.colorbar(
-        ScalarMappable(colouring.scale, colouring.colours),
-        ax=axis,
-        location="bottom",
-        shrink=0.9,
-        aspect=40,
-        pad=0.02,
-    )
-    bar.set_label(colouring.label)
+    bar = figure.colorbar(colours, ax=axis, location="bottom", shrink=0.9, aspect=40, pad=0.02)
+    bar.set_label(label)
     return figure
 
 

@@ -43,14 +43,14 @@ def write_tables(evaluation: Evaluation, output: Path) -> None:
             "mean_training_force_N": evaluation.mean_force,
             "wall_s_per_simulated_s": {
                 "solver": evaluation.total.solver_rate,
-                "network_stepping_with_force": timing.stepping,
-                "network_with_decoding": timing.decoding,
+                "network_stepping_with_force": timing.rollout,
+                "network_with_decoding": timing.decoded,
                 "network_threads": 1,
                 "network_repeats": timing.repeats,
             },
             "peak_memory_bytes": {
-                "network_stepping_with_force": timing.stepping_bytes,
-                "network_with_decoding": timing.decoding_bytes,
+                "network_stepping_with_force": timing.rollout_bytes,
+                "network_with_decoding": timing.decoded_bytes,
             },
             "network": {
                 "parameters": costs.parameters,
@@ -240,22 +240,22 @@ def cost_columns(evaluation: Evaluation) -> list[Column]:
     """Time and memory of solver, network and, if measured, the network on every particle: a column each."""
     timing, costs, n = evaluation.timing, evaluation.costs, evaluation.particle_count
     solver = evaluation.total.solver_rate
-    stepping, decoding = timing.stepping, timing.decoding
+    rollout, decoded = timing.rollout, timing.decoded
     columns = {
         "solver (MPM)": (solver, 1.0, None, None, 6 * n, None, None, math.nan),
         "network": (
-            stepping,
-            solver / stepping,
+            rollout,
+            solver / rollout,
             costs.seconds_per_step,
             costs.training_seconds,
             3 * evaluation.num_modes,
             costs.parameters,
             1e-6 * costs.checkpoint_bytes,
-            1e-6 * timing.stepping_bytes,
+            1e-6 * timing.rollout_bytes,
         ),
         "network, particles decoded": (
-            *(decoding, solver / decoding, None, None, 3 * n, None, None),
-            1e-6 * timing.decoding_bytes,
+            *(decoded, solver / decoded, None, None, 3 * n, None, None),
+            1e-6 * timing.decoded_bytes,
         ),
     }
     if full := evaluation.full_space:

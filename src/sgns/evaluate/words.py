@@ -124,7 +124,7 @@ def body_words(total: Scores) -> str:
 
 def time_words(evaluation: Evaluation) -> str:
     """How fast the network is beside the solver."""
-    own, solver = evaluation.timing.stepping, evaluation.total.solver_rate
+    own, solver = evaluation.timing.rollout, evaluation.total.solver_rate
     sentence = f"One simulated second takes the network {number(own, 2)} s on one thread"
     if math.isnan(solver) or solver <= 0.0:
         return sentence + "; the solver's time is not recorded."

@@ -103,11 +103,7 @@ def points_with_errors(study: Study) -> list[Point]:
 
 
 def with_errors(
-    study: Study,
-    scene: StudyScene,
-    point: Point,
-    cases: Iterable[str],
-    reference: Mapping[str, Observation],
+    study: Study, scene: StudyScene, point: Point, cases: Iterable[str], reference: Mapping[str, Observation]
 ) -> Point:
     """A point with its errors; without any if it is the reference or did not finish."""
     if point.axis == "reference":

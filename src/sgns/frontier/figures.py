@@ -40,13 +40,9 @@ def column_of(points: Sequence[Point], column: str) -> list[float]:
 
 @plain_text
 def scene_figure(points: Sequence[Point], column: str, bands: Mapping[str, float], title: str) -> bytes:
-    """Error over wall time per simulated second, as PNG.
+    """Error of a column over wall time per simulated second of a scene's points, as PNG.
 
-    Args:
-        points: of one scene.
-        column: which error.
-        bands: how wrong the reference may be, by column.
-        title: over the figure.
+    `bands` say how wrong the reference may be, by column.
     """
     shown = known(points, column)
     references = [p for p in points if p.axis == "reference" and not math.isnan(p.cost)]
@@ -233,15 +229,8 @@ def place_labels(
     """Write a text beside each point, where it covers no other, no point and no line and stays within the border.
 
     The limits and scales of the axes must not change afterwards. Points whose surroundings are crowded choose last
-    but are given the room further away.
-
-    Args:
-        axes: drawn with its final limits.
-        x: of the points, data coordinates.
-        y: likewise.
-        texts: one for each point; an empty one is left out.
-        size: of the letters [points].
-        line: corners of a line that labels keep off, data coordinates.
+    but are given the room further away. Points and the corners of a line to keep off are in data coordinates; empty
+    texts are left out.
 
     Returns:
         The box of each text in pixels: x0, y0, x1, y1; shape (texts, 4).

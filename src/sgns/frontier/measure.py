@@ -227,7 +227,6 @@ def measure_reductions_of(study: Study, scene: StudyScene, missing: list[Reducti
                 "reduction",
                 p.entry,
                 label=p.label,
-                paper=False,
                 settings=shlex.join([f"dataset={scene.dataset}", *changes]),
                 modes=float(p.modes),
                 particles=float(len(basis.modes)),
@@ -270,12 +269,7 @@ def coding_times(basis: Basis, path: Path) -> np.ndarray:
 
 
 def with_training_runs(dataset: Dataset, count: int | None, seed: int = 0) -> Dataset:
-    """The dataset with some of its training runs; a smaller number's runs are among a larger one's.
-
-    Args:
-        dataset: With all its runs.
-        count: Of training runs; None: all.
-        seed: Of the order in which they are taken.
+    """The dataset with so many of its training runs (None: all); a smaller number's runs are among a larger one's.
 
     Raises:
         UserError: It has fewer.
@@ -303,14 +297,9 @@ def every_nth_frame(reduced: ReducedDataset, n: int) -> ReducedDataset:
 
 
 def frame_means(values: np.ndarray, n: int) -> np.ndarray:
-    """Means over the n frames that end with every nth one.
+    """Means over the n frames that end with every nth one, of forces or torques (T, 3), shape (1 + (T - 1) // n, 3).
 
-    Args:
-        values: Forces or torques, means over a recorded frame each, shape (T, 3).
-        n: Frames in one of the result.
-
-    Returns:
-        Shape (1 + (T - 1) // n, 3); frame 0 has none before it and stays.
+    Those are means over a recorded frame each; frame 0 has none before it and stays.
     """
     count = (len(values) - 1) // n
     return np.concatenate([values[:1], values[1 : 1 + count * n].reshape(count, n, 3).mean(axis=1)])
@@ -356,17 +345,11 @@ class TimedTraining:
 def train_for(
     seconds: float, reduced: ReducedDataset, settings: Mapping[str, Any], folder: Path, seed: int = 0
 ) -> TimedTraining:
-    """Train on this thread for about so much processor time, or take what is complete.
+    """Train on this thread for about so much processor time, validation on top, or take what is complete.
 
     The steps of the optimiser are as many as fit, by the time of a few, and the learning rate falls over them, so that
-    every training is a whole one. Polynomials are fitted, however long it takes.
-
-    Args:
-        seconds: Processor time of the steps; validation comes on top.
-        reduced: The dataset in its basis.
-        settings: `conf/train` as plain values.
-        folder: Trainings are kept in, each in a folder named by what it depends on.
-        seed: Of weights, noise and order.
+    every training is a whole one. Polynomials are fitted, however long it takes. `settings` are those of `conf/train`;
+    trainings are kept in `folder`, each in a folder named by what it depends on.
     """
     model, training = settings["model"], settings["training"] | {"threads": 1, "resume": False}
     # The folder's name is made of everything that the result depends on.
@@ -478,11 +461,7 @@ def own_errors(
 ) -> Scores:
     """Scores over some runs together, each rolled out from its first d true frames, as `sgns evaluate` does it.
 
-    Args:
-        simulator: Trained at 1/every of the runs' frame rate.
-        paths: Runs to be predicted.
-        training_paths: Runs whose mean force is a baseline.
-        every: Frames of the runs in one of the simulator's.
+    `every` frames of the runs are one of the simulator's; the mean force of the training runs is a baseline.
     """
     d = int(simulator.history)
     means = training_means(training_paths, d)
@@ -683,16 +662,17 @@ FULL_SPACE_COLUMNS = {  # of a point → of the table
     "own_position_rmse_mm": "position_rmse_mm",
     "training_s": "trained_processor_s",
     "training_samples": "trained_steps",  # one window a step
+} | {
+    name: name
+    for name in (
+        "repeats",
+        "parameters",
+        "frozen_rmse_mm",
+        "skill_frozen",
+        "skill_constant_velocity",
+        "mean_force_nrmse",
+    )
 }
-for name in (
-    "repeats",
-    "parameters",
-    "frozen_rmse_mm",
-    "skill_frozen",
-    "skill_constant_velocity",
-    "mean_force_nrmse",
-):
-    FULL_SPACE_COLUMNS[name] = name
 
 
 def measure_elsewhere(study: Study, scene: StudyScene, entry: PointSettings) -> None:
@@ -711,7 +691,7 @@ def measure_elsewhere(study: Study, scene: StudyScene, entry: PointSettings) -> 
     except ValueError as error:
         raise UserError(f"{file}: {case!r} has a column that is no number ({error})") from None
     note = f"{case!r} of {file.as_posix()}"
-    study.store.save(new_point(study, scene, "full space", entry, paper=False, note=note, **columns), {})
+    study.store.save(new_point(study, scene, "full space", entry, note=note, **columns), {})
 
 
 def full_space_fields(row: Mapping[str, str]) -> dict[str, float]:

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from mpm_warp import Scene
 from sgns.arrays import require_shapes
 from sgns.config import UserError
 from sgns.data.files import whole_file
 from sgns.data.small_files import read_arrays
-from sgns.evaluate.metrics import SurfaceGrid, VectorErrors, height_error, height_map
+from sgns.evaluate.metrics import SurfaceGrid, VectorErrors, height_error, height_map, rms_mm
 
 # --- What is kept of a run ------------------------------------------------------------------------------
 # Forces, torques and poses are kept in every frame. The soil is kept a few times a second, in two forms that do not
@@ -95,17 +96,12 @@ def observed_frames(frame_count: int, frame_rate: float) -> np.ndarray:
 
 
 class Observer:
-    """Collects an observation frame by frame.
-
-    Args:
-        scene: what is simulated; says where the bin is.
-        start: positions of the particles at time 0 [m], shape (n, 3).
-    """
+    """Collects an observation of a scene frame by frame, from where the particles are at time 0 [m], shape (n, 3)."""
 
     def __init__(self, scene: Scene, start: np.ndarray) -> None:
         self._start = np.asarray(start, dtype=np.float64)
         size = np.asarray(scene.bed.size)
-        self._points = _NearPoints(self._start, size)
+        self._weights = lattice_weights(self._start, size)
         x, y = (np.linspace(0.0, edge, max(1, round(edge / COLUMN)) + 1) for edge in size[:2])
         self._columns = SurfaceGrid(x, y)
         # Half the edge of the cube that belongs to one particle, whatever share of them is here.
@@ -120,8 +116,10 @@ class Observer:
     def add_soil(self, time: float, position: np.ndarray) -> None:
         """The particles in a frame in which the soil is to be observed [m], shape (n, 3)."""
         position = np.asarray(position, dtype=np.float64)
+        with np.errstate(invalid="ignore"):  # no particle is near: NaN
+            moved = self._weights @ (position - self._start) / self._weights.sum(axis=1)[:, None]
         self._frames["soil_time"].append(time)
-        self._frames["moved"].append(self._points.mean(position - self._start).astype(np.float32))
+        self._frames["moved"].append(moved.astype(np.float32))
         self._frames["surface"].append(height_map(position, self._columns) + self._above)
 
     def finish(self) -> Observation:
@@ -129,33 +127,19 @@ class Observer:
         return Observation(**{key: np.array(values) for key, values in self._frames.items()})
 
 
-class _NearPoints:
-    """Means over the particles near the points of a regular lattice in the bin."""
-
-    def __init__(self, start: np.ndarray, size: np.ndarray) -> None:
-        counts = np.maximum(1, np.round(size / LATTICE)).astype(int)
-        spacing = size / counts
-        place = (start + np.array([0.0, 0.0, size[2]])) / spacing - 0.5
-        low = np.floor(place).astype(int)
-        index, weight = [], []
-        for corner in itertools.product((0, 1), repeat=3):
-            node = low + corner
-            share = np.prod(np.maximum(0.0, 1.0 - np.abs(place - node)), axis=1)
-            share[((node < 0) | (node >= counts)).any(axis=1)] = 0.0
-            index.append(np.ravel_multi_index(tuple(np.clip(node, 0, counts - 1).T), tuple(counts)))
-            weight.append(share)
-        self._index, self._weight = np.concatenate(index), np.concatenate(weight)
-        self._count = int(np.prod(counts))
-        self._total = np.bincount(self._index, self._weight, self._count)
-
-    def mean(self, values: np.ndarray) -> np.ndarray:
-        """Of a vector of each particle (n, 3), shape (P, 3); NaN where no particle is near."""
-        sums = [
-            np.bincount(self._index, self._weight * np.tile(values[:, axis], 8), self._count)
-            for axis in range(3)
-        ]
-        with np.errstate(invalid="ignore"):
-            return np.stack(sums, axis=1) / self._total[:, None]
+def lattice_weights(start: np.ndarray, size: np.ndarray) -> csr_array:
+    """Weight of each particle (n, 3) [m] at each point of a regular lattice in a bin of a size [m], shape (P, n)."""
+    counts = np.maximum(1, np.round(size / LATTICE)).astype(int)
+    place = (start + np.array([0.0, 0.0, size[2]])) / (size / counts) - 0.5
+    points, weights = [], []
+    for corner in itertools.product((0, 1), repeat=3):
+        node = np.floor(place).astype(int) + corner
+        weight = np.prod(np.maximum(0.0, 1.0 - np.abs(place - node)), axis=1)
+        weight[((node < 0) | (node >= counts)).any(axis=1)] = 0.0
+        points.append(np.ravel_multi_index(tuple(np.clip(node, 0, counts - 1).T), tuple(counts)))
+        weights.append(weight)
+    entries = np.concatenate(weights), (np.concatenate(points), np.tile(np.arange(len(start)), 8))
+    return csr_array(entries, shape=(int(np.prod(counts)), len(start)))
 
 
 def observe_arrays(
@@ -168,18 +152,10 @@ def observe_arrays(
     frames: np.ndarray,
     positions: Iterable[np.ndarray],
 ) -> Observation:
-    """The observation of a run that is in memory.
+    """The observation of a run that is in memory: frames as in `Observation`, the particles (n, 3) [m] in some of them.
 
-    Args:
-        scene: what was simulated.
-        start: where the particles are in an undisturbed bed [m], shape (n, 3). Not a frame of the run: what a reduction
-            leaves out of the bed at rest would be left out of every error.
-        time: of all frames [s], shape (T,).
-        force: [N], shape (T, 3).
-        torque: [N m], shape (T, 3).
-        pose: of the body, shape (T, 7).
-        frames: numbers of the frames in which the soil is known, `observed_frames`, the first of them 0.
-        positions: particles in each of these frames [m], (n, 3) each.
+    `start` is where the particles are in an undisturbed bed [m], shape (n, 3). Not a frame of the run: what a reduction
+    leaves out of the bed at rest would be left out of every error. `frames` are `observed_frames`, the first of them 0.
     """
     observer = Observer(scene, start)
     for frame, position in zip(frames, positions, strict=True):
@@ -269,14 +245,14 @@ def mean_squares(run: Observation, reference: Observation) -> np.ndarray:
 
 
 def errors(comparisons: Sequence[Comparison], *, free_body: bool = False) -> dict[str, float]:
-    """Errors of a point over its cases, by the names of the columns of `Point`.
+    """Errors of a point over its cases, by the names of the columns of `Point`; sinkage only where the body is free.
 
     Squares are summed over the cases before the root is taken; low and high are those of the best and the worst case.
-
-    Args:
-        comparisons: of each case.
-        free_body: whether the body's height is part of the answer.
     """
+
+    def pooled(squares: Iterable[float]) -> float:
+        return rms_mm(float(np.mean(list(squares))))
+
     force = reduce(add, (c.whole_force for c in comparisons))
     torque = reduce(add, (c.torque for c in comparisons))
     found = {
@@ -286,22 +262,17 @@ def errors(comparisons: Sequence[Comparison], *, free_body: bool = False) -> dic
         "vertical_nrmse": float(force.nrmse[2]),
         "vertical_mean_error": float(force.mpe[2]) / 100.0,
         "torque_nrmse": torque.overall_nrmse,
-        "position_rmse_mm": _root_mm([c.position.mean() for c in comparisons]),
-        "surface_rmse_mm": _root_mm([c.surface for c in comparisons]),
+        "position_rmse_mm": pooled(c.position.mean() for c in comparisons),
+        "surface_rmse_mm": pooled(c.surface for c in comparisons),
         "sinkage_error_mm": 1e3 * float(np.mean([c.sinkage for c in comparisons])) if free_body else math.nan,
     }
     for q in range(1, 5):
         found[f"force_nrmse_q{q}"] = reduce(add, (c.force[q - 1] for c in comparisons)).overall_nrmse
-        found[f"position_rmse_mm_q{q}"] = _root_mm([c.position_at(q) for c in comparisons])
+        found[f"position_rmse_mm_q{q}"] = pooled(c.position_at(q) for c in comparisons)
     for name, values in (
         ("force_nrmse", [c.whole_force.overall_nrmse for c in comparisons]),
-        ("position_rmse_mm", [_root_mm([c.position.mean()]) for c in comparisons]),
-        ("surface_rmse_mm", [_root_mm([c.surface]) for c in comparisons]),
+        ("position_rmse_mm", [rms_mm(c.position.mean()) for c in comparisons]),
+        ("surface_rmse_mm", [rms_mm(c.surface) for c in comparisons]),
     ):
         found |= {f"{name}_low": min(values), f"{name}_high": max(values)}
     return found
-
-
-def _root_mm(squares: Sequence[float]) -> float:
-    """Root of the mean of squares [m²] in mm."""
-    return 1e3 * math.sqrt(float(np.mean(squares)))

@@ -32,49 +32,35 @@ class Point:
     scene (observation.py); they are filled in when points are gathered, all other fields when a point is measured.
     """
 
-    study: str
-    """quick, full or the name of a study of one's own."""
-    scene: str
-    """cut, wheel, ...: points of one scene are on one figure."""
-    kind: str
-    """One of `KINDS`."""
+    study: str  # quick, full or the name of a study of one's own
+    scene: str  # cut, wheel, ...: points of one scene are on one figure
+    kind: str  # one of `KINDS`
+    # what is varied: dx, stiffness, an effect, r, width, ...; `reference` for the most accurate run
     axis: str
-    """What is varied: dx, stiffness, an effect, r, width, ...; `reference` for the most accurate run."""
-    label: str
-    """Unique within scene and kind; stands in figures."""
+    label: str  # unique within scene and kind; stands in figures
+    # the overrides that make it as they are written on the command line: of `sgns simulate` for the solver,
+    # of `sgns train` for surrogates (dataset and length of the training among them)
     settings: str = ""
-    """The overrides that make it as they are written on the command line: of `sgns simulate` for the solver, of
-    `sgns train` for surrogates (dataset and length of the training among them)."""
-    note: str = ""
-    """What a reader must know, such as `left the range: not finite from frame 31 on`."""
-    paper: bool = False
-    """An operating point of the paper."""
+    note: str = ""  # what a reader must know, such as `left the range: not finite from frame 31 on`
+    paper: bool = False  # an operating point of the paper
 
     # --- size ---
-    particles: float = math.nan
-    """That are computed or decoded, the mirrored half included."""
-    modes: float = math.nan
-    """r."""
-    parameters: float = math.nan
-    """Learned numbers."""
+    particles: float = math.nan  # that are computed or decoded, the mirrored half included
+    modes: float = math.nan  # r
+    parameters: float = math.nan  # learned numbers
 
     # --- cost: medians of repeats, warm ---
     wall_s_per_simulated_s: float = math.nan
-    wall_s_per_simulated_s_low: float = math.nan
-    """The fastest repeat."""
-    wall_s_per_simulated_s_high: float = math.nan
-    """The slowest repeat."""
+    wall_s_per_simulated_s_low: float = math.nan  # the fastest repeat
+    wall_s_per_simulated_s_high: float = math.nan  # the slowest repeat
     processor_s_per_simulated_s: float = math.nan
+    # with the positions of all particles in every frame, where they are not computed anyway
     decoded_wall_s_per_simulated_s: float = math.nan
-    """With the positions of all particles in every frame, where they are not computed anyway."""
-    repeats: float = math.nan
-    """How many repeats, or stretches of one run, the median is of."""
+    repeats: float = math.nan  # how many repeats, or stretches of one run, the median is of
+    # the reference workload (study.py), before and after, on the same core; processor time if that was shared
     workload_wall_s_per_simulated_s: float = math.nan
-    """The reference workload (study.py), before and after, on the same core; processor time if that was shared."""
-    ratio: float = math.nan
-    """`cost` / workload_wall_s_per_simulated_s."""
-    includes: str = ""
-    """What is in the time."""
+    ratio: float = math.nan  # `cost` / workload_wall_s_per_simulated_s
+    includes: str = ""  # what is in the time
     processor: str = ""
     threads: float = math.nan
     device: str = ""
@@ -84,27 +70,22 @@ class Point:
     force_nrmse_low: float = math.nan
     force_nrmse_high: float = math.nan
     draft_nrmse: float = math.nan
-    draft_mean_error: float = math.nan
-    """(mean - mean of the reference) / mean of the reference, signed."""
+    draft_mean_error: float = math.nan  # (mean - mean of the reference) / mean of the reference, signed
     vertical_nrmse: float = math.nan
     vertical_mean_error: float = math.nan
     torque_nrmse: float = math.nan
     position_rmse_mm: float = math.nan
     position_rmse_mm_low: float = math.nan
     position_rmse_mm_high: float = math.nan
-    surface_rmse_mm: float = math.nan
-    """Of the last frame."""
+    surface_rmse_mm: float = math.nan  # of the last frame
     surface_rmse_mm_low: float = math.nan
     surface_rmse_mm_high: float = math.nan
-    sinkage_error_mm: float = math.nan
-    """Mean absolute error of the height of a body that is free."""
-    force_nrmse_q1: float = math.nan
-    """In the first quarter of the run; q2 to q4 likewise."""
+    sinkage_error_mm: float = math.nan  # mean absolute error of the height of a body that is free
+    force_nrmse_q1: float = math.nan  # in the first quarter of the run; q2 to q4 likewise
     force_nrmse_q2: float = math.nan
     force_nrmse_q3: float = math.nan
     force_nrmse_q4: float = math.nan
-    position_rmse_mm_q1: float = math.nan
-    """At the end of the first quarter of the run; q2 to q4 likewise."""
+    position_rmse_mm_q1: float = math.nan  # at the end of the first quarter of the run; q2 to q4 likewise
     position_rmse_mm_q2: float = math.nan
     position_rmse_mm_q3: float = math.nan
     position_rmse_mm_q4: float = math.nan
@@ -116,27 +97,19 @@ class Point:
     own_position_rmse_mm: float = math.nan
     own_surface_rmse_mm: float = math.nan
     own_sinkage_error_mm: float = math.nan
-    frozen_rmse_mm: float = math.nan
-    """Nothing moves: the baseline of skill_frozen."""
+    frozen_rmse_mm: float = math.nan  # nothing moves: the baseline of skill_frozen
     skill_frozen: float = math.nan
     skill_constant_velocity: float = math.nan
-    mean_force_nrmse: float = math.nan
-    """The mean force of the training runs: the baseline of own_force_nrmse."""
-    training_s: float = math.nan
-    """Processor seconds."""
-    training_samples: float = math.nan
-    """Windows seen, repetitions counted."""
+    mean_force_nrmse: float = math.nan  # the mean force of the training runs: the baseline of own_force_nrmse
+    training_s: float = math.nan  # processor seconds
+    training_samples: float = math.nan  # windows seen, repetitions counted
     training_runs: float = math.nan
-    energy: float = math.nan
-    """Share of the displacement energy that the modes hold, held-out runs."""
+    energy: float = math.nan  # share of the displacement energy that the modes hold, held-out runs
 
-    command: str = ""
-    """That measured it."""
+    command: str = ""  # that measured it
     machine: str = ""
-    version: str = ""
-    """Of the package."""
-    commit: str = ""
-    """Of the code that measured it, where that was a checkout."""
+    version: str = ""  # of the package
+    commit: str = ""  # of the code that measured it, where that was a checkout
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -193,11 +166,7 @@ class Point:
             raise UserError(f"a row of operating points lacks columns: {error}") from None
 
 
-_ABOVE_ZERO = (
-    "wall_s_per_simulated_s",
-    "processor_s_per_simulated_s",
-    "decoded_wall_s_per_simulated_s",
-)
+_ABOVE_ZERO = ("wall_s_per_simulated_s", "processor_s_per_simulated_s", "decoded_wall_s_per_simulated_s")
 """Columns that others are divided by."""
 _READERS = {"str": str, "float": float, "bool": lambda v: {"True": True, "False": False}[str(v)]}
 

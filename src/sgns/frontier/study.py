@@ -173,9 +173,8 @@ class Store:
 
     def save(self, point: Point, observations: Mapping[str, Observation]) -> None:
         """Keep a point with its run of every case; none for a point that left the range (say so in its note)."""
-        name = name_of(point.scene, point.kind, point.label)
         for case, observation in observations.items():
-            observation.save(self._observation(name, case))
+            observation.save(self._observation(point, case))
         content = {"point": point.row(), "cases": list(observations)}
         file = self.file(point.scene, point.kind, point.label)
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -204,10 +203,10 @@ class Store:
 
     def observation(self, point: Point, case: str) -> Observation:
         """The run of a case of a point."""
-        return read_observation(self._observation(name_of(point.scene, point.kind, point.label), case))
+        return read_observation(self._observation(point, case))
 
-    def _observation(self, name: str, case: str) -> Path:
-        return self.folder / "observations" / f"{name}_{case}.npz"
+    def _observation(self, point: Point, case: str) -> Path:
+        return self.folder / "observations" / f"{name_of(point.scene, point.kind, point.label)}_{case}.npz"
 
 
 def name_of(scene: str, kind: str, label: str) -> str:
@@ -227,12 +226,9 @@ class PointSettings:
 
     axis: str
     label: str
-    set: tuple[str, ...] = ()
-    """Overrides: of `sgns simulate` for the solver, of `sgns train` for surrogates."""
-    paper: bool = False
-    """It is an operating point of the paper."""
-    more: Mapping[str, Any] | None = None
-    """Further keys that only one axis knows."""
+    set: tuple[str, ...] = ()  # overrides: of `sgns simulate` for the solver, of `sgns train` for surrogates
+    paper: bool = False  # it is an operating point of the paper
+    more: Mapping[str, Any] | None = None  # further keys that only one axis knows
 
     @classmethod
     def from_dict(cls, data: Any, where: str) -> PointSettings:
@@ -286,9 +282,8 @@ class StudyScene:
     @cached_property
     def reference(self) -> PointSettings:
         """The most accurate run."""
-        return PointSettings.from_dict(
-            {"axis": "reference"} | dict(self.settings["reference"]), f"study.scenes.{self.name}.reference"
-        )
+        entry = {"axis": "reference"} | dict(self.settings["reference"])
+        return PointSettings.from_dict(entry, f"study.scenes.{self.name}.reference")
 
     def points(self, axis: str) -> list[PointSettings]:
         """Points of an axis, in the order in which they are measured."""

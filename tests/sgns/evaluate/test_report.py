@@ -45,7 +45,7 @@ def scores(name, skill=0.9, force=0.3, mean=0.6, reduction=0.1):
     return Scores(name, 4, mse, own, own, baseline, baseline, 20.0, mpe, mean_mpe)
 
 
-def evaluation(names=("run1", "run2"), split="test", stepping=0.1, words="", wheel=False, **kw):
+def evaluation(names=("run1", "run2"), split="test", rollout=0.1, words="", wheel=False, **kw):
     particles = ParticleErrors(np.full(5, 1e-6), np.full(5, 1e-7))
     errors = PositionErrors(np.arange(4) / 60.0, *[np.full(4, 1e-6)] * 7, particles)
     runs = [
@@ -56,7 +56,7 @@ def evaluation(names=("run1", "run2"), split="test", stepping=0.1, words="", whe
         split=split,
         runs=runs,
         total=aggregate([run.scores for run in runs]),
-        timing=NetworkTiming(stepping, 2 * stepping, 3, names[0]),
+        timing=NetworkTiming(rollout, 2 * rollout, 3, names[0]),
         mean_force=np.array([-90.0, 0.0, 40.0]),
         curves=ReductionCurves(np.ones(2), np.ones(2), np.ones(2), np.ones(3)),
         basis=Basis(torch.zeros(4, 3), torch.eye(4)[:, :2], torch.ones(2), 3.0, 3.0, "particle_axis"),
@@ -173,9 +173,9 @@ def test_words_follow_from_the_force(force, words):
 
 
 def test_words_about_time_and_split():
-    assert "200 times less" in summary(evaluation(stepping=0.1))
-    assert "2.0 times more" in summary(evaluation(stepping=40.0))
-    assert "slower than the solver" in render_report(evaluation(stepping=40.0), [])
+    assert "200 times less" in summary(evaluation(rollout=0.1))
+    assert "2.0 times more" in summary(evaluation(rollout=40.0))
+    assert "slower than the solver" in render_report(evaluation(rollout=40.0), [])
     assert "never saw" in summary(evaluation())
     assert "1 run that" in summary(evaluation(names=("one",)))
 

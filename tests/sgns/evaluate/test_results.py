@@ -5,9 +5,7 @@ from types import SimpleNamespace
 import pytest
 from surrogates import made_scores
 
-from sgns.evaluate.results import aggregate, seen_warning, seen_before
-
-# ---  ---------------------------------------------------------------------------------------------------
+from sgns.evaluate.results import aggregate, seen_before, seen_warning
 
 
 def test_aggregate_by_hand():
@@ -41,13 +39,9 @@ def test_sinkage_is_the_mean_of_the_wheels_only():
     assert blade.row()["body_rmse_mm"] == 0.0 and math.isnan(blade.row()["sinkage_mae_mm"])
 
 
-# ---  ---------------------------------------------------------------------------------------------------
-
-
 def simulator(fitted_on, validation_runs):
     return SimpleNamespace(
-        basis=SimpleNamespace(fitted_on=fitted_on),
-        card={"settings": {"validation_runs": validation_runs}},
+        basis=SimpleNamespace(fitted_on=fitted_on), card={"settings": {"validation_runs": validation_runs}}
     )
 
 
