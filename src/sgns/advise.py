@@ -69,7 +69,7 @@ def chosen(points: Sequence[Point], wish: Wish) -> tuple[Point, bool]:
     Raises:
         UserError: no point of the scene has the errors asked for.
     """
-    there = [
+    candidates = [
         p
         for p in points
         if p.scene == wish.scene
@@ -77,19 +77,19 @@ def chosen(points: Sequence[Point], wish: Wish) -> tuple[Point, bool]:
         and not (p.kind == "surrogate" and p.note)  # the note says what the command leaves out
         and not math.isnan(wish.excess(p) + wish.step_time(p))
     ]
-    if not there:
+    if not candidates:
         raise UserError(
             f"no operating point of task={wish.scene} has all the numbers asked for; its kinds of error are "
             f"in points.csv"
         )
-    good = [p for p in there if wish.excess(p) <= 1.0]
+    good = [p for p in candidates if wish.excess(p) <= 1.0]
     if good and wish.errors:
         return min(good, key=wish.step_time), True
     if good:
         force = wish.columns["force"]
         with_force = [p for p in good if not math.isnan(wish.error(p, force))] or good
         return min(with_force, key=lambda p: (wish.error(p, force), wish.step_time(p))), True
-    return min(there, key=lambda p: (wish.excess(p), wish.step_time(p))), False
+    return min(candidates, key=lambda p: (wish.excess(p), wish.step_time(p))), False
 
 
 def advice(points: Sequence[Point], wish: Wish) -> list[str]:

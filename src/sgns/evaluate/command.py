@@ -135,16 +135,8 @@ def evaluate(
 ) -> Evaluation:
     """Rolls out every run of a split, measures, and writes `rollouts/`, `metrics.csv` and `metrics.json` into `output`.
 
-    Args:
-        simulator: the trained `Simulator`.
-        dataset: `Dataset` with the runs.
-        output: folder to write to.
-        split: of the dataset.
-        checkpoint: file of the simulator, for messages.
-        new_rollouts: run files without truth, checked here and shown in the report.
-        repeats: timed rollouts.
-        full_space: whether to measure what the same network would cost on every particle.
-        made: how it was made, for the report.
+    `new_rollouts` are run files without truth, checked here and shown in the report; `full_space` is whether to measure
+    what the same network would cost on every particle; `made` says how the evaluation was made, for the report.
     """
     network = model_settings(simulator.card["model"]) if full_space else None
     if full_space and not isinstance(network, ModelSettings):
@@ -184,8 +176,13 @@ def evaluate(
         target = output / "rollouts" / f"{path.stem}.h5"
         with Run(path) as truth:
             rollout = roll_out(simulator, truth)
-            told = {"effects": truth.effects, "seed": truth.seed, "mesh": truth.mesh, "given_frames": history}
-            write_rollout(target, simulator, truth.scene, rollout, checkpoint=checkpoint, **told)
+            recorded = {
+                "effects": truth.effects,
+                "seed": truth.seed,
+                "mesh": truth.mesh,
+                "given_frames": history,
+            }
+            write_rollout(target, simulator, truth.scene, rollout, checkpoint=checkpoint, **recorded)
             with Run(target) as prediction:
                 errors = position_errors(truth, prediction, simulator.basis, history, grid)
                 body = body_errors(truth, prediction, history)

@@ -154,12 +154,8 @@ def reconstruction_figure(
 ) -> Figure:
     """Reconstruction error for r = 1, 2, 4, … modes.
 
-    Args:
-        test: reduction MSE of the evaluated runs for r = 0 … R [m²], shape (R + 1,).
-        training: the same on the training runs for r = 1 … R, shape (R,).
-        num_modes: modes that the network uses.
-        network_rmse_mm: the network's own error, drawn as a line for comparison.
-        label: name of the evaluated runs.
+    `test` is the reduction MSE of the evaluated runs for r = 0 … R [m²], shape (R + 1,), `training` that of the
+    training runs for r = 1 … R, shape (R,); the network's own error is drawn as a line for comparison.
     """
     figure = new_figure(PICTURE_WIDTH, 3.4)
     axis = figure.subplots()

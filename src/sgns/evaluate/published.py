@@ -102,8 +102,8 @@ def scored(simulator: Simulator, run: ReducedRun, mean_force: np.ndarray) -> Sco
         surface=unknown,
         surface_frozen=unknown,
     )
-    told = SimpleNamespace(time=run.time, force=run.force, torque=run.torque, wall_time_s=0.0)
-    return run_scores(run.name, errors, told, rollout, d, mean_force, np.zeros(3))
+    simulated = SimpleNamespace(time=run.time, force=run.force, torque=run.torque, wall_time_s=0.0)
+    return run_scores(run.name, errors, simulated, rollout, d, mean_force, np.zeros(3))
 
 
 def score_lines(scores: Sequence[Scores]) -> list[str]:

@@ -77,9 +77,9 @@ def points_with_errors(study: Study) -> list[Point]:
         UserError: no reference has been measured.
     """
     found: list[Point] = []
-    there = study.store.points()
+    measured = study.store.points()
     for scene in study.scenes:
-        points = [(point, cases) for point, cases in there if point.scene == scene.name]
+        points = [(point, cases) for point, cases in measured if point.scene == scene.name]
         if not points:
             continue
         label = scene.reference.label
@@ -92,8 +92,8 @@ def points_with_errors(study: Study) -> list[Point]:
             continue
         reference = Point(study.name, scene.name, "solver", "reference", label)
         runs = {case: study.store.observation(reference, case) for case in scene.cases}
-        judged = [with_errors(study, scene, point, cases, runs) for point, cases in points]
-        found += sorted(judged, key=lambda p: (-math.inf if math.isnan(p.cost) else -p.cost, p.label))
+        compared = [with_errors(study, scene, point, cases, runs) for point, cases in points]
+        found += sorted(compared, key=lambda p: (-math.inf if math.isnan(p.cost) else -p.cost, p.label))
     if not found:
         raise UserError(
             f"{study.folder} holds no points with a reference; measure some: sgns frontier "

@@ -354,8 +354,8 @@ def train_for(
     model, training = settings["model"], settings["training"] | {"threads": 1, "resume": False}
     # The folder's name is made of everything that the result depends on.
     basis = (reduced.folder.name, reduced.num_modes, reduced.frame_rate)
-    told = json.dumps([TRAINING_FORMAT, seconds, *basis, model, training, seed], sort_keys=True)
-    output = folder / hashlib.blake2b(told.encode(), digest_size=8).hexdigest()
+    identity = json.dumps([TRAINING_FORMAT, seconds, *basis, model, training, seed], sort_keys=True)
+    output = folder / hashlib.blake2b(identity.encode(), digest_size=8).hexdigest()
     record = output / "timed.json"
     if record.exists():
         return read_record(record)

@@ -110,10 +110,8 @@ def cost_fields(
 ) -> dict[str, Any]:
     """The columns of `Point` that say what it costs, for the CPU.
 
-    Args:
-        rates: wall seconds per simulated second, of each repeat.
-        workload: those of the reference workload before and after.
-        processor_rate: processor seconds per simulated second.
+    From wall seconds per simulated second, of each repeat and of the reference workload before and after, and processor
+    seconds per simulated second.
     """
     median, reference = statistics.median(rates), statistics.median(workload)
     cost = processor_rate if median > SHARED * processor_rate else median
