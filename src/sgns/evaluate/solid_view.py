@@ -103,26 +103,21 @@ class DepthBuffer:
             if abs(normal[2]) < 1e-9 * max(length, 1e-12) or length == 0.0:
                 continue  # seen edge-on
             normal = normal * np.sign(normal[2]) / length
-            self._fill(triangle, normal, brightness(normal) * np.asarray(colour))
+            self._fill(triangle, brightness(normal) * np.asarray(colour))
 
-    def _fill(self, triangle: np.ndarray, normal: np.ndarray, colour: np.ndarray) -> None:
+    def _fill(self, triangle: np.ndarray, colour: np.ndarray) -> None:
         height, width = self.nearness.shape
-        grid = (triangle[:, :2] - self.low) / self.pixel
-        first = np.maximum(np.floor(grid.min(axis=0)).astype(int), 0)
-        last = np.minimum(np.ceil(grid.max(axis=0)).astype(int), [width, height])
+        corners = (triangle[:, :2] - self.low) / self.pixel
+        first = np.maximum(np.floor(corners.min(axis=0)).astype(int), 0)
+        last = np.minimum(np.ceil(corners.max(axis=0)).astype(int), [width, height])
         if (last <= first).any():
             return
         x, y = np.meshgrid(np.arange(first[0], last[0]) + 0.5, np.arange(first[1], last[1]) + 0.5)
-        sides = [
-            (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
-            for a, b in zip(grid, np.roll(grid, -1, axis=0), strict=True)
-        ]
-        inside = np.all(np.stack(sides) >= 0.0, axis=0) | np.all(np.stack(sides) <= 0.0, axis=0)
-        right, up = x * self.pixel + self.low[0], y * self.pixel + self.low[1]
-        slope = normal[0] * (right - triangle[0, 0]) + normal[1] * (up - triangle[0, 1])
-        nearness = triangle[0, 2] - slope / normal[2]
+        # Barycentric coordinates; what lies on a side shared by two triangles belongs to both.
+        weights = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(np.c_[corners, np.ones(3)])
+        nearness = weights @ triangle[:, 2]
         window = np.s_[first[1] : last[1], first[0] : last[0]]
-        seen = inside & (nearness > self.nearness[window])
+        seen = (weights >= -1e-9).all(axis=-1) & (nearness > self.nearness[window])
         self.nearness[window][seen] = nearness[seen]
         self.colour[window][seen] = colour
 

@@ -119,16 +119,6 @@ def plain(value: Any) -> Any:
 
 # --- The tables of a report -----------------------------------------------------------------------------
 
-COST_ROWS = (
-    "wall seconds per simulated second",
-    "solver's time / this",
-    "training, wall seconds per step",
-    "training, wall seconds in all",
-    "numbers that describe the soil at a moment",
-    "learned parameters",
-    "checkpoint [MB]",
-    "peak memory of the process [MB]",
-)
 GUESSES = {"frozen": "frozen", "const. velocity": "constant_velocity"}
 
 
@@ -238,32 +228,29 @@ def example_columns(evaluation: Evaluation) -> list[Column]:
 
 def cost_columns(evaluation: Evaluation) -> list[Column]:
     """Time and memory of solver, network and, if measured, the network on every particle: a column each."""
-    timing, costs, n = evaluation.timing, evaluation.costs, evaluation.particle_count
-    solver = evaluation.total.solver_rate
-    rollout, decoded = timing.rollout, timing.decoded
-    columns = {
-        "solver (MPM)": (solver, 1.0, None, None, 6 * n, None, None, math.nan),
-        "network": (
-            rollout,
-            solver / rollout,
-            costs.seconds_per_step,
-            costs.training_seconds,
-            3 * evaluation.num_modes,
-            costs.parameters,
-            1e-6 * costs.checkpoint_bytes,
-            1e-6 * timing.rollout_bytes,
+    timing, costs, full = evaluation.timing, evaluation.costs, evaluation.full_space
+    solver, n = evaluation.total.solver_rate, evaluation.particle_count
+    names = ["solver (MPM)", "network", "network, particles decoded"] + ["full space, untrained"] * bool(full)
+    rows = {
+        "wall seconds per simulated second": (solver, timing.rollout, timing.decoded, full and full.rollout),
+        "solver's time / this": (
+            *(1.0, solver / timing.rollout, solver / timing.decoded),
+            full and solver / full.rollout,
         ),
-        "network, particles decoded": (
-            *(decoded, solver / decoded, None, None, 3 * n, None, None),
-            1e-6 * timing.decoded_bytes,
+        "training, wall seconds per step": (None, costs.seconds_per_step, None, full and full.training_step),
+        "training, wall seconds in all": (None, costs.training_seconds, None, None),
+        "numbers that describe the soil at a moment": (6 * n, 3 * evaluation.num_modes, 3 * n, 3 * n),
+        "learned parameters": (None, costs.parameters, None, full and full.parameters),
+        "checkpoint [MB]": (None, 1e-6 * costs.checkpoint_bytes, None, None),
+        "peak memory of the process [MB]": (
+            *(math.nan, 1e-6 * timing.rollout_bytes, 1e-6 * timing.decoded_bytes),
+            full and 1e-6 * full.peak_bytes,
         ),
     }
-    if full := evaluation.full_space:
-        times = (full.rollout, solver / full.rollout, full.training_step, None)
-        columns["full space, untrained"] = (*times, 3 * n, full.parameters, None, 1e-6 * full.peak_bytes)
+    columns = zip(names, zip(*rows.values(), strict=True), strict=False)
     return [
-        Column("", COST_ROWS, text=True),
-        *(Column(heading, [quantity(value) for value in values]) for heading, values in columns.items()),
+        Column("", list(rows), text=True),
+        *(Column(name, [quantity(value) for value in values]) for name, values in columns),
     ]
 
 

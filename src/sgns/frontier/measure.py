@@ -71,8 +71,8 @@ Measured = tuple[Point, Mapping[str, Observation]]
 
 def new_point(study: Study, scene: StudyScene, kind: str, entry: PointSettings, **columns: Any) -> Point:
     """What a point says of itself before anything is measured."""
-    columns = {"label": entry.label, "paper": entry.paper, "includes": INCLUDES[kind]} | columns
-    return Point(study=study.name, scene=scene.name, kind=kind, axis=entry.axis, **columns)
+    columns |= {"axis": entry.axis, "label": entry.label, "paper": entry.paper, "includes": INCLUDES[kind]}
+    return Point(study=study.name, scene=scene.name, kind=kind, **columns)
 
 
 def measure_if_missing(
@@ -154,34 +154,21 @@ def timed_run(overrides: list[str]) -> tuple[Observation, list[float], float, in
 # point for each r. One stream over the dataset's training runs serves all entries; held out are its other runs.
 
 
-@dataclass(frozen=True, eq=False)
-class ReductionPoint:
-    """A centring and a number of modes, of an entry."""
-
-    entry: PointSettings
-    centring: str
-    modes: int
-
-    @property
-    def label(self) -> str:
-        """Of the point."""
-        return f"{self.entry.label}, r {self.modes}"
-
-
-def reduction_points(scene: StudyScene) -> Iterator[ReductionPoint]:
-    """All points of a scene's entries.
+def reduction_points(scene: StudyScene) -> Iterator[PointSettings]:
+    """All points of a scene's entries, with `centring` and one number of `modes` each.
 
     Raises:
         UserError: An entry lacks its keys, or they make no sense.
     """
     for entry in scene.points("reduction"):
         where = f"study.scenes.{scene.name}.reduction, {entry.label!r}"
-        centring, modes = (dict(entry.more or {}).get(key) for key in ("centring", "modes"))
+        centring, modes = (entry.more.get(key) for key in ("centring", "modes"))
         if centring not in CENTRINGS:
             raise UserError(f"{where}: centring is {centring!r}; allowed: {', '.join(CENTRINGS)}")
         if not isinstance(modes, list) or not all(type(r) is int and r >= 1 for r in modes):
             raise UserError(f"{where}: modes is {modes!r}; it must be a list of whole numbers, 1 or more")
-        yield from (ReductionPoint(entry, centring, r) for r in modes)
+        for r in modes:
+            yield replace(entry, label=f"{entry.label}, r {r}", more={"centring": centring, "modes": r})
 
 
 def measure_reduction(study: Study) -> None:
@@ -197,38 +184,37 @@ def measure_reduction(study: Study) -> None:
                         measure_reductions_of(study, scene, missing)
 
 
-def measure_reductions_of(study: Study, scene: StudyScene, missing: list[ReductionPoint]) -> None:
+def measure_reductions_of(study: Study, scene: StudyScene, missing: list[PointSettings]) -> None:
     """Fit, measure and keep."""
     watch = stopwatch()
     dataset = Dataset.open(training_settings(scene.dataset, ())["dataset"]["path"])
     training, held_out = dataset.runs("train"), [*dataset.runs("validation"), *dataset.runs("test")]
-    pca = fit_runs(training, max(p.modes for p in missing))
+    pca = fit_runs(training, max(p.more["modes"] for p in missing))
     log.info("%s, reduction: fitted on %d runs (%.0f s)", scene.name, len(training), watch()[0])
     # Mean square [m²] about each particle's mean place: what the energy is a share of, for every centring.
     motion = float(reconstruction_curve(held_out, pca.basis("particle_axis", 1))[0])
     workload = Workload()
-    for centring in dict.fromkeys(p.centring for p in missing):
+    for centring in dict.fromkeys(p.more["centring"] for p in missing):
         basis = pca.basis(centring, pca.rank(centring))
-        asked = [p for p in missing if p.centring == centring]
+        asked = [p for p in missing if p.more["centring"] == centring]
+        found = [p for p in asked if p.more["modes"] <= basis.num_modes]
         curve = reconstruction_curve(held_out, basis)
         before = workload.measure()
-        times = {
-            p: coding_times(basis.sliced(p.modes), held_out[0]) for p in asked if p.modes <= basis.num_modes
-        }
+        times = [coding_times(basis.sliced(p.more["modes"]), held_out[0]) for p in found]
         speed = [*before, *workload.measure()]
-        for p, (wall, processor, decoding) in times.items():
-            mse = float(curve[p.modes])
-            changes = [f"reduction.centring={p.centring}", f"reduction.num_modes={p.modes}"]
-            if p.modes > 64:  # kept by default
-                changes.append(f"reduction.max_modes={p.modes}")
+        for p, (wall, processor, decoding) in zip(found, times, strict=True):
+            r = p.more["modes"]
+            mse = float(curve[r])
+            changes = [f"reduction.centring={centring}", f"reduction.num_modes={r}"]
+            if r > 64:  # kept by default
+                changes.append(f"reduction.max_modes={r}")
             point = new_point(
                 study,
                 scene,
                 "reduction",
-                p.entry,
-                label=p.label,
+                p,
                 settings=shlex.join([f"dataset={scene.dataset}", *changes]),
-                modes=float(p.modes),
+                modes=float(r),
                 particles=float(len(basis.modes)),
                 own_runs=float(len(held_out)),
                 own_position_rmse_mm=1e3 * mse**0.5,
@@ -240,7 +226,7 @@ def measure_reductions_of(study: Study, scene: StudyScene, missing: list[Reducti
                 **made_here(),
             )
             study.store.save(point, {})
-        if beyond := [p.modes for p in asked if p not in times]:
+        if beyond := [p.more["modes"] for p in asked if p not in found]:
             log.info("%s: r %s left out, the data has %d modes", scene.name, beyond, basis.num_modes)
     log.info("%s, reduction: %d points (%.0f s)", scene.name, len(missing), watch()[0])
 
@@ -524,15 +510,14 @@ class TrainingPlan:
             UserError: A key is unknown, or its value makes no sense.
         """
         where = f"study.scenes.{scene.name}.surrogate, {entry.label!r}"
-        values = dict(scene.settings.get("training") or {}) | dict(entry.more or {})
+        values = dict(scene.settings.get("training") or {}) | entry.more
         known = [field.name for field in fields(cls)]
         if unknown := set(values) - set(known):
             allowed = ", ".join([*known, "table with case"])
             raise UserError(f"{where} has the unknown key {min(unknown)!r}; allowed: {allowed}")
         plan = cls(**values)
-        if isinstance(plan.seconds, bool) or not isinstance(plan.seconds, (int, float)) or not (
-            0 < plan.seconds < math.inf
-        ):  # fmt: skip
+        number = isinstance(plan.seconds, (int, float)) and not isinstance(plan.seconds, bool)
+        if not (number and 0 < plan.seconds < math.inf):
             raise UserError(f"{where}: seconds is {plan.seconds!r}; it must be a number above 0")
         for key, low in (("runs", 1), ("every", 1), ("seed", 0)):
             value = getattr(plan, key)
@@ -547,7 +532,7 @@ def measure_surrogates(study: Study) -> None:
     with one_core(last=True):
         for scene in study.scenes:
             for entry in scene.points("surrogate"):
-                if "table" in (entry.more or {}):
+                if "table" in entry.more:
                     measure_elsewhere(study, scene, entry)
                     continue
                 plan = TrainingPlan.of(scene, entry)
@@ -677,8 +662,7 @@ FULL_SPACE_COLUMNS = {  # of a point → of the table
 
 def measure_elsewhere(study: Study, scene: StudyScene, entry: PointSettings) -> None:
     """Take a line of a table of experiments/full_space, anew each time; nothing where the table is not there."""
-    more = dict(entry.more or {})
-    file, case = Path(str(more["table"])), str(more.get("case"))
+    file, case = Path(str(entry.more["table"])), str(entry.more.get("case"))
     if not file.exists():
         log.info("%s: %s is left out, there is no %s here", scene.name, entry.label, file)
         return

@@ -11,7 +11,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -226,7 +226,7 @@ class PointSettings:
     label: str
     set: tuple[str, ...] = ()  # overrides: of `sgns simulate` for the solver, of `sgns train` for surrogates
     paper: bool = False  # it is an operating point of the paper
-    more: Mapping[str, Any] | None = None  # further keys that only one axis knows
+    more: Mapping[str, Any] = field(default_factory=dict)  # further keys that only one axis knows
 
     @classmethod
     def from_dict(cls, data: Any, where: str) -> PointSettings:
