@@ -45,13 +45,6 @@ def cpu_model() -> str:
     return platform.processor() or platform.machine() or "unknown"
 
 
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def command_line() -> str:
     """The `sgns` command that is running with its overrides; empty outside Hydra."""
     from hydra.core.hydra_config import HydraConfig
@@ -65,6 +58,7 @@ def command_line() -> str:
 def provenance(simulator: Simulator, checkpoint: Path) -> dict[str, str]:
     """Name → value, in the order to show; what is not known is left out."""
     settings = simulator.card.get("settings", {})
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     facts = {
         "command": command_line(),
         "checkpoint": str(checkpoint),
@@ -75,7 +69,7 @@ def provenance(simulator: Simulator, checkpoint: Path) -> dict[str, str]:
         "history frames": str(simulator.history),
         "basis fitted on": f"{len(simulator.basis.fitted_on)} training runs",
         "package": f"sgns {__version__}, torch {torch.__version__}, Python {platform.python_version()}",
-        "machine": f"{cpu_model()}, {usable_cores()} cores, {platform.system()}",
+        "machine": f"{cpu_model()}, {cores} cores, {platform.system()}",
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
     }
     return {name: value for name, value in facts.items() if value}
