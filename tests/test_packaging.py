@@ -81,6 +81,13 @@ def test_every_setting_file_is_readable_and_ends_in_yaml() -> None:
         assert (FOLDERS["sgns.conf"] / f"{command}.yaml").is_file()
 
 
+def test_templates_and_tables_are_installed(project: dict) -> None:
+    installed = project["tool"]["setuptools"]["package-data"]
+    for path in FOLDERS["sgns"].rglob("*"):
+        if path.suffix in (".j2", ".csv"):
+            assert any(path.match(pattern) for pattern in installed[f"sgns.{path.parent.name}"]), path
+
+
 def test_the_solver_stands_alone() -> None:
     for path in FOLDERS["mpm_warp"].rglob("*.py"):
         assert not imports_of(path) & {"sgns", "torch", "hydra", "omegaconf", "lightning"}, path

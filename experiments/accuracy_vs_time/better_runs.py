@@ -11,13 +11,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
+from sgns.frontier.measure import observed
 from sgns.frontier.observation import compare, errors
 from sgns.frontier.point import Point
-from sgns.frontier.study import Study, composed_scene
-from sgns.frontier.surrogate_points import observed
+from sgns.frontier.study import Study, composed, composed_scene
 from sgns.simulator import Simulator
 
 SHOWN = ("force_nrmse", "draft_mean_error", "vertical_mean_error", "position_rmse_mm", "surface_rmse_mm")
@@ -29,8 +28,7 @@ def main() -> None:
     parser.add_argument("--study", type=Path, required=True, help="folder of a finished study=full")
     parser.add_argument("--set", nargs="*", default=[], help="overrides that made the training runs")
     options = parser.parse_args()
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        settings = OmegaConf.to_container(compose("frontier", ["study=full"]).study, resolve=True)
+    settings = OmegaConf.to_container(composed("frontier", ["study=full"]).study, resolve=True)
     study = Study.from_settings(settings, options.study)
     cut = next(scene for scene in study.scenes if scene.name == "cut")
     reference = Point(study.name, cut.name, "solver", "reference", cut.reference.label)

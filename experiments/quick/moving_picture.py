@@ -49,7 +49,7 @@ def main() -> None:
 
 def picture(truth: Run, network: Run, frame: int, scales: Scales) -> Image.Image:
     """One frame: the two side views, and the draft up to it."""
-    view = VIEW * scales.aspect
+    view = VIEW * np.ptp(scales.z_limits) / np.ptp(scales.x_limits)
     height = 2.0 * (view + 0.27) + 0.25
     figure = Figure(figsize=(WIDTH, height), dpi=DPI)
     canvas = FigureCanvasAgg(figure)

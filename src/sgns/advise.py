@@ -18,9 +18,7 @@ from sgns.frontier.point import Point, effective_error, read_points, usable
 
 log = logging.getLogger(__name__)
 
-
-STEP = 1.0 / 60.0
-"""Simulated time of one step: what `time` is the wall time of [s]."""
+STEP = 1.0 / 60.0  # simulated time of one step: what `time` is the wall time of [s]
 # Key of `error` → column, what one of its units is of the key's, and words. Lengths are metres in settings.
 ERRORS = {
     "force": ("force_nrmse", 1.0, "force NRMSE", ""),
@@ -28,33 +26,19 @@ ERRORS = {
     "surface": ("surface_rmse_mm", 1e3, "surface at the end", " mm"),
     "sinkage": ("sinkage_error_mm", 1e3, "sinkage", " mm"),
 }
-OWN = {
-    "force": "own_force_nrmse",
-    "position": "own_position_rmse_mm",
-    "surface": "own_surface_rmse_mm",
-    "sinkage": "own_sinkage_error_mm",
-}
+OWN = {key: f"own_{column}" for key, (column, *_) in ERRORS.items()}
 
 
 @dataclass(frozen=True)
 class Wish:
-    """What a person needs.
+    """What a person needs."""
 
-    Attributes:
-        scene: whose points are looked at.
-        errors: column of `Point` → largest error, in the column's unit.
-        time: longest wall time of a step of `STEP` [s], or None.
-        particles: whether the positions of all particles are wanted in every step.
-        bands: column → how wrong the reference itself may be.
-        columns: key of `error` → the column it is about.
-    """
-
-    scene: str
-    errors: Mapping[str, float]
-    time: float | None
-    particles: bool
-    bands: Mapping[str, float]
-    columns: Mapping[str, str]
+    scene: str  # whose points are looked at
+    errors: Mapping[str, float]  # column of `Point` → largest error, in the column's unit
+    time: float | None  # longest wall time of a step of `STEP` [s], or None
+    particles: bool  # whether the positions of all particles are wanted in every step
+    bands: Mapping[str, float]  # column → how wrong the reference itself may be
+    columns: Mapping[str, str]  # key of `error` → the column it is about
 
     def step_time(self, point: Point) -> float:
         """Wall time of a step of a point [s]; NaN if it is not known."""
@@ -85,7 +69,7 @@ def chosen(points: Sequence[Point], wish: Wish) -> tuple[Point, bool]:
     Raises:
         UserError: no point of the scene has the errors asked for.
     """
-    there = [
+    candidates = [
         p
         for p in points
         if p.scene == wish.scene
@@ -93,19 +77,19 @@ def chosen(points: Sequence[Point], wish: Wish) -> tuple[Point, bool]:
         and not (p.kind == "surrogate" and p.note)  # the note says what the command leaves out
         and not math.isnan(wish.excess(p) + wish.step_time(p))
     ]
-    if not there:
+    if not candidates:
         raise UserError(
             f"no operating point of task={wish.scene} has all the numbers asked for; its kinds of error are "
             f"in points.csv"
         )
-    good = [p for p in there if wish.excess(p) <= 1.0]
+    good = [p for p in candidates if wish.excess(p) <= 1.0]
     if good and wish.errors:
         return min(good, key=wish.step_time), True
     if good:
         force = wish.columns["force"]
         with_force = [p for p in good if not math.isnan(wish.error(p, force))] or good
         return min(with_force, key=lambda p: (wish.error(p, force), wish.step_time(p))), True
-    return min(there, key=lambda p: (wish.excess(p), wish.step_time(p))), False
+    return min(candidates, key=lambda p: (wish.excess(p), wish.step_time(p))), False
 
 
 def advice(points: Sequence[Point], wish: Wish) -> list[str]:

@@ -34,10 +34,10 @@ from sgns.data.published import read_published
 from sgns.data.run import Run
 from sgns.evaluate.costs import network_costs
 from sgns.evaluate.figures import read_log
+from sgns.frontier.measure import read_record
 from sgns.frontier.observation import read_observation
 from sgns.frontier.point import read_points
 from sgns.frontier.study import Store
-from sgns.frontier.surrogate_points import read_record
 from sgns.model.checkpoint import load_surrogate, read_checkpoint
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, read_reduced, reduce_dataset

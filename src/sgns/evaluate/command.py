@@ -11,7 +11,6 @@ import os
 import statistics
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,9 +33,9 @@ from sgns.evaluate.results import (
     Evaluation,
     NetworkTiming,
     aggregate,
-    overlap_warning,
     run_scores,
     seen_before,
+    seen_warning,
 )
 from sgns.evaluate.tables import write_tables
 from sgns.evaluate.words import describe, forward_name, short_names
@@ -63,29 +62,21 @@ def roll_out(simulator: Simulator, run: Run) -> Rollout:
 
 def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTiming:
     """Times rollouts along one run's tool path, after one that warms up."""
-    stepping, decoding = [], []
+    times = []
     with Run(path) as run, single_thread():
         simulated = (run.frame_count - simulator.history) / run.frame_rate
-        for repeat in range(repeats + 1):
+        for _ in range(repeats + 1):
             forget_peak()
             rollout = roll_out(simulator, run)
-            stepping_bytes = peak_memory()
+            rollout_bytes = peak_memory()
             forget_peak()
             began = time.perf_counter()
             for latent in torch.as_tensor(rollout.latent):
                 simulator.basis.inverse(latent)
-            if repeat:
-                stepping.append(float(rollout.wall_time_s) / simulated)
-                decoding.append(stepping[-1] + elapsed(began, time.perf_counter()) / simulated)
-            decoding_bytes = peak_memory()
-        return NetworkTiming(
-            statistics.median(stepping),
-            statistics.median(decoding),
-            len(stepping),
-            path.stem,
-            stepping_bytes,
-            decoding_bytes,
-        )
+            per_second = float(rollout.wall_time_s) / simulated
+            times.append((per_second, per_second + elapsed(began, time.perf_counter()) / simulated))
+        medians = (statistics.median(kind) for kind in zip(*times[1:], strict=True))
+        return NetworkTiming(*medians, repeats, path.stem, rollout_bytes, peak_memory())
 
 
 def full_basis(dataset: Dataset, basis: Basis) -> Basis:
@@ -142,18 +133,10 @@ def evaluate(
     full_space: bool = False,
     made: dict[str, str] | None = None,
 ) -> Evaluation:
-    """Rolls out every run of a split, measures, and writes `rollouts/`, `metrics.csv` and `metrics.json`.
+    """Rolls out every run of a split, measures, and writes `rollouts/`, `metrics.csv` and `metrics.json` into `output`.
 
-    Args:
-        simulator: the trained `Simulator`.
-        dataset: `Dataset` with the runs.
-        output: folder to write to.
-        split: `train`, `validation` or `test`.
-        checkpoint: file of the simulator, for messages and the rollouts' run files.
-        new_rollouts: run files without truth, checked here and shown in the report.
-        repeats: timed rollouts.
-        full_space: whether to measure what the same network would cost on every particle.
-        made: how it was made, for the report.
+    `new_rollouts` are run files without truth, checked here and shown in the report; `full_space` is whether to measure
+    what the same network would cost on every particle; `made` says how the evaluation was made, for the report.
     """
     network = model_settings(simulator.card["model"]) if full_space else None
     if full_space and not isinstance(network, ModelSettings):
@@ -183,7 +166,7 @@ def evaluate(
             f"cannot write to output={output}: {error.strerror}; give a folder that you may write to"
         ) from error
     history = int(simulator.history)
-    mean_force, mean_torque = training_means(dataset.runs("train"), history)
+    means = training_means(dataset.runs("train"), history)
     start = np.asarray(simulator.start_positions, dtype=np.float64)
     grid = surface_grid(start)
 
@@ -191,24 +174,20 @@ def evaluate(
     labels = short_names([path.stem for path in paths])
     for path, label in zip(tqdm(paths, desc="rolling out", unit="run", disable=None), labels, strict=True):
         target = output / "rollouts" / f"{path.stem}.h5"
-        with ExitStack() as stack:
-            truth = stack.enter_context(Run(path))
-            write_rollout(
-                target,
-                simulator,
-                truth.scene,
-                roll_out(simulator, truth),
-                effects=truth.effects,
-                seed=truth.seed,
-                checkpoint=checkpoint,
-                given_frames=history,
-                mesh=truth.mesh,
-            )
-            prediction = stack.enter_context(Run(target))
-            errors = position_errors(truth, prediction, simulator.basis, history, grid)
+        with Run(path) as truth:
+            rollout = roll_out(simulator, truth)
+            recorded = {
+                "effects": truth.effects,
+                "seed": truth.seed,
+                "mesh": truth.mesh,
+                "given_frames": history,
+            }
+            write_rollout(target, simulator, truth.scene, rollout, checkpoint=checkpoint, **recorded)
+            with Run(target) as prediction:
+                errors = position_errors(truth, prediction, simulator.basis, history, grid)
+                body = body_errors(truth, prediction, history)
+                scores = run_scores(path.stem, errors, truth, prediction, history, *means, body)
             words, wheel = describe(truth.scene), is_wheel(truth.scene)
-            body = body_errors(truth, prediction, history)
-            scores = run_scores(path.stem, errors, truth, prediction, history, mean_force, mean_torque, body)
         runs.append(EvaluatedRun(path.stem, label, words, path, target, errors, scores, wheel))
 
     trained_on, chosen_by = seen_before(simulator, [run.name for run in runs])
@@ -220,8 +199,8 @@ def evaluate(
         timing=time_network(simulator, paths[0], repeats),
         costs=costs,
         full_space=full_space_cost(paths[0], network, repeats) if network else None,
-        mean_force=mean_force,
-        mean_torque=mean_torque,
+        mean_force=means[0],
+        mean_torque=means[1],
         training_log=training_log,
         trained_on=trained_on,
         chosen_by=chosen_by,
@@ -241,40 +220,26 @@ def evaluate(
 def log_summary(evaluation: Evaluation, report: Path) -> None:
     """The main numbers on the terminal."""
     total, timing = evaluation.total, evaluation.timing
-    if warning := overlap_warning(evaluation):
+    if warning := seen_warning(evaluation):
         log.warning("%s", warning)
-    log.info("%d %s runs of %s", len(evaluation.runs), evaluation.split, evaluation.dataset)
-    log.info(
-        "position: RMSE %.3g mm (reduction alone %.3g, frozen %.3g); skill %.3f against frozen, %.3f "
-        "against constant velocity",
-        total.rmse_mm("total"),
-        total.rmse_mm("reduction"),
-        total.rmse_mm("frozen"),
-        total.skill(),
-        total.skill("constant_velocity"),
-    )
-    log.info(
-        "force: NRMSE %.3f (mean force of the training split: %.3f); %s MAE %.3g N, vertical MAE %.3g N",
-        total.force.overall_nrmse,
-        total.mean_force.overall_nrmse,
-        forward_name(evaluation),
-        total.force.mae[0],
-        total.force.mae[2],
-    )
-    log.info(
-        "wall seconds per simulated second: network %.3g (with decoding %.3g, one thread), solver %.3g",
-        timing.stepping,
-        timing.decoding,
-        total.solver_rate,
-    )
+    lines = [
+        f"{len(evaluation.runs)} {evaluation.split} runs of {evaluation.dataset}",
+        f"position: RMSE {total.rmse_mm('total'):.3g} mm (reduction alone {total.rmse_mm('reduction'):.3g}, frozen "
+        f"{total.rmse_mm('frozen'):.3g}); skill {total.skill():.3f} against frozen, "
+        f"{total.skill('constant_velocity'):.3f} against constant velocity",
+        f"force: NRMSE {total.force.overall_nrmse:.3f} (mean force of the training split: "
+        f"{total.mean_force.overall_nrmse:.3f}); {forward_name(evaluation)} MAE {total.force.mae[0]:.3g} N, vertical "
+        f"MAE {total.force.mae[2]:.3g} N",
+        f"wall seconds per simulated second: network {timing.rollout:.3g} (with decoding {timing.decoded:.3g}, one "
+        f"thread), solver {total.solver_rate:.3g}",
+    ]
     if full := evaluation.full_space:
-        log.info(
-            "the same network on every particle: %.3g s per simulated second, %.3g s per training step of %d samples",
-            full.rollout,
-            full.training_step,
-            full.batch_size,
+        lines.append(
+            f"the same network on every particle: {full.rollout:.3g} s per simulated second, {full.training_step:.3g} "
+            f"s per training step of {full.batch_size} samples"
         )
-    log.info("report: %s", report)
+    for line in [*lines, f"report: {report}"]:
+        log.info("%s", line)
 
 
 def main(cfg: DictConfig) -> float:
@@ -290,15 +255,15 @@ def main(cfg: DictConfig) -> float:
     if not isinstance(cfg.full_space, bool):
         raise UserError(f"full_space is {cfg.full_space!r}; it must be true or false")
     checkpoint, output = Path(cfg.checkpoint), Path(cfg.output)
-    if cfg.dataset.get("format") == "published":
-        from sgns.evaluate.published import evaluate_published
-
-        simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
-        with only_here(output / "metrics.json"):
-            return evaluate_published(simulator, cfg.dataset, cfg.split, output, checkpoint)
-    dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
+    published = cfg.dataset.get("format") == "published"
+    if not published:
+        dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
     simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
     with only_here(output / "metrics.json"):
+        if published:
+            from sgns.evaluate.published import evaluate_published
+
+            return evaluate_published(simulator, cfg.dataset, cfg.split, output, checkpoint)
         evaluation = evaluate(
             simulator,
             dataset,

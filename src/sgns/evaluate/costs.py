@@ -45,13 +45,6 @@ def cpu_model() -> str:
     return platform.processor() or platform.machine() or "unknown"
 
 
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def command_line() -> str:
     """The `sgns` command that is running with its overrides; empty outside Hydra."""
     from hydra.core.hydra_config import HydraConfig
@@ -63,13 +56,9 @@ def command_line() -> str:
 
 
 def provenance(simulator: Simulator, checkpoint: Path) -> dict[str, str]:
-    """Name → value, in the order to show; what is not known is left out.
-
-    Args:
-        simulator: the trained `Simulator`; its card tells how it was trained.
-        checkpoint: file it was loaded from.
-    """
+    """Name → value, in the order to show; what is not known is left out."""
     settings = simulator.card.get("settings", {})
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     facts = {
         "command": command_line(),
         "checkpoint": str(checkpoint),
@@ -80,7 +69,7 @@ def provenance(simulator: Simulator, checkpoint: Path) -> dict[str, str]:
         "history frames": str(simulator.history),
         "basis fitted on": f"{len(simulator.basis.fitted_on)} training runs",
         "package": f"sgns {__version__}, torch {torch.__version__}, Python {platform.python_version()}",
-        "machine": f"{cpu_model()}, {usable_cores()} cores, {platform.system()}",
+        "machine": f"{cpu_model()}, {cores} cores, {platform.system()}",
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
     }
     return {name: value for name, value in facts.items() if value}
@@ -90,40 +79,24 @@ def provenance(simulator: Simulator, checkpoint: Path) -> dict[str, str]:
 
 
 def network_costs(checkpoint: Path, card: dict[str, Any]) -> Costs:
-    """What a checkpoint and the folder it lies in tell.
-
-    Args:
-        checkpoint: file; nothing is known if there is none.
-        card: of the simulator that was loaded from it.
-    """
-    return Costs(**stored(checkpoint), **trained(checkpoint, card))
-
-
-def stored(checkpoint: Path) -> dict[str, float]:
-    """Size of the checkpoint and number of its learned weights; nothing if it is no file."""
-    if not checkpoint.is_file():
-        return {}
-    weights = load_surrogate(checkpoint).dynamics.parameters()
-    return {
-        "parameters": sum(weight.numel() for weight in weights),
-        "checkpoint_bytes": checkpoint.stat().st_size,
-    }
-
-
-def trained(checkpoint: Path, card: dict[str, Any]) -> dict[str, float]:
-    """What `training.json` beside the checkpoint says of the training; nothing without it.
+    """What a checkpoint, its simulator's card and the folder it lies in tell; nothing is known if there is no file.
 
     Raises:
-        UserError: it is damaged.
+        UserError: `training.json` beside the checkpoint is damaged.
     """
-    if not os.path.lexists(checkpoint.parent / SUMMARY):
-        return {}
-    summary = read_summary(checkpoint.parent)
-    found = {"training_seconds": float(summary["seconds"])}
-    if "steps" in summary:  # polynomials are fitted without any
-        found["training_steps"] = summary["steps"]
-    batch = card.get("settings", {}).get("training", {}).get("batch_size")
-    return found | ({"batch_size": int(batch)} if batch else {})
+    found: dict[str, float] = {}
+    if checkpoint.is_file():
+        weights = load_surrogate(checkpoint).dynamics.parameters()
+        found["parameters"] = sum(weight.numel() for weight in weights)
+        found["checkpoint_bytes"] = checkpoint.stat().st_size
+    if os.path.lexists(checkpoint.parent / SUMMARY):
+        summary = read_summary(checkpoint.parent)
+        found["training_seconds"] = float(summary["seconds"])
+        if "steps" in summary:  # polynomials are fitted without any
+            found["training_steps"] = summary["steps"]
+        if batch := card.get("settings", {}).get("training", {}).get("batch_size"):
+            found["batch_size"] = int(batch)
+    return Costs(**found)
 
 
 # --- memory of this process, as Linux counts it -----------------------------------------------------------
@@ -156,12 +129,9 @@ _REACH = 4 / 3  # radius of the neighbourhood in particle spacings: 6 neighbours
 
 
 def full_space_cost(path: Path, settings: ModelSettings, repeats: int) -> FullSpaceCost:
-    """Time and memory of a step, with the tool half-way along a run.
+    """Time and memory of a step, with the tool half-way along a run; medians of repeats after one to warm up.
 
-    Args:
-        path: the run.
-        settings: of the network; its body has nodes on its surface whatever `body_nodes` says.
-        repeats: timed steps, after one to warm up; medians count.
+    The network's body has nodes on its surface whatever `body_nodes` says.
     """
     with Run(path) as run:
         spacing = float(np.prod(run.scene["bed"]["size"]) / run.particle_count) ** (1 / 3)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -18,14 +18,23 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import LogFormatter, LogLocator, MaxNLocator, NullFormatter
 from mpl_toolkits.mplot3d import Axes3D
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mpm_warp.inputs import open_file
 from sgns.config import UserError
 from sgns.data.run import Run, frame_chunks
-from sgns.evaluate.metrics import ParticleErrors, SurfaceGrid, height_map
+from sgns.evaluate.metrics import (
+    NEGLIGIBLE_SHARE,
+    ParticleErrors,
+    PositionErrors,
+    SurfaceGrid,
+    forward_force,
+    height_map,
+    is_wheel,
+    sinkage,
+)
 from sgns.reduction.basis import Basis
 
 # --- Pictures of runs and of errors, for reports and experiments ----------------------------------------
@@ -51,24 +60,13 @@ STYLE: dict[str, Any] = {
     "lines.linewidth": 1.6,
     "text.parse_math": False,  # names of runs may hold anything
 }
-P = ParamSpec("P")
-R = TypeVar("R")
+styled = matplotlib.rc_context(STYLE)
+"""Draws in the project's style and leaves matplotlib's settings as they were."""
 
 
-def styled(draw: Callable[P, R]) -> Callable[P, R]:
-    """Draws in the project's style and leaves matplotlib's settings as they were."""
-
-    @functools.wraps(draw)
-    def inside(*args: P.args, **kwargs: P.kwargs) -> R:
-        with matplotlib.rc_context(STYLE):
-            return draw(*args, **kwargs)
-
-    return inside
-
-
-def new_figure(width: float, height: float, layout: str = "constrained") -> Figure:
+def new_figure(width: float, height: float, layout: str = "constrained", dpi: int = DPI) -> Figure:
     """An empty figure of a size in inches, drawn without a display."""
-    figure = Figure(figsize=(width, height), dpi=DPI, layout=layout)
+    figure = Figure(figsize=(width, height), dpi=dpi, layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
@@ -86,12 +84,9 @@ def png(figure: Figure) -> bytes:
 
 @styled
 def profile_figure(runs: Mapping[str, Any], frames: Sequence[int], grid: SurfaceGrid) -> Figure:
-    """Height of the surface along the middle of the bed, at some frames.
+    """Height of the surface along the middle of the bed, a panel for each of some frames.
 
-    Args:
-        runs: `Run`s by name; `truth` is drawn black, `network` blue.
-        frames: one panel each.
-        grid: columns of the height map; the two rows of columns next to mid-width are averaged.
+    The two rows of columns next to mid-width are averaged.
     """
     figure = new_figure(PICTURE_WIDTH, 1.45 * len(frames) + 0.8)
     axes = figure.subplots(len(frames), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
@@ -130,12 +125,8 @@ def middle_line(run: Any, frame: int, grid: SurfaceGrid, middle: slice) -> np.nd
 
 @styled
 def energy_figure(energy: np.ndarray, displacement_energy: np.ndarray, num_modes: int) -> Figure:
-    """What the modes do not hold of the training data's variance.
-
-    Args:
-        energy: the paper's cumulative energy for r = 1 … R, shape (R,).
-        displacement_energy: share of the variance about each particle's mean place, shape (R,).
-        num_modes: modes that the network uses.
+    """What r = 1 … R modes do not hold of the training data's variance: of the paper's cumulative energy, and of the
+    share of the variance about each particle's mean place, shape (R,) each.
     """
     figure = new_figure(PICTURE_WIDTH, 3.4)
     axis = figure.subplots()
@@ -163,12 +154,8 @@ def reconstruction_figure(
 ) -> Figure:
     """Reconstruction error for r = 1, 2, 4, … modes.
 
-    Args:
-        test: reduction MSE of the evaluated runs for r = 0 … R [m²], shape (R + 1,).
-        training: the same on the training runs for r = 1 … R, shape (R,).
-        num_modes: modes that the network uses.
-        network_rmse_mm: the network's own error, drawn as a line for comparison.
-        label: name of the evaluated runs.
+    `test` is the reduction MSE of the evaluated runs for r = 0 … R [m²], shape (R + 1,), `training` that of the
+    training runs for r = 1 … R, shape (R,); the network's own error is drawn as a line for comparison.
     """
     figure = new_figure(PICTURE_WIDTH, 3.4)
     axis = figure.subplots()
@@ -178,18 +165,12 @@ def reconstruction_figure(
         fitted = [1e3 * math.sqrt(max(training[r - 1], 0.0)) for r in shown]
         axis.loglog(shown, fitted, color=BASELINE, linestyle="--", marker=".", label="training runs")
     axis.loglog(
-        shown,
-        [1e3 * math.sqrt(test[r]) for r in shown],
-        color=ACCENT,
-        marker="o",
-        markersize=4,
-        label=label,
+        shown, [1e3 * math.sqrt(test[r]) for r in shown], color=ACCENT, marker="o", markersize=4, label=label
     )
     if network_rmse_mm is not None and math.isfinite(network_rmse_mm) and network_rmse_mm > 0.0:
         axis.axhline(network_rmse_mm, color=NETWORK, label="rollout of the network")
     log_modes(axis, last, num_modes)
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    round_numbers(axis.yaxis)
     axis.set_ylabel("reconstruction RMSE [mm]")
     axis.legend(loc="lower left")
     return figure
@@ -199,6 +180,12 @@ def plain_log_numbers(axis: Axis) -> None:
     """Numbers along a logarithmic axis without the formulas that matplotlib would write."""
     axis.set_major_formatter(LogFormatter())
     axis.set_minor_formatter(LogFormatter())
+
+
+def round_numbers(axis: Axis, most: int | None = None) -> None:
+    """0.2 in place of 2 × 10⁻¹, at 1, 2 and 5 of every decade."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=most))
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
 
 
 def log_modes(axis: Axes, last: int, num_modes: int) -> None:
@@ -220,7 +207,169 @@ def log_modes(axis: Axes, last: int, num_modes: int) -> None:
     axis.grid(alpha=0.25, linewidth=0.6)
 
 
-# --- How the position errors are spread over the particles (the paper's Fig. "Distribution of … position MS
+# --- Quantities through time of one run: panels that share their time axis ------------------------------
+
+# A force component below this share of the largest does not fill its panel.
+SMALLEST_PANEL = 0.1
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A line of a panel."""
+
+    label: str  # for the legend
+    time: np.ndarray  # [s], shape (t,)
+    values: np.ndarray  # shape (t,)
+    colour: str  # of the line
+    style: str = "-"  # matplotlib's name of the dashes
+    scaled: bool = True  # whether the panel must be large enough for it
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One quantity through time."""
+
+    label: str  # of the vertical axis, with the unit
+    curves: Sequence[Curve]  # the first is drawn lowest
+    least_height: float = 0.0  # range that the axis shows at least
+    from_zero: bool = False  # whether the axis begins at zero
+
+
+def compared(
+    label: str,
+    read: Callable[[Any], np.ndarray],
+    truth: Any,
+    prediction: Any,
+    history: int,
+    baseline: float | None = None,
+) -> Panel:
+    """A panel with the truth (None for a path that was never simulated), the prediction after its history, and
+    perhaps a constant baseline, the training runs' mean; `read` takes the values (T,) from a `Run`.
+    """
+    time = prediction.time
+    curves = [Curve("network", time[history:], read(prediction)[history:], NETWORK)]
+    if truth is not None:
+        curves.insert(0, Curve("simulated (MPM)", time, read(truth), TRUTH))
+    if baseline is not None:
+        level = np.full(len(time), baseline)
+        curves.insert(0, Curve("training mean", time, level, BASELINE, "--", scaled=False))
+    return Panel(label, curves)
+
+
+def force_panels(truth: Any, prediction: Any, history: int, mean_force: np.ndarray) -> list[Panel]:
+    """Forward, lateral and vertical force; for a wheel also its sinkage. Arguments as in `compared`."""
+    forward, sign = forward_force(prediction.scene)
+    runs = (truth, prediction, history)
+    panels = [
+        compared(f"{name} [N]", lambda run, i=i, s=s: s * run.force[:, i], *runs, s * float(mean_force[i]))
+        for i, name, s in ((0, forward, sign), (1, "lateral Fy", 1.0), (2, "vertical Fz", 1.0))
+    ]
+    # A small component is drawn as small as it is beside the largest.
+    ranges = [float(np.ptp(curve.values)) for panel in panels for curve in panel.curves if len(curve.values)]
+    panels = [replace(panel, least_height=SMALLEST_PANEL * max(ranges, default=0.0)) for panel in panels]
+    if is_wheel(prediction.scene):
+        panels.append(compared("sinkage [mm]", lambda run: 1e3 * sinkage(run.scene, run.pose), *runs))
+    return panels
+
+
+def torque_panels(truth: Any, prediction: Any, history: int, mean_torque: np.ndarray) -> list[Panel]:
+    """Torque about the axes about which there is any worth mentioning. Arguments as in `compared`."""
+    runs = [run for run in (truth, prediction) if run is not None]
+    largest = np.max([np.abs(run.torque).max(axis=0) for run in runs], axis=0)
+    return [
+        compared(
+            f"{name} [N m]",
+            lambda run, axis=axis: run.torque[:, axis],
+            truth,
+            prediction,
+            history,
+            float(mean_torque[axis]),
+        )
+        for axis, name in enumerate(("roll Tx", "pitch Ty", "yaw Tz"))
+        if largest[axis] > NEGLIGIBLE_SHARE * largest.max()
+    ]
+
+
+def error_panels(
+    errors: PositionErrors, truth: Any, prediction: Any, history: int, mean_force: np.ndarray
+) -> list[Panel]:
+    """Error of the soil's positions, of the force and, where it was predicted, of the body's place."""
+    positions = [
+        Curve(label, errors.time, 1e3 * np.sqrt(getattr(errors, key)), colour, style, scaled)
+        for key, label, colour, style, scaled in (
+            # A baseline that runs away must not flatten the curves that matter.
+            ("constant_velocity", "constant velocity", BASELINE, ":", False),
+            ("frozen", "frozen", BASELINE, "--", True),
+            ("reduction", "PCA alone", ACCENT, "-", True),
+            ("total", "network", NETWORK, "-", True),
+        )
+    ]
+    time, force = truth.time[history:], truth.force[history:]
+    force_error = [
+        Curve("training mean", time, np.linalg.norm(mean_force - force, axis=1), BASELINE, "-."),
+        Curve("network", time, np.linalg.norm(prediction.force[history:] - force, axis=1), NETWORK),
+    ]
+    panels = [
+        Panel("position RMSE [mm]", positions, from_zero=True),
+        Panel("force error [N]", force_error, from_zero=True),
+    ]
+    misplaced = 1e3 * np.linalg.norm(prediction.pose[history:, :3] - truth.pose[history:, :3], axis=1)
+    if np.any(misplaced):
+        curves = [Curve("network", time, misplaced, NETWORK)]
+        panels.append(Panel("body misplaced [mm]", curves, from_zero=True))
+    return panels
+
+
+@styled
+def history_figure(panels: Sequence[Panel]) -> Figure:
+    """Panels above each other, with one legend."""
+    figure = new_figure(PICTURE_WIDTH, 1.25 * len(panels) + 0.85)
+    axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True)[:, 0]
+    for axis, panel in zip(axes, panels, strict=True):
+        for curve in panel.curves:
+            axis.plot(curve.time, curve.values, color=curve.colour, linestyle=curve.style, label=curve.label)
+        axis.set_ylim(*limits(panel))
+        axis.set_ylabel(panel.label, fontsize=9)
+        axis.grid(alpha=0.25, linewidth=0.6)
+    axes[-1].set_xlabel("time [s]")
+    figure.align_ylabels(axes)
+    # One legend, every label once, what is drawn last first.
+    entries = {
+        label: handle
+        for axis in axes[::-1]
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    order = [label for label in ("network", "simulated (MPM)") if label in entries]
+    others = dict.fromkeys(curve.label for panel in panels for curve in panel.curves)
+    order += [label for label in others if label not in order]
+    figure.legend(
+        [entries[label] for label in order],
+        order,
+        loc="outside upper center",
+        ncols=3,
+        fontsize=8.5,
+        columnspacing=1.2,
+        handlelength=1.6,
+    )
+    return figure
+
+
+def limits(panel: Panel) -> tuple[float, float]:
+    """Range of the vertical axis."""
+    scaled = [curve.values[np.isfinite(curve.values)] for curve in panel.curves if curve.scaled]
+    values = np.concatenate([*scaled, [0.0]] if panel.from_zero else scaled)
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    missing = max(panel.least_height - (high - low), 0.0)
+    if high - low + missing <= 0.0:
+        missing = 1.0
+    room = 0.06 * (high - low + missing)
+    if panel.from_zero:
+        return 0.0, high + missing + room
+    return low - 0.5 * missing - room, high + 0.5 * missing + room
+
+
+# --- How the position errors are spread over the particles ---------------------------------------
+# The paper's Fig. "Distribution of … position MSE".
 
 BINS_PER_DECADE = 4
 # An error below a micrometre counts as one [m²]: particles that rest would fill decades with rounding.
@@ -312,8 +461,7 @@ def training_figure(log: Mapping[str, np.ndarray]) -> Figure:
         label = name.removeprefix("loss/")
         losses.plot(*log[name].T, color=COLOURS.get(label, NETWORK), label=label, linewidth=1.2)
         losses.set_yscale("log")
-        losses.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
-        losses.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        round_numbers(losses.yaxis, most=8)
         losses.yaxis.set_minor_formatter(NullFormatter())
     for name, (label, colour) in VALIDATION.items():
         if name in log:
@@ -350,11 +498,7 @@ def latent_path(run: Run, basis: Basis) -> np.ndarray:
 def subspace_view(truth: Run, prediction: Run, paths: tuple[np.ndarray, np.ndarray], frame: int) -> Figure:
     """Modes, body points and force at one frame, with the way that the modes have come.
 
-    Args:
-        truth: the simulated run.
-        prediction: the predicted run, whose body is drawn.
-        paths: `latent_path` of the two [m], shape (T, r, 3) each.
-        frame: to draw.
+    `paths` are the `latent_path` of the two runs [m], shape (T, r, 3) each.
     """
     figure = new_figure(PICTURE_WIDTH, 4.3)
     axis = figure.add_subplot(projection="3d")

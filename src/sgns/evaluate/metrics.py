@@ -13,8 +13,7 @@ import torch
 from sgns.config import UserError
 from sgns.data.run import frame_chunks
 
-# --- The body of a recorded scene: its kind, its corners, and how its force is reported -----------------
-# Scenes are plain data of a run file, of any kind.
+# --- The body of a recorded scene -----------------------------------------------------------------------
 
 
 def is_wheel(scene: Mapping[str, Any]) -> bool:
@@ -41,15 +40,10 @@ SPACINGS_PER_COLUMN = 2.0
 
 @dataclass(frozen=True)
 class SurfaceGrid:
-    """Columns of a height map.
+    """Columns of a height map."""
 
-    Attributes:
-        x_edges: borders of the columns along x [m], shape (nx + 1,), increasing, equally spaced.
-        y_edges: borders of the columns along y [m], shape (ny + 1,), increasing, equally spaced.
-    """
-
-    x_edges: np.ndarray
-    y_edges: np.ndarray
+    x_edges: np.ndarray  # borders of the columns along x [m], shape (nx + 1,), increasing, equally spaced
+    y_edges: np.ndarray  # borders of the columns along y [m], shape (ny + 1,), increasing, equally spaced
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -61,20 +55,11 @@ class SurfaceGrid:
         """Middle of the columns along x [m], shape (nx,)."""
         return 0.5 * (self.x_edges[1:] + self.x_edges[:-1])
 
-    @property
-    def y_centres(self) -> np.ndarray:
-        """Middle of the columns along y [m], shape (ny,)."""
-        return 0.5 * (self.y_edges[1:] + self.y_edges[:-1])
-
 
 def particle_spacing(positions: np.ndarray) -> float:
-    """Edge [m] of the cube that one particle occupies in an undisturbed bed.
+    """Edge [m] of the cube that one particle occupies in an undisturbed bed (n, 3) [m].
 
-    The bed reaches half a spacing s beyond its outermost particles, so Π (extent + s) = n s³, solved by
-    iteration.
-
-    Args:
-        positions: an undisturbed bed [m], shape (n, 3).
+    The bed reaches half a spacing s beyond its outermost particles, so Π (extent + s) = n s³, solved by iteration.
     """
     extent = np.ptp(np.asarray(positions, dtype=np.float64), axis=0)
     solid = extent[extent > 0.0]
@@ -87,12 +72,10 @@ def particle_spacing(positions: np.ndarray) -> float:
 
 
 def surface_grid(positions: np.ndarray, column: float | None = None) -> SurfaceGrid:
-    """Height-map columns that cover an undisturbed bed.
+    """Height-map columns that cover an undisturbed bed (n, 3) [m].
 
-    Args:
-        positions: particles of the undisturbed bed [m], shape (n, 3).
-        column: wanted edge of a column [m]; by default two particle spacings. The edge used is the
-            nearest that divides the bed's length and width.
+    Their edge is the nearest to `column` [m], by default two particle spacings, that divides the bed's length and
+    width.
     """
     positions = np.asarray(positions, dtype=np.float64)
     spacing = particle_spacing(positions)
@@ -107,16 +90,9 @@ def surface_grid(positions: np.ndarray, column: float | None = None) -> SurfaceG
 
 
 def height_map(positions: np.ndarray, grid: SurfaceGrid) -> np.ndarray:
-    """Height of the highest particle of every column.
+    """Height of the highest particle of every column [m], shape (nx, ny); NaN where a column holds no particle.
 
-    Particles beyond the grid's border count for the outermost columns.
-
-    Args:
-        positions: particles [m], shape (n, 3).
-        grid: columns of the map.
-
-    Returns:
-        Heights z [m], shape (nx, ny); NaN where a column holds no particle.
+    Particles (n, 3) [m] beyond the grid's border count for the outermost columns.
     """
     positions = np.asarray(positions)
     nx, ny = grid.shape
@@ -145,67 +121,38 @@ NEGLIGIBLE_SHARE = 0.05
 
 @dataclass(frozen=True)
 class ParticleErrors:
-    """Mean-square position errors of one run's particles, over axes and the frames after the history.
+    """Mean-square position errors of one run's particles, over axes and the frames after the history."""
 
-    Attributes:
-        reduction: PCA⁻¹PCA(truth) − truth [m²], shape (n,).
-        network: prediction − PCA⁻¹PCA(truth) [m²], shape (n,).
-    """
-
-    reduction: np.ndarray
-    network: np.ndarray
+    reduction: np.ndarray  # PCA⁻¹PCA(truth) − truth [m²], shape (n,)
+    network: np.ndarray  # prediction − PCA⁻¹PCA(truth) [m²], shape (n,)
 
 
 @dataclass(frozen=True)
 class PositionErrors:
-    """Mean-square position errors of one run at every frame after the history.
+    """Mean-square position errors of one run at every frame after the history."""
 
-    Attributes:
-        time: time of the frames [s], shape (t,).
-        reduction: PCA⁻¹PCA(truth) − truth [m²], shape (t,).
-        network: prediction − PCA⁻¹PCA(truth) [m²], shape (t,); the paper's figure.
-        total: prediction − truth [m²], shape (t,).
-        frozen: last frame of the history, kept − truth [m²], shape (t,).
-        constant_velocity: last step of the history, continued − truth [m²], shape (t,).
-        surface: height map of the prediction − of the truth [m²], shape (t,).
-        surface_frozen: height map of the last frame of the history − of the truth [m²], shape (t,).
-        particles: the same run, by particle instead of by frame; None if only frames were asked for.
-    """
-
-    time: np.ndarray
-    reduction: np.ndarray
-    network: np.ndarray
-    total: np.ndarray
-    frozen: np.ndarray
-    constant_velocity: np.ndarray
-    surface: np.ndarray
-    surface_frozen: np.ndarray
+    time: np.ndarray  # time of the frames [s], shape (t,)
+    reduction: np.ndarray  # PCA⁻¹PCA(truth) − truth [m²], shape (t,)
+    network: np.ndarray  # prediction − PCA⁻¹PCA(truth) [m²], shape (t,); the paper's figure
+    total: np.ndarray  # prediction − truth [m²], shape (t,)
+    frozen: np.ndarray  # last frame of the history, kept − truth [m²], shape (t,)
+    constant_velocity: np.ndarray  # last step of the history, continued − truth [m²], shape (t,)
+    surface: np.ndarray  # height map of the prediction − of the truth [m²], shape (t,)
+    surface_frozen: np.ndarray  # height map of the last frame of the history − of the truth [m²], shape (t,)
+    # the same run, by particle instead of by frame; None if only frames were asked for
     particles: ParticleErrors | None = None
 
     def mse(self, name: str) -> float:
         """Mean over frames of one of the errors [m²]."""
         return float(np.mean(getattr(self, name)))
 
-    def rmse_mm(self, name: str) -> float:
-        """Root of the mean over frames of one of the errors [mm]."""
-        return 1e3 * math.sqrt(self.mse(name)) if self.mse(name) >= 0.0 else math.nan
-
-    def skill(self, baseline: str = "frozen") -> float:
-        """1 − total MSE / MSE of a baseline (`frozen` or `constant_velocity`)."""
-        return skill([self.mse("total")], [self.mse(baseline)])
-
 
 @dataclass(frozen=True)
 class BodyErrors:
-    """How far a predicted body is from its true place, over the frames after the history.
+    """How far a predicted body is from its true place, over the frames after the history."""
 
-    Attributes:
-        mse: mean-square distance of the centres of mass [m²].
-        sinkage_mae: mean absolute error of a wheel's sinkage [m]; NaN for other bodies.
-    """
-
-    mse: float
-    sinkage_mae: float
+    mse: float  # mean-square distance of the centres of mass [m²]
+    sinkage_mae: float  # mean absolute error of a wheel's sinkage [m]; NaN for other bodies
 
 
 PRESCRIBED = BodyErrors(0.0, math.nan)
@@ -214,32 +161,18 @@ PRESCRIBED = BodyErrors(0.0, math.nan)
 
 @dataclass(frozen=True)
 class VectorErrors:
-    """Sums from which every metric of a predicted force or torque follows; sums of runs add up.
+    """Sums from which every metric of a predicted force or torque follows; sums of runs add up."""
 
-    Attributes:
-        samples: number of frames.
-        absolute: Σ |prediction − truth| per world axis, shape (3,).
-        squared: Σ (prediction − truth)², shape (3,).
-        truth_squared: Σ truth², shape (3,).
-        truth_sum: Σ truth, shape (3,).
-        prediction_sum: Σ prediction, shape (3,).
-    """
-
-    samples: int
-    absolute: np.ndarray
-    squared: np.ndarray
-    truth_squared: np.ndarray
-    truth_sum: np.ndarray
-    prediction_sum: np.ndarray
+    samples: int  # number of frames
+    absolute: np.ndarray  # Σ |prediction − truth| per world axis, shape (3,)
+    squared: np.ndarray  # Σ (prediction − truth)², shape (3,)
+    truth_squared: np.ndarray  # Σ truth², shape (3,)
+    truth_sum: np.ndarray  # Σ truth, shape (3,)
+    prediction_sum: np.ndarray  # Σ prediction, shape (3,)
 
     @classmethod
     def compare(cls, truth: np.ndarray, prediction: np.ndarray) -> VectorErrors:
-        """Errors of a predicted history.
-
-        Args:
-            truth: true vectors [N or N m], shape (t, 3).
-            prediction: predicted vectors, shape (t, 3), or (3,) for a constant.
-        """
+        """Errors of predicted vectors [N or N m], shape (t, 3), or (3,) for a constant, beside true ones, (t, 3)."""
         truth = np.asarray(truth, dtype=np.float64)
         prediction = np.broadcast_to(np.asarray(prediction, dtype=np.float64), truth.shape)
         difference = prediction - truth
@@ -269,9 +202,7 @@ class VectorErrors:
     def nrmse(self) -> np.ndarray:
         """RMS error / RMS of the truth per axis, shape (3,); NaN where the truth is negligible."""
         significant = self.truth_squared > NEGLIGIBLE_SHARE**2 * self.truth_squared.sum()
-        ratio = np.full(3, np.nan)
-        np.divide(self.squared, self.truth_squared, out=ratio, where=significant)
-        return np.sqrt(ratio)
+        return np.sqrt(_ratio(self.squared, self.truth_squared, significant))
 
     @property
     def overall_nrmse(self) -> float:
@@ -286,9 +217,16 @@ class VectorErrors:
         NaN where the mean of the truth is negligible beside the RMS length of the vector.
         """
         significant = np.abs(self.truth_sum) / self.samples > NEGLIGIBLE_SHARE * self.rms_truth
-        ratio = np.full(3, np.nan)
-        np.divide(self.prediction_sum - self.truth_sum, self.truth_sum, out=ratio, where=significant)
-        return 100.0 * ratio
+        return 100.0 * _ratio(self.prediction_sum - self.truth_sum, self.truth_sum, significant)
+
+
+def _ratio(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> np.ndarray:
+    return np.divide(a, b, out=np.full(3, np.nan), where=where)
+
+
+def rms_mm(mse: float) -> float:
+    """Root of a mean-square error [m²] in mm; NaN of NaN."""
+    return 1e3 * math.sqrt(mse) if mse >= 0.0 else math.nan
 
 
 def skill(mse: Sequence[float], baseline: Sequence[float]) -> float:
@@ -301,14 +239,9 @@ def skill(mse: Sequence[float], baseline: Sequence[float]) -> float:
 
 
 def mean_prediction(histories: Iterable[np.ndarray], history: int) -> np.ndarray:
-    """Mean force (or torque) of the training split, the simplest prediction of one.
+    """Mean force (or torque) of the training split, the simplest prediction of one, shape (3,).
 
-    Args:
-        histories: force of every training run [N], shape (T, 3) each.
-        history: frames to leave out at the start, as in every metric.
-
-    Returns:
-        Mean over all frames of all runs [N], shape (3,).
+    Over all frames of all runs, (T, 3) each, but the first `history` of every run, as in every metric.
     """
     total, count = np.zeros(3), 0
     for values in histories:
@@ -339,62 +272,48 @@ def require_comparable(truth: Any, prediction: Any, history: int) -> None:
 def position_errors(
     truth: Any, prediction: Any, basis: Any, history: int, grid: SurfaceGrid
 ) -> PositionErrors:
-    """Position errors of a predicted run at every frame after the history.
+    """Position errors of a predicted `Run` at every frame after the history of d frames that it was given.
 
     With orthonormal modes the network's error needs no decoding: it is ‖Uᵀ(prediction − truth)‖² / 3n, for a
-    prediction that lies in the subspace.
-
-    Args:
-        truth: the simulated `Run`.
-        prediction: the predicted `Run` of the same scene.
-        basis: `Basis` the prediction was decoded with.
-        history: number of frames d that the prediction was given.
-        grid: columns of the height map.
+    prediction that lies in the subspace of the basis.
     """
     require_comparable(truth, prediction, history)
     last = np.asarray(truth.positions(slice(history - 1, history)), dtype=np.float64)[0]
     before = np.asarray(truth.positions(slice(max(history - 2, 0), max(history - 1, 1))), dtype=np.float64)[0]
     step = last - before
     last_heights = height_map(last, grid)
-    names = [f.name for f in fields(PositionErrors) if f.name not in ("time", "particles")]
-    collected: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    parts: list[dict[str, Any]] = []  # PositionErrors of some frames each
     by_particle = {name: np.zeros(truth.particle_count) for name in ("reduction", "network")}
     for frames in frame_chunks(truth.particle_count, truth.frame_count, history):
         true = np.asarray(truth.positions(frames), dtype=np.float64)
         predicted = np.asarray(prediction.positions(frames), dtype=np.float64)
         latent = basis.transform(torch.from_numpy(true))
         difference = basis.transform(torch.from_numpy(predicted)) - latent
-        elapsed = np.arange(frames.start, frames.stop) - (history - 1)
+        since = np.arange(frames.start, frames.stop) - (history - 1)
         projected = basis.inverse(latent).numpy()
-        collected["reduction"].append(mean_square(projected - true))
         by_particle["reduction"] += np.einsum("tna,tna->n", projected - true, projected - true)
         by_particle["network"] += np.einsum("tna,tna->n", predicted - projected, predicted - projected)
-        collected["network"].append(
-            difference.square().sum(dim=(-2, -1)).numpy() / (3 * truth.particle_count)
-        )
-        collected["total"].append(mean_square(predicted - true))
-        collected["frozen"].append(mean_square(last - true))
-        collected["constant_velocity"].append(mean_square(last + elapsed[:, None, None] * step - true))
         heights = [height_map(frame, grid) for frame in true]
-        guess = [height_map(frame, grid) for frame in predicted]
-        collected["surface"].append(
-            np.array([height_error(a, b) for a, b in zip(guess, heights, strict=True)])
+        guesses = [height_map(frame, grid) for frame in predicted]
+        parts.append(
+            {
+                "reduction": mean_square(projected - true),
+                "network": difference.square().sum(dim=(-2, -1)).numpy() / (3 * truth.particle_count),
+                "total": mean_square(predicted - true),
+                "frozen": mean_square(last - true),
+                "constant_velocity": mean_square(last + since[:, None, None] * step - true),
+                "surface": [height_error(a, b) for a, b in zip(guesses, heights, strict=True)],
+                "surface_frozen": [height_error(last_heights, b) for b in heights],
+            }
         )
-        collected["surface_frozen"].append(np.array([height_error(last_heights, b) for b in heights]))
-    values = {name: np.concatenate(parts) for name, parts in collected.items()}
+    values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     entries = 3 * (truth.frame_count - history)
     particles = ParticleErrors(**{name: total / entries for name, total in by_particle.items()})
     return PositionErrors(time=np.asarray(truth.time)[history:], **values, particles=particles)
 
 
 def body_errors(truth: Any, prediction: Any, history: int) -> BodyErrors:
-    """Errors of the body's place in a predicted run.
-
-    Args:
-        truth: the simulated `Run`.
-        prediction: the predicted `Run` of the same scene.
-        history: frames at the start that count in no metric.
-    """
+    """Errors of the body's place in a predicted `Run`, over the frames after the history."""
     misplaced = prediction.pose[history:, :3] - truth.pose[history:, :3]
     return BodyErrors(
         mse=float(np.mean((misplaced**2).sum(axis=1))),

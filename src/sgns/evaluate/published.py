@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,27 +31,12 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Series:
-    """What `run_scores` compares."""
-
-    time: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
-    wall_time_s: float = 0.0
-
-
 def evaluate_published(
     simulator: Simulator, settings: Mapping[str, Any], split: str, output: Path, checkpoint: Path
 ) -> float:
     """Roll out, print the table, write metrics.csv and metrics.json; returns the skill against frozen.
 
-    Args:
-        simulator: Trained on published runs.
-        settings: The `dataset` group.
-        split: "train": the runs that it was trained on; else all others of the folder.
-        output: Folder of the tables.
-        checkpoint: File of the simulator, for messages.
+    The split "train" are the published runs that the simulator was trained on; any other all others of the folder.
     """
     trained = {name.rsplit(" ", 1)[-1] for name in simulator.basis.fitted_on or []}
     everything = [run for found in published_runs(settings["path"]).values() for run in found]
@@ -76,7 +61,7 @@ def evaluate_published(
     total = aggregate(scores)
     log.info("%s", "\n".join(score_lines([*scores, total])))
     output.mkdir(parents=True, exist_ok=True)
-    write_csv(output / "metrics.csv", [*scores, total])
+    write_csv(output / "metrics.csv", [score.row() for score in (*scores, total)])
     write_json(
         output / "metrics.json",
         {
@@ -117,10 +102,8 @@ def scored(simulator: Simulator, run: ReducedRun, mean_force: np.ndarray) -> Sco
         surface=unknown,
         surface_frozen=unknown,
     )
-    predicted = Series(run.time, rollout.force, rollout.torque)
-    return run_scores(
-        run.name, errors, Series(run.time, run.force, run.torque), predicted, d, mean_force, np.zeros(3)
-    )
+    simulated = SimpleNamespace(time=run.time, force=run.force, torque=run.torque, wall_time_s=0.0)
+    return run_scores(run.name, errors, simulated, rollout, d, mean_force, np.zeros(3))
 
 
 def score_lines(scores: Sequence[Scores]) -> list[str]:

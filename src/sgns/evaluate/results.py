@@ -17,6 +17,7 @@ from sgns.evaluate.metrics import (
     BodyErrors,
     PositionErrors,
     VectorErrors,
+    rms_mm,
     skill,
 )
 from sgns.reduction.basis import Basis, ReductionCurves
@@ -33,43 +34,29 @@ SURFACE_ERRORS = ("surface", "surface_frozen")
 
 @dataclass(frozen=True)
 class Scores:
-    """Errors of a prediction and of the baselines.
+    """Errors of a prediction and of the baselines."""
 
-    Attributes:
-        name: of the run, or of the group of runs.
-        frames: number of frames that count (the history does not).
-        mse: mean-square errors [m²] by the names of `PositionErrors`.
-        force: errors of the force [N].
-        torque: errors of the torque about the centre of mass [N m].
-        mean_force: errors of the mean force of the training split [N].
-        mean_torque: errors of the mean torque of the training split [N m].
-        solver_rate: wall seconds per simulated second of the solver; NaN if not recorded.
-        absolute_mpe: mean over runs of |MPE| [%] by component of the force.
-        mean_force_absolute_mpe: the same of the mean force of the training split [%].
-        body_mse: mean-square distance of the body from its true place [m²]; 0 where its path was given.
-        sinkage_mae: mean absolute error of a wheel's sinkage [m]; NaN for other bodies.
-    """
-
-    name: str
-    frames: int
-    mse: Mapping[str, float]
-    force: VectorErrors
-    torque: VectorErrors
-    mean_force: VectorErrors
-    mean_torque: VectorErrors
-    solver_rate: float
-    absolute_mpe: Mapping[str, float]
-    mean_force_absolute_mpe: Mapping[str, float]
+    name: str  # of the run, or of the group of runs
+    frames: int  # number of frames that count (the history does not)
+    mse: Mapping[str, float]  # mean-square errors [m²] by the names of `PositionErrors`
+    force: VectorErrors  # errors of the force [N]
+    torque: VectorErrors  # errors of the torque about the centre of mass [N m]
+    mean_force: VectorErrors  # errors of the mean force of the training split [N]
+    mean_torque: VectorErrors  # errors of the mean torque of the training split [N m]
+    solver_rate: float  # wall seconds per simulated second of the solver; NaN if not recorded
+    absolute_mpe: Mapping[str, float]  # mean over runs of |MPE| [%] by component of the force
+    mean_force_absolute_mpe: Mapping[str, float]  # the same of the mean force of the training split [%]
+    # mean-square distance of the body from its true place [m²]; 0 where its path was given
     body_mse: float = 0.0
-    sinkage_mae: float = math.nan
+    sinkage_mae: float = math.nan  # mean absolute error of a wheel's sinkage [m]; NaN for other bodies
 
     def rmse_mm(self, name: str) -> float:
         """Root of a mean-square error [mm]."""
-        return 1e3 * math.sqrt(self.mse[name]) if self.mse[name] >= 0.0 else math.nan
+        return rms_mm(self.mse[name])
 
-    def skill(self, baseline: str = "frozen", error: str = "total") -> float:
+    def skill(self, baseline: str = "frozen") -> float:
         """1 − MSE / MSE of a baseline; for several runs 1 − Σ MSE / Σ MSE of the baseline."""
-        return skill([self.mse[error]], [self.mse[baseline]])
+        return skill([self.mse["total"]], [self.mse[baseline]])
 
     def row(self) -> dict[str, Any]:
         """Everything as plain numbers by column name; the unit is the end of the name."""
@@ -114,17 +101,9 @@ def run_scores(
     mean_torque: np.ndarray,
     body: BodyErrors = PRESCRIBED,
 ) -> Scores:
-    """Scores of one run.
+    """Scores of one run over the frames after its history.
 
-    Args:
-        name: of the run.
-        positions: its position errors.
-        truth: the simulated `Run`.
-        prediction: the predicted `Run`.
-        history: frames at the start that count in no metric.
-        mean_force: mean force of the training split [N], shape (3,).
-        mean_torque: mean torque of the training split [N m], shape (3,).
-        body: how far the body is from its true place; by default its path was given.
+    The mean force [N] and torque [N m] of the training split are baselines, shape (3,) each.
     """
     force = VectorErrors.compare(truth.force[history:], prediction.force[history:])
     mean = VectorErrors.compare(truth.force[history:], mean_force)
@@ -194,67 +173,40 @@ def mean_of_known(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """One run of the split and its rollout.
+    """One run of the split and its rollout."""
 
-    Attributes:
-        name: of the run.
-        label: short name.
-        words: its scene in a few words; empty if there is nothing to say.
-        truth: path of the simulated run.
-        rollout: path of the predicted run.
-        errors: position errors through time.
-        scores: every metric.
-        wheel: whether its body is a wheel.
-    """
-
-    name: str
-    label: str
-    words: str
-    truth: Path
-    rollout: Path
-    errors: PositionErrors
-    scores: Scores
-    wheel: bool = False
+    name: str  # of the run
+    label: str  # short name
+    words: str  # its scene in a few words; empty if there is nothing to say
+    truth: Path  # path of the simulated run
+    rollout: Path  # path of the predicted run
+    errors: PositionErrors  # position errors through time
+    scores: Scores  # every metric
+    wheel: bool = False  # whether its body is a wheel
 
 
 @dataclass(frozen=True)
 class NetworkTiming:
-    """Wall seconds per simulated second of the network: medians of warm repeats on one thread.
+    """Wall seconds per simulated second of the network: medians of warm repeats on one thread."""
 
-    Attributes:
-        stepping: steps with force and torque; the soil stays in the subspace.
-        decoding: the same, and every frame decoded to all particles.
-        repeats: number of timed repeats.
-        run: run that was timed.
-        stepping_bytes: peak memory of the whole process while it steps; NaN if not known.
-        decoding_bytes: the same while it decodes.
-    """
-
-    stepping: float
-    decoding: float
-    repeats: int
-    run: str
-    stepping_bytes: float = math.nan
-    decoding_bytes: float = math.nan
+    rollout: float  # steps with force and torque; the soil stays in the subspace
+    decoded: float  # the same, and every frame decoded to all particles
+    repeats: int  # number of timed repeats
+    run: str  # run that was timed
+    rollout_bytes: float = math.nan  # peak memory of the whole process while it steps; NaN if not known
+    decoded_bytes: float = math.nan  # the same while it decodes
 
 
 @dataclass(frozen=True)
 class Costs:
-    """What the network takes besides time; NaN is not known.
+    """What the network takes besides time; NaN is not known."""
 
-    Attributes:
-        parameters: weights that were learned.
-        checkpoint_bytes: size of the file, with the basis and what is needed to go on training.
-        training_steps: of the whole training.
-        training_seconds: wall time of the whole training, validation included.
-        batch_size: samples of a training step.
-    """
-
-    parameters: int | float = math.nan
+    parameters: int | float = math.nan  # weights that were learned
+    # size of the file, with the basis and what is needed to go on training
     checkpoint_bytes: float = math.nan
-    training_steps: int | float = math.nan
-    training_seconds: float = math.nan
-    batch_size: int | float = math.nan
+    training_steps: int | float = math.nan  # of the whole training
+    training_seconds: float = math.nan  # wall time of the whole training, validation included
+    batch_size: int | float = math.nan  # samples of a training step
 
     @property
     def seconds_per_step(self) -> float:
@@ -264,70 +216,44 @@ class Costs:
 
 @dataclass(frozen=True)
 class FullSpaceCost:
-    """A network on every particle, untrained.
+    """A network on every particle, untrained."""
 
-    Attributes:
-        parameters: weights that would be learned.
-        training_step: wall time of a step of `batch_size` windows on one thread, reading them included [s].
-        batch_size: windows of that step.
-        rollout: wall seconds per simulated second on one thread.
-        peak_bytes: peak memory of the whole process while it trains; NaN if not known.
-    """
-
-    parameters: int
+    parameters: int  # weights that would be learned
+    # wall time of a step of `batch_size` windows on one thread, reading them included [s]
     training_step: float
-    batch_size: int
-    rollout: float
-    peak_bytes: float
+    batch_size: int  # windows of that step
+    rollout: float  # wall seconds per simulated second on one thread
+    peak_bytes: float  # peak memory of the whole process while it trains; NaN if not known
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Everything that a report shows, in numbers.
+    """Everything that a report shows, in numbers."""
 
-    Attributes:
-        dataset: name of the dataset.
-        split: which of its splits was evaluated.
-        runs: the evaluated runs.
-        total: scores of all of them together.
-        timing: of the network.
-        mean_force: mean force of the training split [N], shape (3,).
-        curves: of the reduction; held out are the evaluated runs.
-        basis: of the network.
-        num_modes: modes r that the network uses.
-        history: frames d that it was given.
-        particle_count: particles n of the bed.
-        start: common start of the particles [m], shape (n, 3).
-        costs: of the network.
-        full_space: of the same network on every particle; None if it was not asked for.
-        mean_torque: mean torque of the training split [N m], shape (3,).
-        training_log: losses and validation scores by step, as `training_curves.read_log` gives them.
-        trained_on: names of the evaluated runs that the basis and the network were fitted on.
-        chosen_by: names of those that chose the checkpoint.
-        new_rollouts: run files without truth that are shown too.
-        made: how it was made: name → value, in the order to show.
-    """
-
-    dataset: str
-    split: str
-    runs: Sequence[EvaluatedRun]
-    total: Scores
-    timing: NetworkTiming
-    mean_force: np.ndarray
-    curves: ReductionCurves
-    basis: Basis
-    num_modes: int
-    history: int
-    particle_count: int
-    start: np.ndarray
-    costs: Costs = field(default_factory=Costs)
+    dataset: str  # name of the dataset
+    split: str  # which of its splits was evaluated
+    runs: Sequence[EvaluatedRun]  # the evaluated runs
+    total: Scores  # scores of all of them together
+    timing: NetworkTiming  # of the network
+    mean_force: np.ndarray  # mean force of the training split [N], shape (3,)
+    curves: ReductionCurves  # of the reduction; held out are the evaluated runs
+    basis: Basis  # of the network
+    num_modes: int  # modes r that the network uses
+    history: int  # frames d that it was given
+    particle_count: int  # particles n of the bed
+    start: np.ndarray  # common start of the particles [m], shape (n, 3)
+    costs: Costs = field(default_factory=Costs)  # of the network
+    # of the same network on every particle; None if it was not asked for
     full_space: FullSpaceCost | None = None
+    # mean torque of the training split [N m], shape (3,)
     mean_torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    # losses and validation scores by step, as `figures.read_log` gives them
     training_log: Mapping[str, np.ndarray] = field(default_factory=dict)
+    # names of the evaluated runs that the basis and the network were fitted on
     trained_on: Sequence[str] = ()
-    chosen_by: Sequence[str] = ()
-    new_rollouts: Sequence[Path] = ()
-    made: dict[str, str] = field(default_factory=dict)
+    chosen_by: Sequence[str] = ()  # names of those that chose the checkpoint
+    new_rollouts: Sequence[Path] = ()  # run files without truth that are shown too
+    made: dict[str, str] = field(default_factory=dict)  # how it was made: name → value, in the order to show
 
 
 # --- Which of the judged runs a checkpoint has already seen: a number for those is no test --------------
@@ -344,7 +270,7 @@ def seen_before(simulator: Simulator, names: Sequence[str]) -> tuple[list[str], 
     return trained_on, [name for name in names if name in judged - fitted]
 
 
-def overlap_warning(evaluation: Evaluation) -> str:
+def seen_warning(evaluation: Evaluation) -> str:
     """One sentence if the evaluation is no clean test, else nothing."""
     count = len(evaluation.runs)
     parts = [

@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import PathCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.ticker import MaxNLocator
+from scipy.spatial import ConvexHull, QhullError
 
 from mpm_warp.poses import in_world_frame
 from sgns.evaluate.figures import NETWORK, PICTURE_WIDTH, TRUTH, new_figure, styled
 from sgns.evaluate.metrics import is_wheel, particle_spacing
 from sgns.model.features import distance, markers
 
-# --- The body of a recorded scene: its kind, its corners, and how its force is reported -----------------
-# Scenes are plain data of a run file, of any kind.
+STEEL = "#4d5a66"
+# Resting soil looks like sand; the faster, the darker: legible without colour as well.
+SPEED = LinearSegmentedColormap.from_list("speed", ["#e9dcc3", "#e3b565", "#c9693a", "#8a2a55", "#33103f"])
+# A force arrow of the largest force shown is this share of the picture's width long.
+ARROW_SHARE = 0.22
+# Below this length [m] the head would hide the arrow.
+SHORTEST_ARROW = 0.02
+
+# --- The body of a recorded scene -----------------------------------------------------------------------
 
 
 def body_corners(run: Any, frame: int) -> np.ndarray:
@@ -48,17 +55,6 @@ def body_corners(run: Any, frame: int) -> np.ndarray:
     return in_world_frame(run.pose[[frame]], corners)[0]
 
 
-# --- Side view of soil, body and force: a slice near mid-width at some moments of one or more runs ------
-
-STEEL = "#4d5a66"
-# Resting soil looks like sand; the faster, the darker: legible without colour as well.
-SPEED = LinearSegmentedColormap.from_list("speed", ["#e9dcc3", "#e3b565", "#c9693a", "#8a2a55", "#33103f"])
-# A force arrow of the largest force shown is this share of the picture's width long.
-ARROW_SHARE = 0.22
-# Below this length [m] the head would hide the arrow.
-SHORTEST_ARROW = 0.02
-
-
 def body_outline(run: Any, frame: int) -> np.ndarray:
     """Outline of the body seen from the side [m], shape (k, 2) in x and z.
 
@@ -72,23 +68,14 @@ def body_outline(run: Any, frame: int) -> np.ndarray:
 
 
 def hull(points: np.ndarray) -> np.ndarray:
-    """Convex hull of points (k, 2), counter-clockwise (Andrew's monotone chain)."""
-    ordered = np.unique(np.round(points, 9), axis=0)
-    if len(ordered) < 3:
-        return ordered
+    """Corners of the convex hull of points (k, 2), counter-clockwise; the two ends if they lie on a line."""
+    try:
+        return points[ConvexHull(points).vertices]
+    except QhullError:
+        return np.unique(np.round(points, 9), axis=0)[[0, -1]]
 
-    def half(side: np.ndarray) -> list[np.ndarray]:
-        chain: list[np.ndarray] = []
-        for point in side:
-            while len(chain) > 1:
-                a, b = chain[-1] - chain[-2], point - chain[-2]
-                if a[0] * b[1] - a[1] * b[0] > 0.0:
-                    break
-                chain.pop()
-            chain.append(point)
-        return chain[:-1]
 
-    return np.array(half(ordered) + half(ordered[::-1]))
+# --- A slice near mid-width at some moments of one or more runs -----------------------------------------
 
 
 def middle_slice(start: np.ndarray) -> np.ndarray:
@@ -108,43 +95,21 @@ def view_times(run: Any, history: int, count: int = 3) -> list[int]:
     return [round(first + (last - first) * 0.9 * (k + 1) / count) for k in range(count)]
 
 
-@dataclass(frozen=True)
-class Scales:
-    """What makes several side views comparable.
+class Scales(NamedTuple):
+    """What makes several side views comparable."""
 
-    Attributes:
-        chosen: which particles lie near mid-width, shape (n,).
-        speed: range of the colours [m/s].
-        arrow: length of a force arrow [m/N].
-        x_limits: of the picture [m].
-        z_limits: of the picture [m].
-        spacing: between particles [m].
-    """
-
-    chosen: np.ndarray
-    speed: Normalize
-    arrow: float
-    x_limits: tuple[float, float]
-    z_limits: tuple[float, float]
-    spacing: float
-
-    @property
-    def aspect(self) -> float:
-        """Height of a view over its width."""
-        return (self.z_limits[1] - self.z_limits[0]) / (self.x_limits[1] - self.x_limits[0])
-
-    def disc(self, width: float) -> float:
-        """Diameter [points] of a particle's disc in a view so many inches wide: the room that it has."""
-        return max(1.4, 0.98 * self.spacing * 72.0 * width / (self.x_limits[1] - self.x_limits[0]))
+    chosen: np.ndarray  # which particles lie near mid-width, shape (n,)
+    speed: Normalize  # range of the colours [m/s]
+    arrow: float  # length of a force arrow [m/N]
+    x_limits: tuple[float, float]  # of the picture [m]
+    z_limits: tuple[float, float]  # of the picture [m]
+    spacing: float  # between particles [m]
 
 
 def common_scales(runs: Sequence[Any], frames: Sequence[int], start: np.ndarray) -> Scales:
-    """Scales for all views of some runs at some frames; the first run sets the colours.
+    """Scales for all views of some `Run`s at some frames; the first run sets the colours.
 
-    Args:
-        runs: `Run`s.
-        frames: frames that will be drawn.
-        start: common start of the particles [m], shape (n, 3).
+    `start` are the particles at rest [m], shape (n, 3).
     """
     chosen, spacing = middle_slice(start), particle_spacing(start)
     fastest = max(float(np.percentile(slice_speed(runs[0], frame, chosen), 99.5)) for frame in frames)
@@ -172,64 +137,40 @@ def slice_speed(run: Any, frame: int, chosen: np.ndarray) -> np.ndarray:
 
 @styled
 def side_views(runs: Mapping[str, Any], frames: Sequence[int], start: np.ndarray) -> Figure:
-    """Soil near mid-width coloured by speed, body and force, at some frames (rows) of runs (columns).
+    """Soil near mid-width coloured by speed, body and force, at some frames (rows) of runs by title (columns).
 
-    Args:
-        runs: title → `Run`; all runs share scales of colour and force.
-        frames: frames to draw.
-        start: common start of the particles [m], shape (n, 3): which of them are near mid-width.
+    All share scales of colour and force; `start` are the particles at rest [m], shape (n, 3).
     """
     panel, width = (5.4, 4.95) if len(runs) > 1 else (7.2, 6.15)  # [inches], with and without labels
     scales = common_scales(list(runs.values()), frames, start)
-    figure = new_figure(len(runs) * panel, len(frames) * (width * scales.aspect + 0.38) + 1.0, "compressed")
-    axes = figure.subplots(len(frames), len(runs), squeeze=False, sharex=True, sharey=True)
-    for row, frame in zip(axes, frames, strict=True):
-        for axis, (title, run) in zip(row, runs.items(), strict=True):
-            draw_view(axis, title, run, frame, scales, width)
-    finish(figure, axes, scales)
-    return figure
+    views = [[(title, run, frame) for title, run in runs.items()] for frame in frames]
+    return draw_views(views, scales, len(runs) * panel, width)
 
 
 @styled
 def side_view(runs: Mapping[str, Any], frame: int, scales: Scales) -> Figure:
-    """The same at one frame, the runs above each other in one narrow picture.
+    """The same at one frame, the runs above each other in one narrow picture."""
+    views = [[(title, run, frame)] for title, run in runs.items()]
+    return draw_views(views, scales, PICTURE_WIDTH, PICTURE_WIDTH - 0.75)
 
-    Args:
-        runs: title → `Run`.
-        frame: frame to draw.
-        scales: of this and other pictures.
-    """
-    width = PICTURE_WIDTH - 0.75
-    figure = new_figure(PICTURE_WIDTH, len(runs) * (width * scales.aspect + 0.38) + 1.0, "compressed")
-    axes = figure.subplots(len(runs), 1, squeeze=False, sharex=True, sharey=True)
-    for axis, (title, run) in zip(axes[:, 0], runs.items(), strict=True):
+
+def draw_views(
+    views: Sequence[Sequence[tuple[str, Any, int]]], scales: Scales, whole_width: float, width: float
+) -> Figure:
+    """Rows of views (title, run, frame) in a picture so many inches wide, each view without its labels `width`."""
+    inches = width / np.ptp(scales.x_limits)  # per metre
+    height = len(views) * (inches * np.ptp(scales.z_limits) + 0.38) + 1.0
+    figure = new_figure(whole_width, height, "compressed")
+    axes = figure.subplots(len(views), len(views[0]), squeeze=False, sharex=True, sharey=True)
+    for axis, (title, run, frame) in zip(axes.flat, itertools.chain(*views), strict=True):
         draw_view(axis, title, run, frame, scales, width)
-    finish(figure, axes, scales)
-    return figure
-
-
-def draw_view(axis: Axes, title: str, run: Any, frame: int, scales: Scales, width: float) -> None:
-    """One run at one frame in a view so many inches wide."""
-    positions = slice_positions(run, frame, scales.chosen)
-    speed = slice_speed(run, frame, scales.chosen)
-    draw_soil(axis, positions, speed, scales.speed, scales.disc(width))
-    draw_body(axis, body_outline(run, frame))
-    draw_force(axis, run, frame, scales.arrow)
-    axis.set_xlim(*scales.x_limits)
-    axis.set_ylim(*scales.z_limits)
-    axis.set_aspect("equal")
-    axis.set_title(f"{title}, t = {run.time[frame]:.2f} s")
-
-
-def finish(figure: Figure, axes: np.ndarray, scales: Scales) -> None:
-    """Names of the outer axes and the colour bar."""
     for axis in axes[:, 0]:
         axis.set_ylabel("z [m]")
     for axis in axes[-1]:
         axis.set_xlabel("x [m]")
     bar = figure.colorbar(
         ScalarMappable(scales.speed, SPEED),
-        ax=list(axes.ravel()),
+        ax=list(axes.flat),
         location="bottom",
         shrink=0.5 if axes.shape[1] > 1 else 0.9,
         aspect=40,
@@ -237,61 +178,53 @@ def finish(figure: Figure, axes: np.ndarray, scales: Scales) -> None:
         ticks=MaxNLocator(5),
     )
     bar.set_label("speed of the soil [m/s]")
+    return figure
 
 
-def draw_soil(
-    axis: Axes, positions: np.ndarray, speed: np.ndarray, scale: Normalize, size: float
-) -> PathCollection:
-    """Particles (k, 3) as discs of a diameter in points, coloured by speed (k,)."""
+def draw_view(axis: Axes, title: str, run: Any, frame: int, scales: Scales, width: float) -> None:
+    """One run at one frame in a view so many inches wide."""
+    inches = width / np.ptp(scales.x_limits)  # per metre
+    disc = max(
+        1.4, 0.98 * scales.spacing * 72.0 * inches
+    )  # diameter of a particle [points]: the room that it has
+    positions = slice_positions(run, frame, scales.chosen)
+    speed = slice_speed(run, frame, scales.chosen)
     order = np.argsort(speed)  # the fast ones on top
-    return axis.scatter(
-        positions[order, 0],
-        positions[order, 2],
-        c=speed[order],
-        s=size**2,
-        cmap=SPEED,
-        norm=scale,
-        linewidths=0.0,
-    )
-
-
-def draw_body(axis: Axes, outline: np.ndarray) -> None:
-    """The body's outline: a filled shape, or a line if it is seen edge-on."""
+    x, _, z = positions[order].T
+    axis.scatter(x, z, c=speed[order], s=disc**2, cmap=SPEED, norm=scales.speed, linewidths=0.0)
+    outline = body_outline(run, frame)
     if len(outline) >= 3:
-        axis.add_patch(
-            Polygon(outline, closed=True, facecolor=STEEL, edgecolor="black", linewidth=0.8, zorder=3)
-        )
-    else:
-        axis.plot(outline[:, 0], outline[:, 1], color=STEEL, linewidth=3.0, zorder=3)
+        axis.add_patch(Polygon(outline, facecolor=STEEL, edgecolor="black", linewidth=0.8, zorder=3))
+    else:  # seen edge-on
+        axis.plot(*outline.T, color=STEEL, linewidth=3.0, zorder=3)
+    force = run.force[frame, [0, 2]]
+    size = float(np.linalg.norm(force)) * scales.arrow
+    if size > 0.0:
+        head = "-|>,head_width=0.25,head_length=0.5" if size > SHORTEST_ARROW else "-"
+        foot = outline[np.argmin(outline[:, 1])]
+        draw_force(axis, run, force, foot, foot + force * scales.arrow, head)
+    axis.set(xlim=scales.x_limits, ylim=scales.z_limits, aspect="equal")
+    axis.set_title(f"{title}, t = {run.time[frame]:.2f} s")
 
 
-def draw_force(axis: Axes, run: Any, frame: int, scale: float) -> None:
-    """An arrow from the body's lowest point along the force, with its size."""
-    force = np.asarray(run.force[frame])[[0, 2]]
-    size = float(np.linalg.norm(force))
-    if not math.isfinite(size) or size * scale <= 0.0:
-        return
+def draw_force(
+    axis: Axes,
+    run: Any,
+    force: np.ndarray,
+    foot: np.ndarray,
+    tip: np.ndarray,
+    head: str = "-|>",
+    clip: bool | None = None,
+) -> None:
+    """A force [N] as an arrow between two points of the picture, and its size in the corner."""
     colour = TRUTH if run.producer == "mpm" else NETWORK
-    foot = body_outline(run, frame)
-    foot = foot[np.argmin(foot[:, 1])]
-    tip = foot + force * scale
-    head = "-|>,head_width=0.25,head_length=0.5" if size * scale > SHORTEST_ARROW else "-"
-    axis.annotate(
-        "",
-        xy=tip,
-        xytext=foot,
-        zorder=4,
-        arrowprops={
-            "arrowstyle": head,
-            "color": colour,
-            "linewidth": 2.0,
-            "shrinkA": 0.0,
-            "shrinkB": 0.0,
-        },
-    )
-    axis.text(
-        0.99, 0.97, f"{size:.0f} N", color=colour, fontsize=9, ha="right", va="top", transform=axis.transAxes
-    )
+    size = float(np.linalg.norm(force))
+    if not 0.0 < size < math.inf:
+        return
+    arrow = {"arrowstyle": head, "color": colour, "linewidth": 2.0, "shrinkA": 0.0, "shrinkB": 0.0}
+    axis.annotate("", xy=tip, xytext=foot, zorder=4, arrowprops=arrow, annotation_clip=clip)
+    corner = {"ha": "right", "va": "top", "transform": axis.transAxes}
+    axis.text(0.99, 0.97, f"{size:.0f} N", color=colour, fontsize=9, **corner)
 
 
 def nice(value: float) -> float:

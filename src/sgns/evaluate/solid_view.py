@@ -12,12 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
+from scipy.spatial import ConvexHull, QhullError
 
-from sgns.evaluate.figures import DPI, NETWORK, PICTURE_WIDTH, TRUTH, new_figure, styled
+from sgns.evaluate.figures import DPI, PICTURE_WIDTH, TRUTH, new_figure, styled
 from sgns.evaluate.metrics import particle_spacing
-from sgns.evaluate.side_view import SPEED, STEEL, body_corners, nice
+from sgns.evaluate.side_view import SPEED, STEEL, body_corners, draw_force, hull, nice
 
-# --- A picture of particles and a convex body in space, drawn into a depth buffer: what is nearer hides the
+# --- Particles and a convex body in space, drawn into a depth buffer: what is nearer hides the rest -----
 # Parallel projection, so that lengths along an axis are the same everywhere in the picture.
 # Letters: n particles, k corners of the body, (h, w) rows and columns of the picture.
 
@@ -27,15 +28,10 @@ LIGHT = np.array([-0.35, 0.55, 0.76])
 
 @dataclass(frozen=True)
 class Camera:
-    """Direction of view.
+    """Direction of view."""
 
-    Attributes:
-        azimuth: of the camera about z, from +x towards +y [degrees].
-        elevation: of the camera above the horizon [degrees].
-    """
-
-    azimuth: float = -60.0
-    elevation: float = 28.0
+    azimuth: float = -60.0  # of the camera about z, from +x towards +y [degrees]
+    elevation: float = 28.0  # of the camera above the horizon [degrees]
 
     @property
     def axes(self) -> np.ndarray:
@@ -53,10 +49,7 @@ class Camera:
 class DepthBuffer:
     """A picture that remembers how near each of its points is.
 
-    Args:
-        low: right and up of the lower left corner [m], shape (2,).
-        high: of the upper right corner [m], shape (2,).
-        width: columns.
+    Its lower left and upper right corner lie at `low` and `high`, right and up [m]; it has `width` columns.
     """
 
     def __init__(self, low: np.ndarray, high: np.ndarray, width: int) -> None:
@@ -71,20 +64,12 @@ class DepthBuffer:
     def extent(self) -> tuple[float, float, float, float]:
         """Left, right, bottom and top [m]; row 0 is the bottom."""
         height, width = self.nearness.shape
-        return (
-            self.low[0],
-            self.low[0] + width * self.pixel,
-            self.low[1],
-            self.low[1] + height * self.pixel,
-        )
+        return (self.low[0], self.low[0] + width * self.pixel, self.low[1], self.low[1] + height * self.pixel)
 
     def spheres(self, centres: np.ndarray, radius: float, colours: np.ndarray) -> None:
-        """Particles as shaded spheres.
+        """Particles as shaded spheres of a radius [m].
 
-        Args:
-            centres: right, up, nearness [m], shape (n, 3).
-            radius: [m].
-            colours: red, green, blue, shape (n, 3).
+        Their centres are right, up and nearness [m], their colours red, green and blue, shape (n, 3) each.
         """
         reach = max(1, int(np.ceil(radius / self.pixel)))
         offsets = np.arange(-reach, reach + 1)
@@ -111,38 +96,28 @@ class DepthBuffer:
         self.colour[row[order], column[order]] = colours[order]
 
     def triangles(self, corners: np.ndarray, colour: np.ndarray) -> None:
-        """Flat faces of one colour.
-
-        Args:
-            corners: right, up, nearness [m], shape (t, 3, 3): triangles, corners, coordinates.
-            colour: red, green, blue, shape (3,).
-        """
+        """Flat faces of one colour (3,); corners are right, up and nearness [m], shape (triangles, 3, 3)."""
         for triangle in corners:
             normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
             length = float(np.linalg.norm(normal))
             if abs(normal[2]) < 1e-9 * max(length, 1e-12) or length == 0.0:
                 continue  # seen edge-on
             normal = normal * np.sign(normal[2]) / length
-            self._fill(triangle, normal, brightness(normal) * np.asarray(colour))
+            self._fill(triangle, brightness(normal) * np.asarray(colour))
 
-    def _fill(self, triangle: np.ndarray, normal: np.ndarray, colour: np.ndarray) -> None:
+    def _fill(self, triangle: np.ndarray, colour: np.ndarray) -> None:
         height, width = self.nearness.shape
-        grid = (triangle[:, :2] - self.low) / self.pixel
-        first = np.maximum(np.floor(grid.min(axis=0)).astype(int), 0)
-        last = np.minimum(np.ceil(grid.max(axis=0)).astype(int), [width, height])
+        corners = (triangle[:, :2] - self.low) / self.pixel
+        first = np.maximum(np.floor(corners.min(axis=0)).astype(int), 0)
+        last = np.minimum(np.ceil(corners.max(axis=0)).astype(int), [width, height])
         if (last <= first).any():
             return
         x, y = np.meshgrid(np.arange(first[0], last[0]) + 0.5, np.arange(first[1], last[1]) + 0.5)
-        sides = [
-            (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
-            for a, b in zip(grid, np.roll(grid, -1, axis=0), strict=True)
-        ]
-        inside = np.all(np.stack(sides) >= 0.0, axis=0) | np.all(np.stack(sides) <= 0.0, axis=0)
-        right, up = x * self.pixel + self.low[0], y * self.pixel + self.low[1]
-        slope = normal[0] * (right - triangle[0, 0]) + normal[1] * (up - triangle[0, 1])
-        nearness = triangle[0, 2] - slope / normal[2]
+        # Barycentric coordinates; what lies on a side shared by two triangles belongs to both.
+        weights = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(np.c_[corners, np.ones(3)])
+        nearness = weights @ triangle[:, 2]
         window = np.s_[first[1] : last[1], first[0] : last[0]]
-        seen = inside & (nearness > self.nearness[window])
+        seen = (weights >= -1e-9).all(axis=-1) & (nearness > self.nearness[window])
         self.nearness[window][seen] = nearness[seen]
         self.colour[window][seen] = colour
 
@@ -153,36 +128,20 @@ def brightness(normal: np.ndarray) -> float:
 
 
 def hull_triangles(points: np.ndarray) -> np.ndarray:
-    """Triangles that make up the convex hull of a few points (k, 3), shape (t, 3, 3).
+    """Triangles that make up the convex hull of points (k, 3), shape (t, 3, 3).
 
-    A plane through three points is a face if all others lie on one side of it; a face is drawn as a fan about
-    one of its corners.
+    Of points in a plane they make up one face, of points on a line there are none.
     """
-    triples = np.array(list(itertools.combinations(range(len(points)), 3))).reshape(-1, 3)
-    a, b, c = (points[triples[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1)
-    size = float(np.ptp(points, axis=0).max(initial=0.0))
-    proper = lengths > 1e-6 * size**2
-    normals = normals[proper] / lengths[proper, None]
-    heights = np.einsum("tkj,tj->tk", points[None] - a[proper, None], normals)
-    near = 1e-6 * size
-    is_face = (heights <= near).all(axis=1) | (heights >= -near).all(axis=1)
-    corners, first = np.unique(np.abs(heights[is_face]) <= near, axis=0, return_index=True)
-    fans = [fan(points[on], normal) for on, normal in zip(corners, normals[is_face][first], strict=True)]
-    return np.concatenate(fans) if fans else np.empty((0, 3, 3))
+    try:
+        return points[ConvexHull(points).simplices]
+    except QhullError:
+        middle = points.mean(axis=0)
+        plane = np.linalg.svd(points - middle, full_matrices=False)[2][:2]
+        ring = middle + hull((points - middle) @ plane.T) @ plane
+        return np.stack([np.broadcast_to(ring[0], ring[2:].shape), ring[1:-1], ring[2:]], axis=1)
 
 
-def fan(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Triangles (t, 3, 3) of a flat convex face with corners (c, 3) in any order."""
-    spokes = corners - corners.mean(axis=0)
-    right = spokes[np.argmax(np.linalg.norm(spokes, axis=1))]
-    order = np.argsort(np.arctan2(spokes @ np.cross(normal, right), spokes @ right))
-    ring = corners[order]
-    return np.stack([np.broadcast_to(ring[0], ring[2:].shape), ring[1:-1], ring[2:]], axis=1)
-
-
-# --- The whole bed in three dimensions with its tool: the simulated one, the predicted one and their differ
+# --- The whole bed with its tool: simulated, predicted, and their difference ---------------------------
 
 # No error looks like the paper; the larger, the darker.
 ERROR = LinearSegmentedColormap.from_list("error", ["#f2f2ee", "#9cc3dd", "#3d7fb1", "#22356f", "#0c0c26"])
@@ -192,52 +151,28 @@ ARROW_SHARE = 0.25
 TOOL_ABOVE = 0.22
 
 
-@dataclass(frozen=True)
-class Colouring:
-    """What colours the particles, and how.
-
-    Attributes:
-        label: of the colour bar.
-        values: shape (n,).
-        scale: range of the colours.
-        colours: from low to high.
-    """
-
-    label: str
-    values: np.ndarray
-    scale: Normalize
-    colours: LinearSegmentedColormap
-
-
 def solid_views(truth: Any, prediction: Any, frame: int, start: np.ndarray) -> Mapping[str, Figure]:
     """Three pictures of one moment: displacement, simulated and predicted, and the distance between them.
 
-    Args:
-        truth: the simulated `Run`.
-        prediction: the predicted `Run`.
-        frame: to draw.
-        start: common start of the particles [m], shape (n, 3).
+    `start` are the particles at rest [m], shape (n, 3).
     """
-    runs = {"simulated (MPM)": truth, "network": prediction}
-    positions = {title: run.positions(slice(frame, frame + 1))[0] for title, run in runs.items()}
-    moved = {title: 1e3 * np.linalg.norm(p - start, axis=1) for title, p in positions.items()}
-    error = 1e3 * np.linalg.norm(positions["network"] - positions["simulated (MPM)"], axis=1)
-    displacement = upper_scale(moved["simulated (MPM)"])
-    strongest = max(float(np.linalg.norm(run.force[frame])) for run in runs.values())
-    views = {
-        title: (run, positions[title], Colouring("displacement [mm]", moved[title], displacement, SPEED))
-        for title, run in runs.items()
-    }
-    views["network, its error"] = (
-        prediction,
-        positions["network"],
-        Colouring("distance from the simulated place [mm]", error, upper_scale(error), ERROR),
+    true, predicted = (run.positions(slice(frame, frame + 1))[0] for run in (truth, prediction))
+    moved, moved_predicted, error = (
+        1e3 * np.linalg.norm(difference, axis=1)
+        for difference in (true - start, predicted - start, predicted - true)
     )
+    strongest = max(float(np.linalg.norm(run.force[frame])) for run in (truth, prediction))
+    displacement = "displacement [mm]", ScalarMappable(upper_scale(moved), SPEED)
+    distance = "distance from the simulated place [mm]", ScalarMappable(upper_scale(error), ERROR)
     return {
         title: solid_figure(
-            f"{title}, t = {run.time[frame]:.2f} s", run, frame, p, colouring, start, strongest
+            f"{title}, t = {run.time[frame]:.2f} s", run, frame, positions, values, *colours, start, strongest
         )
-        for title, (run, p, colouring) in views.items()
+        for title, run, positions, values, colours in (
+            ("simulated (MPM)", truth, true, moved, displacement),
+            ("network", prediction, predicted, moved_predicted, displacement),
+            ("network, its error", prediction, predicted, error, distance),
+        )
     }
 
 
@@ -253,20 +188,15 @@ def solid_figure(
     run: Any,
     frame: int,
     positions: np.ndarray,
-    colouring: Colouring,
+    values: np.ndarray,
+    label: str,
+    colours: ScalarMappable,
     start: np.ndarray,
     strongest: float,
 ) -> Figure:
-    """Particles as spheres, the body, and the force on it.
+    """Particles (n, 3) [m] as spheres coloured by values (n,), and the body of a run with the force on it.
 
-    Args:
-        title: of the picture.
-        run: `Run` that the body and the force are taken from.
-        frame: to draw.
-        positions: of the particles [m], shape (n, 3).
-        colouring: of the particles.
-        start: common start of the particles [m], shape (n, 3), which sets the frame of the picture.
-        strongest: force [N] that has the longest arrow.
+    The particles at rest, `start`, set the frame of the picture; the force `strongest` [N] has the longest arrow.
     """
     camera, spacing = Camera(), particle_spacing(start)
     low, high = start.min(axis=0) - spacing, start.max(axis=0) + spacing
@@ -278,8 +208,7 @@ def solid_figure(
     left_bottom, right_top = box[:, :2].min(axis=0), box[:, :2].max(axis=0)
 
     buffer = DepthBuffer(left_bottom, right_top, width=round(DPI * (PICTURE_WIDTH - 0.2)))
-    colours = colouring.colours(colouring.scale(colouring.values))[:, :3]
-    buffer.spheres(camera.project(positions), 0.55 * spacing, colours)
+    buffer.spheres(camera.project(positions), 0.55 * spacing, colours.to_rgba(values)[:, :3])
     buffer.triangles(camera.project(hull_triangles(corners)), np.array(to_rgb(STEEL)))
 
     height, width = buffer.nearness.shape
@@ -289,16 +218,13 @@ def solid_figure(
     axis.set_axis_off()
     axis.set_title(title)
     draw_directions(axis, camera, left_bottom, right_top)
-    draw_force(axis, camera, run, frame, strongest, right_top[0] - left_bottom[0])
-    bar = figure.colorbar(
-        ScalarMappable(colouring.scale, colouring.colours),
-        ax=axis,
-        location="bottom",
-        shrink=0.9,
-        aspect=40,
-        pad=0.02,
-    )
-    bar.set_label(colouring.label)
+    if strongest > 0.0:
+        scale = ARROW_SHARE * (right_top[0] - left_bottom[0]) / strongest
+        foot = camera.project(run.pose[frame, :3])[:2]
+        tip = foot + camera.project(run.force[frame])[:2] * scale
+        draw_force(axis, run, run.force[frame], foot, tip, clip=False)
+    bar = figure.colorbar(colours, ax=axis, location="bottom", shrink=0.9, aspect=40, pad=0.02)
+    bar.set_label(label)
     return figure
 
 
@@ -318,20 +244,4 @@ def draw_directions(axis: Axes, camera: Camera, low: np.ndarray, high: np.ndarra
         fontsize=8,
         ha="center",
         va="top",
-    )
-
-
-def draw_force(axis: Axes, camera: Camera, run: Any, frame: int, strongest: float, width: float) -> None:
-    """The force on the body as an arrow from its centre of mass, and its size."""
-    force = np.asarray(run.force[frame])
-    size = float(np.linalg.norm(force))
-    colour = TRUTH if run.producer == "mpm" else NETWORK
-    if not 0.0 < size < np.inf:
-        return
-    foot = camera.project(run.pose[frame, :3])[:2]
-    tip = foot + camera.project(force)[:2] * ARROW_SHARE * width / strongest
-    arrow = {"arrowstyle": "-|>", "color": colour, "linewidth": 2.0, "shrinkA": 0.0, "shrinkB": 0.0}
-    axis.annotate("", xy=tip, xytext=foot, arrowprops=arrow, annotation_clip=False)
-    axis.text(
-        0.99, 0.97, f"{size:.0f} N", color=colour, fontsize=9, ha="right", va="top", transform=axis.transAxes
     )

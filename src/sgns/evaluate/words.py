@@ -124,7 +124,7 @@ def body_words(total: Scores) -> str:
 
 def time_words(evaluation: Evaluation) -> str:
     """How fast the network is beside the solver."""
-    own, solver = evaluation.timing.stepping, evaluation.total.solver_rate
+    own, solver = evaluation.timing.rollout, evaluation.total.solver_rate
     sentence = f"One simulated second takes the network {number(own, 2)} s on one thread"
     if math.isnan(solver) or solver <= 0.0:
         return sentence + "; the solver's time is not recorded."
@@ -158,66 +158,4 @@ def summary(evaluation: Evaluation) -> str:
         f"{evaluation.particle_count} particles. It was given {given} and the first "
         f"{evaluation.history} frames of {count} run{'s' if count != 1 else ''} {seen_words(evaluation)}, and "
         f"predicted the rest. {' '.join(sentences)} {time_words(evaluation)}"
-    )
-
-
-# --- what the columns of the tables mean ------------------------------------------------------------------
-
-
-def soil_note(evaluation: Evaluation) -> str:
-    """Under the table of position errors."""
-    return (
-        f"Root-mean-square errors per axis over all frames after the first {evaluation.history}, which the "
-        "network was given. Total: prediction against truth. Network: the part of it within the subspace. "
-        "Reduction: what the subspace leaves out. Frozen: nothing moves after the given frames. Constant "
-        "velocity: every particle goes on at its last given speed. Skill: 1 − squared error / squared "
-        "error of the baseline, for all runs of the sums over runs. Surface: height of the highest "
-        "particle of every column of the bed."
-    )
-
-
-def example_note() -> str:
-    """Under the table of test examples."""
-    return (
-        "The paper's columns are the position MSE (network: PCA⁻¹ of the prediction against PCA⁻¹ of the reduced "
-        "truth, so without what the subspace leaves out) and the force MPE, the difference of the means in "
-        "percent of the true one: signed, so that errors along a run cancel. Beside them what it takes to judge "
-        "these: the total error, bed and force of the plainest guesses, and the NRMSE, in which nothing cancels. "
-        "Last row: mean of the MSE over runs, mean of the sizes |MPE|, NRMSE of all frames. – stands where the "
-        "true mean is negligible beside the whole force, as it is for a component that symmetry makes zero."
-    )
-
-
-def force_note(evaluation: Evaluation) -> str:
-    """Under the table of force errors."""
-    x, y, z = (fixed(float(value), 1) for value in evaluation.mean_force)
-    return (
-        "Force by the soil on the tool, mean over a frame; draft is −Fx, drawbar pull Fx, vertical Fz, lateral "
-        "Fy. MAE: mean absolute error. NRMSE: RMS error / RMS of the truth, of the whole vector where no "
-        "component is named. – stands where the truth is negligible beside the whole force. Mean force: always "
-        f"answering the mean of the training runs, ({x}, {y}, {z}) N. Torque is about the tool's centre of mass."
-    )
-
-
-def cost_note(evaluation: Evaluation) -> str:
-    """Under the table of time and memory."""
-    costs, timing = evaluation.costs, evaluation.timing
-    samples = f" of {costs.batch_size} samples" if costs.batch_size > 0 else ""
-    training = (
-        f"Training: {costs.training_steps} steps{samples}, their validation "
-        "included, as training.json beside the checkpoint says. "
-        if costs.training_steps > 0.0
-        else "Training: there is no training.json beside the checkpoint. "
-    )
-    full_space = (
-        "Full space: the same network on every particle, the paper's reference; its weights are not trained, which its "
-        f"costs do not depend on; one thread, training steps of {evaluation.full_space.batch_size} samples."
-        if evaluation.full_space
-        else "The same network on every particle, the paper's reference, is measured with full_space=true."
-    )
-    return (
-        f"Network: median of {timing.repeats} warm repeats on one thread along run {timing.run}; nothing is "
-        "written to disk; the peak memory is that of the whole process, Python and its libraries included. "
-        f"{training}Solver: what its run files say, on the machine that made them; they hold position and velocity "
-        f"of every particle and no memory figure. {full_space}"
     )

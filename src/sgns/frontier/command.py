@@ -1,97 +1,27 @@
-"""`sgns frontier`: measure what accuracy costs in time."""
+"""`sgns frontier`: measure what accuracy costs in time, and gather it into a table, figures and a page."""
 
 from __future__ import annotations
 
-import importlib
 import logging
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
 from sgns.config import UserError
-from sgns.data.files import claimed_in_turn, require_replaceable
+from sgns.data.files import claimed_in_turn, require_replaceable, write_whole
+from sgns.evaluate.report import PAGES, ReportFigure, write_figures
+from sgns.frontier.figures import known, reduction_figure, scene_figure, through_time_figure, training_figure
 from sgns.frontier.observation import Observation, compare, errors
-from sgns.frontier.page import PAGE, write_study
-from sgns.frontier.point import Point
+from sgns.frontier.point import ERRORS, Point, front, write_points
 from sgns.frontier.study import AXES, Study, StudyScene
 
 log = logging.getLogger(__name__)
 
-
-# --- Errors of the points that are there, and which of them nobody beats --------------------------------
-
-TOO_FAR = "left the range: not finite"
-
-
-def gathered(study: Study) -> list[Point]:
-    """All points of a study with their errors against the reference of their scene, fastest last.
-
-    Raises:
-        UserError: no reference has been measured.
-    """
-    found: list[Point] = []
-    there = study.store.points()
-    for scene in study.scenes:
-        points = [(point, cases) for point, cases in there if point.scene == scene.name]
-        if not points:
-            continue
-        reference = reference_runs(study, scene)
-        if reference is None:
-            log.warning(
-                "%s: the reference (%s) is not there yet, so nothing can be judged; sgns frontier axis=solver",
-                scene.name,
-                scene.reference.label,
-            )
-            continue
-        found += [judged(study, scene, point, cases, reference) for point, cases in points]
-    if not found:
-        raise UserError(
-            f"{study.folder} holds no points with a reference; measure some: sgns frontier "
-            f"study={study.name} output={study.folder}"
-        )
-    order = {scene.name: number for number, scene in enumerate(study.scenes)}
-    cost = {id(p): math.inf if math.isnan(p.cost) else p.cost for p in found}
-    return sorted(found, key=lambda point: (order[point.scene], -cost[id(point)], point.label))
-
-
-def reference_runs(study: Study, scene: StudyScene) -> dict[str, Observation] | None:
-    """Case → the most accurate run; None if it has not been made."""
-    if not study.store.has(scene.name, "solver", scene.reference.label):
-        return None
-    point = Point(study.name, scene.name, "solver", "reference", scene.reference.label)
-    return {case: study.store.observation(point, case) for case in scene.cases}
-
-
-def judged(
-    study: Study,
-    scene: StudyScene,
-    point: Point,
-    cases: Iterable[str],
-    reference: Mapping[str, Observation],
-) -> Point:
-    """A point with its errors; without any if it is the reference or did not finish."""
-    if point.axis == "reference":
-        return point
-    runs = {case: study.store.observation(point, case) for case in cases if case in reference}
-    if not runs or point.note.startswith("stopped"):
-        return point
-    if not all(run.finite for run in runs.values()):
-        return replace(point, note=point.note or TOO_FAR)
-    compared = [compare(run, reference[case]) for case, run in runs.items()]
-    return replace(point, **errors(compared, free_body=scene.free_body))
-
-
-# --- `sgns frontier`: measure what accuracy costs in time, and gather it into a table, figures and a page
-
-# Axis → module and function that measures the points of a study that are missing.
-MEASURES = {
-    "solver": ("sgns.frontier.solver_points", "measure_solver"),
-    "reduction": ("sgns.frontier.solver_points", "measure_reduction"),
-    "surrogate": ("sgns.frontier.surrogate_points", "measure_surrogates"),
-}
+PAGE = "frontier.html"
+MOST_THROUGH_TIME = 14  # points of the fronts whose errors through the run are drawn
 
 
 def main(cfg: DictConfig) -> None:
@@ -108,15 +38,21 @@ def main(cfg: DictConfig) -> None:
     if axes:
         with claimed_in_turn(folder / "study.yaml"):  # what it says is read and added to
             study.record()
-    for axis in axes:
-        module, function = MEASURES[axis]
-        getattr(importlib.import_module(module), function)(study)
-    if axes and not any(study.store.has(s.name, "solver", s.reference.label) for s in study.scenes):
-        # Another process is still at it; what was measured here is kept.
-        log.info("no reference is there yet, so nothing can be judged; later: sgns frontier axis=none")
-        return
+        from sgns.frontier import measure  # training takes seconds to import
+
+        functions = {
+            "solver": measure.measure_solver,
+            "reduction": measure.measure_reduction,
+            "surrogate": measure.measure_surrogates,
+        }
+        for axis in axes:
+            functions[axis](study)
+        if not any(study.store.has(s.name, "solver", s.reference.label) for s in study.scenes):
+            # Another process is still at it; what was measured here is kept.
+            log.info("no reference is there yet, so nothing can be judged; later: sgns frontier axis=none")
+            return
     with claimed_in_turn(folder / PAGE):  # of several that gather at once the last sees all points
-        page = write_study(study, gathered(study))
+        page = write_study(study, points_with_errors(study))
     log.info("%s and the table and figures beside it", page)
 
 
@@ -129,3 +65,195 @@ def axes_of(asked: str | None) -> tuple[str, ...]:
     if asked not in AXES:
         raise UserError(f"axis is {asked!r}; allowed: {', '.join(AXES)}, all, none (only gather)")
     return (asked,)
+
+
+# --- Errors of the points that are there ----------------------------------------------------------------
+
+
+def points_with_errors(study: Study) -> list[Point]:
+    """All points of a study with their errors against the reference of their scene, fastest last.
+
+    Raises:
+        UserError: no reference has been measured.
+    """
+    found: list[Point] = []
+    measured = study.store.points()
+    for scene in study.scenes:
+        points = [(point, cases) for point, cases in measured if point.scene == scene.name]
+        if not points:
+            continue
+        label = scene.reference.label
+        if not study.store.has(scene.name, "solver", label):
+            log.warning(
+                "%s: the reference (%s) is not there yet, so nothing can be judged; sgns frontier axis=solver",
+                scene.name,
+                label,
+            )
+            continue
+        reference = Point(study.name, scene.name, "solver", "reference", label)
+        runs = {case: study.store.observation(reference, case) for case in scene.cases}
+        compared = [with_errors(study, scene, point, cases, runs) for point, cases in points]
+        found += sorted(compared, key=lambda p: (-math.inf if math.isnan(p.cost) else -p.cost, p.label))
+    if not found:
+        raise UserError(
+            f"{study.folder} holds no points with a reference; measure some: sgns frontier "
+            f"study={study.name} output={study.folder}"
+        )
+    return found
+
+
+def with_errors(
+    study: Study, scene: StudyScene, point: Point, cases: Iterable[str], reference: Mapping[str, Observation]
+) -> Point:
+    """A point with its errors; without any if it is the reference or did not finish."""
+    if point.axis == "reference":
+        return point
+    runs = {case: study.store.observation(point, case) for case in cases if case in reference}
+    if not runs or point.note.startswith("stopped"):
+        return point
+    if not all(run.finite for run in runs.values()):
+        return replace(point, note=point.note or "left the range: not finite")
+    compared = [compare(run, reference[case]) for case, run in runs.items()]
+    return replace(point, **errors(compared, free_body=scene.free_body))
+
+
+# --- The gathered study as a table, figures, and one HTML page that needs nothing from outside ----------
+
+TABLE = (  # heading, column of `Point`, what it is multiplied with
+    ("with all particles, s per s", "decoded_cost", 1.0),
+    ("force NRMSE", "force_nrmse", 1.0),
+    ("mean draft, %", "draft_mean_error", 100.0),
+    ("mean vertical, %", "vertical_mean_error", 100.0),
+    ("torque NRMSE", "torque_nrmse", 1.0),
+    ("soil, mm", "position_rmse_mm", 1.0),
+    ("surface, mm", "surface_rmse_mm", 1.0),
+    ("sinkage, mm", "sinkage_error_mm", 1.0),
+    ("own force NRMSE", "own_force_nrmse", 1.0),
+    ("own soil, mm", "own_position_rmse_mm", 1.0),
+    ("skill", "skill_frozen", 1.0),
+    ("training, s", "training_s", 1.0),
+    ("displacement energy, %", "energy", 100.0),
+)
+
+
+def write_study(study: Study, points: Sequence[Point]) -> Path:
+    """Writes points.csv, figures/*.png and frontier.html into the study's folder; returns the page."""
+    write_points(study.folder / "points.csv", points)
+    scenes = []
+    for scene in study.scenes:
+        if chosen := [point for point in points if point.scene == scene.name]:
+            figures = scene_figures(scene, chosen)
+            write_figures(figures, study.folder / "figures")
+            scenes.append((scene, figures, *scene_table(scene, chosen)))
+    page = study.folder / PAGE
+    text = PAGES.get_template("frontier/page.html.j2").render(
+        title=f"What accuracy costs in time: study {study.name}",
+        contents=[*((s[0].name, f"Scene: {s[0].name}") for s in scenes), ("made", "How this was made")],
+        scenes=scenes,
+        made=made(study, points),
+        errors=ERRORS,
+    )
+    write_whole(page, text)
+    return page
+
+
+def scene_figures(scene: StudyScene, points: Sequence[Point]) -> list[ReportFigure]:
+    """The pictures of a scene; those that would be empty are left out."""
+    name = scene.name
+    best = {
+        id(p): p for column in ("force_nrmse", "position_rmse_mm") for p in front(points, column, scene.bands)
+    }
+    through_time = [p for p in best.values() if not math.isnan(p.force_nrmse_q4)][:MOST_THROUGH_TIME]
+    trained = [p for p in points if p.training_s > 0 and not math.isnan(p.own_force_nrmse)]
+    reduced = [p for p in points if p.kind == "reduction" and p.own_position_rmse_mm > 0]
+    drawn = [
+        (
+            column.removesuffix("_mm"),
+            words,
+            "Every operating point; a star is one of the paper's. Left of the dashed line is faster than real time.",
+            scene_figure(points, column, scene.bands, f"{name}: {words} over time"),
+        )
+        for column, words in ERRORS.items()
+        if known(points, column)
+    ]
+    for suffix, shown, draw, title, words, caption in (
+        (
+            "through_time",
+            through_time,
+            through_time_figure,
+            "errors through the run, points of the fronts",
+            "error through time",
+            "Force: in each quarter. Soil: at the end of each quarter, where errors have added up.",
+        ),
+        (
+            "training",
+            trained,
+            training_figure,
+            "what training buys",
+            "error against training time",
+            "Errors against the solver that made the training runs, on its held-out runs, over training time.",
+        ),
+        (
+            "reduction",
+            reduced,
+            reduction_figure,
+            "what r modes leave out",
+            "reduction alone",
+            "No simulation: held-out runs projected onto the modes. No surrogate with r modes is better.",
+        ),
+    ):
+        if shown:
+            drawn.append((suffix, words, caption, draw(shown, f"{name}: {title}")))
+    return [
+        ReportFigure(f"{name}_{suffix}", f"{name}: {words}", caption, image)
+        for suffix, words, caption, image in drawn
+    ]
+
+
+def scene_table(scene: StudyScene, points: Sequence[Point]) -> tuple[list[str], list[tuple[bool, list[str]]]]:
+    """Headings, and for each point whether it is on a front, and its cells; columns that say nothing are left out."""
+    columns = {
+        "point": [("★ " if p.paper else "") + p.label for p in points],
+        "what is varied": [p.axis for p in points],
+        "kind": [p.kind for p in points],
+        "s per s": [digits(p.cost) + ("*" if p.shared else "") for p in points],
+        "ratio": [digits(p.ratio) for p in points],
+    }
+    more = {heading: [digits(factor * getattr(p, name)) for p in points] for heading, name, factor in TABLE}
+    more["note"] = [p.note for p in points]
+    columns |= {
+        heading: cells for heading, cells in more.items() if any(cell not in ("", "–") for cell in cells)
+    }
+    best = {id(p) for column in ERRORS for p in front(points, column, scene.bands)}
+    rows = zip(*columns.values(), strict=True)
+    return list(columns), [(id(p) in best, list(row)) for p, row in zip(points, rows, strict=True)]
+
+
+def made(study: Study, points: Sequence[Point]) -> dict[str, str]:
+    """Machine, commands, and what the times include."""
+
+    def all_of(values: Iterable[str]) -> str:
+        return "; ".join(dict.fromkeys(filter(None, values)))
+
+    workloads = [p.workload_wall_s_per_simulated_s for p in points if p.workload_wall_s_per_simulated_s > 0]
+    facts = {
+        "study": study.name,
+        "machine": all_of(sorted(f"one core of {p.machine}" for p in points if p.machine)),
+        "commands": all_of(sorted(p.command for p in points)),
+        "package": all_of(sorted(f"{p.version} {p.commit}".strip() for p in points if p.version)),
+        "points": str(len(points)),
+        "timing": "medians of repeats on one core and one thread, warm: kernels were compiled and files in memory "
+        "before the clock started. The solver's repeats are stretches of its runs.",
+        "reference workload": f"sgns simulate scene=excavation while the plate cuts, beside every point: "
+        f"{digits(min(workloads))} to {digits(max(workloads))} s per simulated s in this study"
+        if workloads
+        else "",
+    }
+    for kind in dict.fromkeys(p.kind for p in points):
+        facts[f"in the time, {kind}"] = all_of(p.includes for p in points if p.kind == kind)
+    return {name: value for name, value in facts.items() if value}
+
+
+def digits(value: float) -> str:
+    """A number to three digits, – where there is none."""
+    return "–" if math.isnan(value) else f"{value:.3g}"

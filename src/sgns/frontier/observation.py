@@ -6,19 +6,22 @@ import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from functools import reduce
+from operator import add
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from mpm_warp import Scene
 from sgns.arrays import require_shapes
 from sgns.config import UserError
 from sgns.data.files import whole_file
 from sgns.data.small_files import read_arrays
-from sgns.evaluate.metrics import SurfaceGrid, VectorErrors, height_map
+from sgns.evaluate.metrics import SurfaceGrid, VectorErrors, height_error, height_map, rms_mm
 
-# --- What is kept of a run so that it can be compared with runs of the same scene on other beds of particle
+# --- What is kept of a run ------------------------------------------------------------------------------
 # Forces, torques and poses are kept in every frame. The soil is kept a few times a second, in two forms that do not
 # depend on which particles stand for it:
 #
@@ -44,25 +47,16 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
 
 @dataclass(frozen=True)
 class Observation:
-    """One run, whoever made it.
+    """One run, whoever made it."""
 
-    Attributes:
-        time: of the frames [s], shape (T,).
-        force: by the soil on the body [N], shape (T, 3); frame 0 is at rest.
-        torque: about its centre of mass [N m], shape (T, 3).
-        pose: of the body, shape (T, 7).
-        soil_time: when the soil was observed [s], shape (K,).
-        moved: displacement of the soil around the lattice points since the start [m], shape (K, P, 3), float32.
-        surface: height of the columns [m], shape (K, nx, ny); NaN where a column is empty.
-    """
-
-    time: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
-    pose: np.ndarray
-    soil_time: np.ndarray
+    time: np.ndarray  # of the frames [s], shape (T,)
+    force: np.ndarray  # by the soil on the body [N], shape (T, 3); frame 0 is at rest
+    torque: np.ndarray  # about its centre of mass [N m], shape (T, 3)
+    pose: np.ndarray  # of the body, shape (T, 7)
+    soil_time: np.ndarray  # when the soil was observed [s], shape (K,)
+    # displacement of the soil around the lattice points since the start [m], shape (K, P, 3), float32
     moved: np.ndarray
-    surface: np.ndarray
+    surface: np.ndarray  # height of the columns [m], shape (K, nx, ny); NaN where a column is empty
 
     def save(self, file: Path) -> None:
         """Write it, complete or not at all."""
@@ -102,17 +96,12 @@ def observed_frames(frame_count: int, frame_rate: float) -> np.ndarray:
 
 
 class Observer:
-    """Collects an observation frame by frame.
-
-    Args:
-        scene: what is simulated; says where the bin is.
-        start: positions of the particles at time 0 [m], shape (n, 3).
-    """
+    """Collects an observation of a scene frame by frame, from where the particles are at time 0 [m], shape (n, 3)."""
 
     def __init__(self, scene: Scene, start: np.ndarray) -> None:
         self._start = np.asarray(start, dtype=np.float64)
         size = np.asarray(scene.bed.size)
-        self._points = _NearPoints(self._start, size)
+        self._weights = lattice_weights(self._start, size)
         x, y = (np.linspace(0.0, edge, max(1, round(edge / COLUMN)) + 1) for edge in size[:2])
         self._columns = SurfaceGrid(x, y)
         # Half the edge of the cube that belongs to one particle, whatever share of them is here.
@@ -127,8 +116,10 @@ class Observer:
     def add_soil(self, time: float, position: np.ndarray) -> None:
         """The particles in a frame in which the soil is to be observed [m], shape (n, 3)."""
         position = np.asarray(position, dtype=np.float64)
+        with np.errstate(invalid="ignore"):  # no particle is near: NaN
+            moved = self._weights @ (position - self._start) / self._weights.sum(axis=1)[:, None]
         self._frames["soil_time"].append(time)
-        self._frames["moved"].append(self._points.mean(position - self._start).astype(np.float32))
+        self._frames["moved"].append(moved.astype(np.float32))
         self._frames["surface"].append(height_map(position, self._columns) + self._above)
 
     def finish(self) -> Observation:
@@ -136,33 +127,19 @@ class Observer:
         return Observation(**{key: np.array(values) for key, values in self._frames.items()})
 
 
-class _NearPoints:
-    """Means over the particles near the points of a regular lattice in the bin."""
-
-    def __init__(self, start: np.ndarray, size: np.ndarray) -> None:
-        counts = np.maximum(1, np.round(size / LATTICE)).astype(int)
-        spacing = size / counts
-        place = (start + np.array([0.0, 0.0, size[2]])) / spacing - 0.5
-        low = np.floor(place).astype(int)
-        index, weight = [], []
-        for corner in itertools.product((0, 1), repeat=3):
-            node = low + corner
-            share = np.prod(np.maximum(0.0, 1.0 - np.abs(place - node)), axis=1)
-            share[((node < 0) | (node >= counts)).any(axis=1)] = 0.0
-            index.append(np.ravel_multi_index(tuple(np.clip(node, 0, counts - 1).T), tuple(counts)))
-            weight.append(share)
-        self._index, self._weight = np.concatenate(index), np.concatenate(weight)
-        self._count = int(np.prod(counts))
-        self._total = np.bincount(self._index, self._weight, self._count)
-
-    def mean(self, values: np.ndarray) -> np.ndarray:
-        """Of a vector of each particle (n, 3), shape (P, 3); NaN where no particle is near."""
-        sums = [
-            np.bincount(self._index, self._weight * np.tile(values[:, axis], 8), self._count)
-            for axis in range(3)
-        ]
-        with np.errstate(invalid="ignore"):
-            return np.stack(sums, axis=1) / self._total[:, None]
+def lattice_weights(start: np.ndarray, size: np.ndarray) -> csr_array:
+    """Weight of each particle (n, 3) [m] at each point of a regular lattice in a bin of a size [m], shape (P, n)."""
+    counts = np.maximum(1, np.round(size / LATTICE)).astype(int)
+    place = (start + np.array([0.0, 0.0, size[2]])) / (size / counts) - 0.5
+    points, weights = [], []
+    for corner in itertools.product((0, 1), repeat=3):
+        node = np.floor(place).astype(int) + corner
+        weight = np.prod(np.maximum(0.0, 1.0 - np.abs(place - node)), axis=1)
+        weight[((node < 0) | (node >= counts)).any(axis=1)] = 0.0
+        points.append(np.ravel_multi_index(tuple(np.clip(node, 0, counts - 1).T), tuple(counts)))
+        weights.append(weight)
+    entries = np.concatenate(weights), (np.concatenate(points), np.tile(np.arange(len(start)), 8))
+    return csr_array(entries, shape=(int(np.prod(counts)), len(start)))
 
 
 def observe_arrays(
@@ -175,18 +152,10 @@ def observe_arrays(
     frames: np.ndarray,
     positions: Iterable[np.ndarray],
 ) -> Observation:
-    """The observation of a run that is in memory.
+    """The observation of a run that is in memory: frames as in `Observation`, the particles (n, 3) [m] in some of them.
 
-    Args:
-        scene: what was simulated.
-        start: where the particles are in an undisturbed bed [m], shape (n, 3). Not a frame of the run: what a reduction
-            leaves out of the bed at rest would be left out of every error.
-        time: of all frames [s], shape (T,).
-        force: [N], shape (T, 3).
-        torque: [N m], shape (T, 3).
-        pose: of the body, shape (T, 7).
-        frames: numbers of the frames in which the soil is known, `observed_frames`, the first of them 0.
-        positions: particles in each of these frames [m], (n, 3) each.
+    `start` is where the particles are in an undisturbed bed [m], shape (n, 3). Not a frame of the run: what a reduction
+    leaves out of the bed at rest would be left out of every error. `frames` are `observed_frames`, the first of them 0.
     """
     observer = Observer(scene, start)
     for frame, position in zip(frames, positions, strict=True):
@@ -196,37 +165,27 @@ def observe_arrays(
     return observer.finish()
 
 
-# --- How far observed runs are from reference runs of the same scenes, on whatever particles either was mad
-# Definitions are those of docs/conventions.md where it has them. Frame 0, at rest, does not count. Forces,
-# torques and
-# poses of a run with another frame rate are interpolated in time at the reference's frames, its soil at the times
-# at which the reference's soil was observed.
-
-QUARTERS = (1, 2, 3, 4)
+# --- How far observed runs are from reference runs of the same scenes, on whatever particles --------------
+# Definitions are those of docs/conventions.md where it has them. Frame 0, at rest, does not count. Forces, torques and
+# poses of a run with another frame rate are interpolated in time at the reference's frames, its soil at the times at
+# which the reference's soil was observed.
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One run beside its reference.
+    """One run beside its reference."""
 
-    Attributes:
-        force: by quarter of the run, four `VectorErrors` [N].
-        torque: of the whole run [N m].
-        position: mean-square difference of displacement at every observed time but the first [m²], shape (K - 1,).
-        surface: mean-square difference of the last surface [m²].
-        sinkage: mean absolute difference of the body's height [m].
-    """
-
-    force: tuple[VectorErrors, ...]
-    torque: VectorErrors
+    force: tuple[VectorErrors, ...]  # by quarter of the run, four `VectorErrors` [N]
+    torque: VectorErrors  # of the whole run [N m]
+    # mean-square difference of displacement at every observed time but the first [m²], shape (K - 1,)
     position: np.ndarray
-    surface: float
-    sinkage: float
+    surface: float  # mean-square difference of the last surface [m²]
+    sinkage: float  # mean absolute difference of the body's height [m]
 
     @property
     def whole_force(self) -> VectorErrors:
         """Of all quarters."""
-        return sum(self.force[1:], start=self.force[0])
+        return reduce(add, self.force)
 
     def position_at(self, quarter: int) -> float:
         """Mean-square difference of displacement at the end of a quarter of the run, 1 to 4 [m²]."""
@@ -257,7 +216,7 @@ def compare(run: Observation, reference: Observation) -> Comparison:
         force=tuple(VectorErrors.compare(reference.force[1:][part], force[part]) for part in quarters),
         torque=VectorErrors.compare(reference.torque[1:], torque),
         position=mean_squares(run, reference),
-        surface=height_difference(run.surface[-1], reference.surface[-1]),
+        surface=height_error(run.surface[-1], reference.surface[-1]),
         sinkage=float(np.abs(heights - reference.pose[1:, 2]).mean()),
     )
 
@@ -285,26 +244,17 @@ def mean_squares(run: Observation, reference: Observation) -> np.ndarray:
     return (difference**2).mean(axis=1)
 
 
-def height_difference(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean-square difference of two height maps [m²] over the columns that both fill."""
-    both = np.isfinite(a) & np.isfinite(b)
-    return float(np.mean((a[both] - b[both]) ** 2)) if both.any() else math.nan
-
-
 def errors(comparisons: Sequence[Comparison], *, free_body: bool = False) -> dict[str, float]:
-    """Errors of a point over its cases, by the names of the columns of `Point`.
+    """Errors of a point over its cases, by the names of the columns of `Point`; sinkage only where the body is free.
 
     Squares are summed over the cases before the root is taken; low and high are those of the best and the worst case.
-
-    Args:
-        comparisons: of each case.
-        free_body: whether the body's height is part of the answer.
     """
-    force = sum((c.whole_force for c in comparisons[1:]), start=comparisons[0].whole_force)
-    torque = sum((c.torque for c in comparisons[1:]), start=comparisons[0].torque)
-    quarters = [
-        sum((c.force[q - 1] for c in comparisons[1:]), start=comparisons[0].force[q - 1]) for q in QUARTERS
-    ]
+
+    def pooled(squares: Iterable[float]) -> float:
+        return rms_mm(float(np.mean(list(squares))))
+
+    force = reduce(add, (c.whole_force for c in comparisons))
+    torque = reduce(add, (c.torque for c in comparisons))
     found = {
         "force_nrmse": force.overall_nrmse,
         "draft_nrmse": float(force.nrmse[0]),
@@ -312,21 +262,17 @@ def errors(comparisons: Sequence[Comparison], *, free_body: bool = False) -> dic
         "vertical_nrmse": float(force.nrmse[2]),
         "vertical_mean_error": float(force.mpe[2]) / 100.0,
         "torque_nrmse": torque.overall_nrmse,
-        "position_rmse_mm": _root_mm([c.position.mean() for c in comparisons]),
-        "surface_rmse_mm": _root_mm([c.surface for c in comparisons]),
+        "position_rmse_mm": pooled(c.position.mean() for c in comparisons),
+        "surface_rmse_mm": pooled(c.surface for c in comparisons),
         "sinkage_error_mm": 1e3 * float(np.mean([c.sinkage for c in comparisons])) if free_body else math.nan,
     }
-    found |= {f"force_nrmse_q{q}": quarters[q - 1].overall_nrmse for q in QUARTERS}
-    found |= {f"position_rmse_mm_q{q}": _root_mm([c.position_at(q) for c in comparisons]) for q in QUARTERS}
+    for q in range(1, 5):
+        found[f"force_nrmse_q{q}"] = reduce(add, (c.force[q - 1] for c in comparisons)).overall_nrmse
+        found[f"position_rmse_mm_q{q}"] = pooled(c.position_at(q) for c in comparisons)
     for name, values in (
         ("force_nrmse", [c.whole_force.overall_nrmse for c in comparisons]),
-        ("position_rmse_mm", [_root_mm([c.position.mean()]) for c in comparisons]),
-        ("surface_rmse_mm", [_root_mm([c.surface]) for c in comparisons]),
+        ("position_rmse_mm", [rms_mm(c.position.mean()) for c in comparisons]),
+        ("surface_rmse_mm", [rms_mm(c.surface) for c in comparisons]),
     ):
         found |= {f"{name}_low": min(values), f"{name}_high": max(values)}
     return found
-
-
-def _root_mm(squares: Sequence[float]) -> float:
-    """Root of the mean of squares [m²] in mm."""
-    return 1e3 * math.sqrt(float(np.mean(squares)))

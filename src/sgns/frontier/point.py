@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import logging
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -14,13 +13,15 @@ from sgns.config import UserError
 from sgns.data.files import whole_file
 from sgns.data.small_files import read_table
 
-log = logging.getLogger(__name__)
-
-
-# --- One operating point: a way to get the motion of the soil, what it costs and how wrong it is. One row o
-
 SHARED = 1.1  # wall time over processor time from which a core counts as shared
 KINDS = ("solver", "reduction", "surrogate", "full space")
+ERRORS = {
+    "force_nrmse": "force, NRMSE [-]",
+    "position_rmse_mm": "displacement of the soil, RMSE [mm]",
+    "surface_rmse_mm": "surface at the end, RMSE [mm]",
+    "sinkage_error_mm": "sinkage, mean absolute error [mm]",
+}
+"""Column → what it is, of the errors that points are compared by."""
 
 
 @dataclass(frozen=True)
@@ -31,49 +32,35 @@ class Point:
     scene (observation.py); they are filled in when points are gathered, all other fields when a point is measured.
     """
 
-    study: str
-    """quick, full or the name of a study of one's own."""
-    scene: str
-    """cut, wheel, ...: points of one scene are on one figure."""
-    kind: str
-    """One of `KINDS`."""
+    study: str  # quick, full or the name of a study of one's own
+    scene: str  # cut, wheel, ...: points of one scene are on one figure
+    kind: str  # one of `KINDS`
+    # what is varied: dx, stiffness, an effect, r, width, ...; `reference` for the most accurate run
     axis: str
-    """What is varied: dx, stiffness, an effect, r, width, ...; `reference` for the most accurate run."""
-    label: str
-    """Unique within scene and kind; stands in figures."""
+    label: str  # unique within scene and kind; stands in figures
+    # the overrides that make it as they are written on the command line: of `sgns simulate` for the solver,
+    # of `sgns train` for surrogates (dataset and length of the training among them)
     settings: str = ""
-    """The overrides that make it as they are written on the command line: of `sgns simulate` for the solver, of
-    `sgns train` for surrogates (dataset and length of the training among them)."""
-    note: str = ""
-    """What a reader must know, such as `left the range: not finite from frame 31 on`."""
-    paper: bool = False
-    """An operating point of the paper."""
+    note: str = ""  # what a reader must know, such as `left the range: not finite from frame 31 on`
+    paper: bool = False  # an operating point of the paper
 
     # --- size ---
-    particles: float = math.nan
-    """That are computed or decoded, the mirrored half included."""
-    modes: float = math.nan
-    """r."""
-    parameters: float = math.nan
-    """Learned numbers."""
+    particles: float = math.nan  # that are computed or decoded, the mirrored half included
+    modes: float = math.nan  # r
+    parameters: float = math.nan  # learned numbers
 
     # --- cost: medians of repeats, warm ---
     wall_s_per_simulated_s: float = math.nan
-    wall_s_per_simulated_s_low: float = math.nan
-    """The fastest repeat."""
-    wall_s_per_simulated_s_high: float = math.nan
-    """The slowest repeat."""
+    wall_s_per_simulated_s_low: float = math.nan  # the fastest repeat
+    wall_s_per_simulated_s_high: float = math.nan  # the slowest repeat
     processor_s_per_simulated_s: float = math.nan
+    # with the positions of all particles in every frame, where they are not computed anyway
     decoded_wall_s_per_simulated_s: float = math.nan
-    """With the positions of all particles in every frame, where they are not computed anyway."""
-    repeats: float = math.nan
-    """How many repeats, or stretches of one run, the median is of."""
+    repeats: float = math.nan  # how many repeats, or stretches of one run, the median is of
+    # the reference workload (study.py), before and after, on the same core; processor time if that was shared
     workload_wall_s_per_simulated_s: float = math.nan
-    """The reference workload (study.py), before and after, on the same core; processor time if that was shared."""
-    ratio: float = math.nan
-    """`cost` / workload_wall_s_per_simulated_s."""
-    includes: str = ""
-    """What is in the time."""
+    ratio: float = math.nan  # `cost` / workload_wall_s_per_simulated_s
+    includes: str = ""  # what is in the time
     processor: str = ""
     threads: float = math.nan
     device: str = ""
@@ -83,27 +70,22 @@ class Point:
     force_nrmse_low: float = math.nan
     force_nrmse_high: float = math.nan
     draft_nrmse: float = math.nan
-    draft_mean_error: float = math.nan
-    """(mean - mean of the reference) / mean of the reference, signed."""
+    draft_mean_error: float = math.nan  # (mean - mean of the reference) / mean of the reference, signed
     vertical_nrmse: float = math.nan
     vertical_mean_error: float = math.nan
     torque_nrmse: float = math.nan
     position_rmse_mm: float = math.nan
     position_rmse_mm_low: float = math.nan
     position_rmse_mm_high: float = math.nan
-    surface_rmse_mm: float = math.nan
-    """Of the last frame."""
+    surface_rmse_mm: float = math.nan  # of the last frame
     surface_rmse_mm_low: float = math.nan
     surface_rmse_mm_high: float = math.nan
-    sinkage_error_mm: float = math.nan
-    """Mean absolute error of the height of a body that is free."""
-    force_nrmse_q1: float = math.nan
-    """In the first quarter of the run; q2 to q4 likewise."""
+    sinkage_error_mm: float = math.nan  # mean absolute error of the height of a body that is free
+    force_nrmse_q1: float = math.nan  # in the first quarter of the run; q2 to q4 likewise
     force_nrmse_q2: float = math.nan
     force_nrmse_q3: float = math.nan
     force_nrmse_q4: float = math.nan
-    position_rmse_mm_q1: float = math.nan
-    """At the end of the first quarter of the run; q2 to q4 likewise."""
+    position_rmse_mm_q1: float = math.nan  # at the end of the first quarter of the run; q2 to q4 likewise
     position_rmse_mm_q2: float = math.nan
     position_rmse_mm_q3: float = math.nan
     position_rmse_mm_q4: float = math.nan
@@ -115,27 +97,19 @@ class Point:
     own_position_rmse_mm: float = math.nan
     own_surface_rmse_mm: float = math.nan
     own_sinkage_error_mm: float = math.nan
-    frozen_rmse_mm: float = math.nan
-    """Nothing moves: the baseline of skill_frozen."""
+    frozen_rmse_mm: float = math.nan  # nothing moves: the baseline of skill_frozen
     skill_frozen: float = math.nan
     skill_constant_velocity: float = math.nan
-    mean_force_nrmse: float = math.nan
-    """The mean force of the training runs: the baseline of own_force_nrmse."""
-    training_s: float = math.nan
-    """Processor seconds."""
-    training_samples: float = math.nan
-    """Windows seen, repetitions counted."""
+    mean_force_nrmse: float = math.nan  # the mean force of the training runs: the baseline of own_force_nrmse
+    training_s: float = math.nan  # processor seconds
+    training_samples: float = math.nan  # windows seen, repetitions counted
     training_runs: float = math.nan
-    energy: float = math.nan
-    """Share of the displacement energy that the modes hold, held-out runs."""
+    energy: float = math.nan  # share of the displacement energy that the modes hold, held-out runs
 
-    command: str = ""
-    """That measured it."""
+    command: str = ""  # that measured it
     machine: str = ""
-    version: str = ""
-    """Of the package."""
-    commit: str = ""
-    """Of the code that measured it, where that was a checkout."""
+    version: str = ""  # of the package
+    commit: str = ""  # of the code that measured it, where that was a checkout
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -160,7 +134,10 @@ class Point:
 
     def row(self) -> dict[str, Any]:
         """Plain values by column, numbers to five digits, empty where not known."""
-        return {key: _written(value) for key, value in asdict(self).items()}
+        return {
+            key: value if not isinstance(value, float) else "" if math.isnan(value) else f"{value:.5g}"
+            for key, value in asdict(self).items()
+        }
 
     @classmethod
     def from_row(cls, row: dict[str, Any]) -> Point:
@@ -175,7 +152,7 @@ class Point:
             if given is None or given == "":
                 continue
             try:
-                values[field.name] = value = _KINDS_OF_VALUE[str(field.type)](given)
+                values[field.name] = value = _READERS[str(field.type)](given)
                 if isinstance(value, float) and (
                     math.isinf(value) or (field.name in _ABOVE_ZERO and value <= 0.0)
                 ):
@@ -189,19 +166,9 @@ class Point:
             raise UserError(f"a row of operating points lacks columns: {error}") from None
 
 
-_ABOVE_ZERO = (
-    "wall_s_per_simulated_s",
-    "processor_s_per_simulated_s",
-    "decoded_wall_s_per_simulated_s",
-)
+_ABOVE_ZERO = ("wall_s_per_simulated_s", "processor_s_per_simulated_s", "decoded_wall_s_per_simulated_s")
 """Columns that others are divided by."""
-_KINDS_OF_VALUE = {"str": str, "float": float, "bool": lambda v: {"True": True, "False": False}[str(v)]}
-
-
-def _written(value: Any) -> Any:
-    if isinstance(value, float):
-        return "" if math.isnan(value) else f"{value:.5g}"
-    return value
+_READERS = {"str": str, "float": float, "bool": lambda v: {"True": True, "False": False}[str(v)]}
 
 
 def write_points(file: Path, points: Iterable[Point]) -> None:
@@ -226,7 +193,7 @@ def read_points(file: Path) -> list[Point]:
         raise UserError(f"{file} is no table of operating points: {error}") from None
 
 
-# --- Errors of the points that are there, and which of them nobody beats --------------------------------
+# --- Which points nobody beats --------------------------------------------------------------------------
 
 
 def usable(point: Point) -> bool:
@@ -236,10 +203,10 @@ def usable(point: Point) -> bool:
 
 def effective_error(point: Point, column: str, bands: Mapping[str, float]) -> float:
     """An error, but never less than what the reference itself may be wrong by; NaN if it is not known."""
-    band = bands.get(column, 0.0)
     if point.axis == "reference":
-        return band if column in bands else math.nan
-    return max(getattr(point, column), band) if not math.isnan(getattr(point, column)) else math.nan
+        return bands.get(column, math.nan)
+    error = getattr(point, column)
+    return error if math.isnan(error) else max(error, bands.get(column, 0.0))
 
 
 def front(points: Iterable[Point], column: str, bands: Mapping[str, float]) -> list[Point]:

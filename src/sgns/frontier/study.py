@@ -9,9 +9,9 @@ import shlex
 import statistics
 import subprocess
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import torch
 import yaml
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig
 
 from mpm_warp import Frame, Scene, Solver, effects_for
 from sgns import __version__
@@ -29,15 +30,13 @@ from sgns.data.files import write_whole
 from sgns.data.small_files import read_json, read_text
 from sgns.evaluate.costs import command_line, cpu_model
 from sgns.frontier.observation import Observation, read_observation
-from sgns.frontier.point import SHARED, Point
+from sgns.frontier.point import ERRORS, SHARED, Point
 from sgns.simulate.scene import scene_from_config
 
 # --- Wall times that can be compared: one core, warm, medians, beside a workload that is always the same
-# The reference workload is the default scene of `sgns simulate` (the paper's bin at 20 mm, 4 particles per
-# cell, half of
-# it computed) while the plate cuts. Its time is taken just before and just after what is measured, on the
-# same core, so
-# that ratios to it hold on a machine whose speed changes.
+# The reference workload is the default scene of `sgns simulate` (the paper's bin at 20 mm, 4 particles per cell, half
+# of it computed) while the plate cuts. Its time is taken just before and just after what is measured, on the same
+# core, so that ratios to it hold on a machine whose speed changes.
 
 FRAMES = 8  # of one measurement of the workload
 STRETCHES = 2  # of which the median is taken, before and after each
@@ -59,13 +58,23 @@ def one_core(last: bool = False) -> Iterator[None]:
             os.sched_setaffinity(0, cores)
 
 
-def composed_scene(overrides: Sequence[str]) -> tuple[Scene, Any]:
-    """The scene and all settings of `sgns simulate` with these overrides."""
+def stopwatch() -> Callable[[], tuple[float, float]]:
+    """A function that tells the wall and the processor time since now [s]."""
+    began, clock = time.perf_counter(), time.process_time()
+    return lambda: (elapsed(began, time.perf_counter()), elapsed(clock, time.process_time()))
+
+
+def composed(command: str, overrides: Sequence[str]) -> DictConfig:
+    """All settings of a command with these overrides."""
     if GlobalHydra.instance().is_initialized():
-        cfg = compose("simulate", list(overrides))
-    else:
-        with initialize_config_module("sgns.conf", version_base="1.3"):
-            cfg = compose("simulate", list(overrides))
+        return compose(command, list(overrides))
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        return compose(command, list(overrides))
+
+
+def composed_scene(overrides: Sequence[str]) -> tuple[Scene, DictConfig]:
+    """The scene and all settings of `sgns simulate` with these overrides."""
+    cfg = composed("simulate", overrides)
     return scene_from_config(cfg), cfg
 
 
@@ -73,8 +82,11 @@ class Workload:
     """The reference workload, warm."""
 
     def __init__(self) -> None:
-        self._scene, _ = composed_scene(["scene=excavation"])
         self._frames: Iterator[Frame] = iter(())
+
+    @cached_property
+    def _scene(self) -> Scene:
+        return composed_scene(["scene=excavation"])[0]
 
     def measure(self) -> list[float]:
         """Wall seconds per simulated second of each of a few stretches; processor seconds where the core was shared."""
@@ -84,10 +96,10 @@ class Workload:
                 self._frames = Solver(self._scene, effects_for(self._scene)[0]).frames()
                 for _ in range(2):  # the first frame loads kernels, the second is the first that computes
                     next(self._frames)
-            began, processor = time.perf_counter(), time.process_time()
+            watch = stopwatch()
             done = sum(1 for _ in zip(range(FRAMES), self._frames, strict=False))
             if done == FRAMES:
-                wall, processor = elapsed(began, time.perf_counter()), elapsed(processor, time.process_time())
+                wall, processor = watch()
                 seconds = processor if wall > SHARED * processor else wall
                 found.append(seconds * self._scene.frame_rate / FRAMES)
         return found or self.measure()
@@ -98,10 +110,8 @@ def cost_fields(
 ) -> dict[str, Any]:
     """The columns of `Point` that say what it costs, for the CPU.
 
-    Args:
-        rates: wall seconds per simulated second, of each repeat.
-        workload: those of the reference workload before and after.
-        processor_rate: processor seconds per simulated second.
+    From wall seconds per simulated second, of each repeat and of the reference workload before and after, and processor
+    seconds per simulated second.
     """
     median, reference = statistics.median(rates), statistics.median(workload)
     cost = processor_rate if median > SHARED * processor_rate else median
@@ -133,17 +143,11 @@ def made_here() -> dict[str, str]:
 @cache
 def commit() -> str:
     """Short name of the commit this package runs from; empty if it is no checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     try:
-        asked = subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=10,
-        )
-    except (OSError, subprocess.TimeoutExpired):
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
         return ""
-    return asked.stdout.strip() if asked.returncode == 0 else ""
 
 
 # --- Points in a folder, one file each, so that a study goes on where it stopped ------------------------
@@ -167,9 +171,8 @@ class Store:
 
     def save(self, point: Point, observations: Mapping[str, Observation]) -> None:
         """Keep a point with its run of every case; none for a point that left the range (say so in its note)."""
-        name = name_of(point.scene, point.kind, point.label)
         for case, observation in observations.items():
-            observation.save(self._observation(name, case))
+            observation.save(self._observation(point, case))
         content = {"point": point.row(), "cases": list(observations)}
         file = self.file(point.scene, point.kind, point.label)
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -198,10 +201,10 @@ class Store:
 
     def observation(self, point: Point, case: str) -> Observation:
         """The run of a case of a point."""
-        return read_observation(self._observation(name_of(point.scene, point.kind, point.label), case))
+        return read_observation(self._observation(point, case))
 
-    def _observation(self, name: str, case: str) -> Path:
-        return self.folder / "observations" / f"{name}_{case}.npz"
+    def _observation(self, point: Point, case: str) -> Path:
+        return self.folder / "observations" / f"{name_of(point.scene, point.kind, point.label)}_{case}.npz"
 
 
 def name_of(scene: str, kind: str, label: str) -> str:
@@ -213,7 +216,6 @@ def name_of(scene: str, kind: str, label: str) -> str:
 
 AXES = ("solver", "reduction", "surrogate")
 """Groups of points that one command, or one process of several, measures."""
-BANDS = ("force_nrmse", "position_rmse_mm", "surface_rmse_mm", "sinkage_error_mm")
 
 
 @dataclass(frozen=True)
@@ -222,12 +224,9 @@ class PointSettings:
 
     axis: str
     label: str
-    set: tuple[str, ...] = ()
-    """Overrides: of `sgns simulate` for the solver, of `sgns train` for surrogates."""
-    paper: bool = False
-    """It is an operating point of the paper."""
-    more: Mapping[str, Any] | None = None
-    """Further keys that only one axis knows."""
+    set: tuple[str, ...] = ()  # overrides: of `sgns simulate` for the solver, of `sgns train` for surrogates
+    paper: bool = False  # it is an operating point of the paper
+    more: Mapping[str, Any] = field(default_factory=dict)  # further keys that only one axis knows
 
     @classmethod
     def from_dict(cls, data: Any, where: str) -> PointSettings:
@@ -281,9 +280,8 @@ class StudyScene:
     @cached_property
     def reference(self) -> PointSettings:
         """The most accurate run."""
-        return PointSettings.from_dict(
-            {"axis": "reference"} | dict(self.settings["reference"]), f"study.scenes.{self.name}.reference"
-        )
+        entry = {"axis": "reference"} | dict(self.settings["reference"])
+        return PointSettings.from_dict(entry, f"study.scenes.{self.name}.reference")
 
     def points(self, axis: str) -> list[PointSettings]:
         """Points of an axis, in the order in which they are measured."""
@@ -317,9 +315,9 @@ class Study:
             for key in ("scene", "dataset", "cases", "reference"):
                 if not isinstance(scene, Mapping) or not scene.get(key):
                     raise UserError(f"study.scenes.{name}.{key} is missing; see conf/study/quick.yaml")
-            if wrong := set(scene.get("bands") or ()) - set(BANDS):
+            if wrong := set(scene.get("bands") or ()) - set(ERRORS):
                 raise UserError(
-                    f"study.scenes.{name}.bands has no key {min(wrong)!r}; allowed: {', '.join(BANDS)}"
+                    f"study.scenes.{name}.bands has no key {min(wrong)!r}; allowed: {', '.join(ERRORS)}"
                 )
         return cls(str(settings["name"]), tuple(StudyScene(n, s) for n, s in scenes.items()), folder)
 

@@ -61,7 +61,7 @@ def test_whole_evaluation(dataset, basis, tmp_path):
     assert [row["run"] for row in examples] == [row["run"] for row in rows]
     assert float(examples[-1]["mse_network_m2"]) == pytest.approx(result.total.mse["network"])
     assert result.timing.repeats >= 3
-    assert result.timing.decoding > result.timing.stepping > 0.0
+    assert result.timing.decoded > result.timing.rollout > 0.0
     for run in result.runs:
         assert check_run(run.rollout) == []
         with Run(run.rollout) as written:

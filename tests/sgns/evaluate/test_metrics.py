@@ -17,12 +17,11 @@ from sgns.evaluate.metrics import (
     mean_prediction,
     particle_spacing,
     position_errors,
+    rms_mm,
     skill,
     surface_grid,
 )
 from sgns.reduction.basis import Basis
-
-# ---  ---------------------------------------------------------------------------------------------------
 
 
 def lattice(nx=12, ny=8, nz=4, spacing=0.05):
@@ -96,9 +95,6 @@ def test_surface_error_of_a_thinned_bed_is_that_of_the_bed(arrangement):
     assert particle_spacing(thinned) == pytest.approx(5 ** (1 / 3) * particle_spacing(full), rel=0.05)
 
 
-# ---  ---------------------------------------------------------------------------------------------------
-
-
 class ArrayRun:
     """A run in memory."""
 
@@ -150,17 +146,21 @@ def test_position_errors_by_hand():
     assert errors.reduction == pytest.approx([0.0, 0.0], abs=1e-12)  # one mode holds one particle
     assert errors.network == pytest.approx(errors.total)
     assert errors.mse("total") == pytest.approx(29 / 6)
-    assert errors.rmse_mm("total") == pytest.approx(1e3 * math.sqrt(29 / 6))
-    assert errors.skill("constant_velocity") == pytest.approx(1 - 29 / 10)
+    assert rms_mm(errors.mse("total")) == pytest.approx(1e3 * math.sqrt(29 / 6))
+    assert skill_of(errors, "constant_velocity") == pytest.approx(1 - 29 / 10)
     assert errors.time == pytest.approx([2 / 60, 3 / 60])
+
+
+def skill_of(errors, baseline="frozen"):
+    return skill([errors.mse("total")], [errors.mse(baseline)])
 
 
 def test_skill_of_perfect_is_one_and_of_frozen_is_zero():
     truth = random_walk()
-    assert compared(truth, truth).skill() == 1.0
+    assert skill_of(compared(truth, truth)) == 1.0
     frozen = truth.copy()
     frozen[2:] = frozen[1]
-    assert compared(truth, frozen).skill() == pytest.approx(0.0, abs=1e-12)
+    assert skill_of(compared(truth, frozen)) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_history_counts_in_no_metric():
@@ -222,7 +222,7 @@ def test_surface_error_of_a_raised_bed():
     prediction = truth.copy()
     prediction[2:, :, 2] += 0.01
     errors = compared(truth, prediction, make_basis(n=truth.shape[1]))
-    assert errors.rmse_mm("surface") == pytest.approx(10.0, rel=1e-5)
+    assert rms_mm(errors.mse("surface")) == pytest.approx(10.0, rel=1e-5)
     assert errors.mse("surface_frozen") == 0.0
 
 
@@ -307,4 +307,4 @@ def test_constant_prediction_and_training_mean():
 
 def test_errors_of_zero_are_zero_not_negative():
     zeros = np.zeros(3)
-    assert PositionErrors(*[zeros] * 8).rmse_mm("total") == 0.0
+    assert rms_mm(PositionErrors(*[zeros] * 8).mse("total")) == 0.0

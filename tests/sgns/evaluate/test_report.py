@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from sgns.evaluate.metrics import ParticleErrors, PositionErrors, VectorErrors
-from sgns.evaluate.report import render_report
-from sgns.evaluate.report_figures import FigureGroup, ReportFigure, file_name
+from sgns.evaluate.report import FigureGroup, ReportFigure, file_name, render_report
 from sgns.evaluate.results import (
     Costs,
     EvaluatedRun,
@@ -20,8 +19,7 @@ from sgns.evaluate.results import (
     Scores,
     aggregate,
 )
-from sgns.evaluate.tables import cost_table, example_table, force_table
-from sgns.evaluate.words import cost_note, describe, fixed, number, short_names, summary, titled
+from sgns.evaluate.words import describe, fixed, number, short_names, summary, titled
 from sgns.reduction.basis import Basis, ReductionCurves
 
 EVIL = '<script>alert("run&1")</script>'
@@ -47,7 +45,7 @@ def scores(name, skill=0.9, force=0.3, mean=0.6, reduction=0.1):
     return Scores(name, 4, mse, own, own, baseline, baseline, 20.0, mpe, mean_mpe)
 
 
-def evaluation(names=("run1", "run2"), split="test", stepping=0.1, words="", wheel=False, **kw):
+def evaluation(names=("run1", "run2"), split="test", rollout=0.1, words="", wheel=False, **kw):
     particles = ParticleErrors(np.full(5, 1e-6), np.full(5, 1e-7))
     errors = PositionErrors(np.arange(4) / 60.0, *[np.full(4, 1e-6)] * 7, particles)
     runs = [
@@ -58,7 +56,7 @@ def evaluation(names=("run1", "run2"), split="test", stepping=0.1, words="", whe
         split=split,
         runs=runs,
         total=aggregate([run.scores for run in runs]),
-        timing=NetworkTiming(stepping, 2 * stepping, 3, names[0]),
+        timing=NetworkTiming(rollout, 2 * rollout, 3, names[0]),
         mean_force=np.array([-90.0, 0.0, 40.0]),
         curves=ReductionCurves(np.ones(2), np.ones(2), np.ones(2), np.ones(3)),
         basis=Basis(torch.zeros(4, 3), torch.eye(4)[:, :2], torch.ones(2), 3.0, 3.0, "particle_axis"),
@@ -98,6 +96,25 @@ def parsed(page):
 
 def group(data=b"", words="Words"):
     return FigureGroup(words, words, [ReportFigure("a", words, words, data)])
+
+
+def section(result, heading):
+    """The HTML under a heading, its breaks of lines as blanks."""
+    page = render_report(result, [])
+    text = page.partition(f">{heading}</h2>")[2].partition("<h2")[0]
+    return " ".join(text.split())
+
+
+def example_table(result):
+    return section(result, "Test examples")
+
+
+def force_table(result):
+    return section(result, "Force on the tool")
+
+
+def costs_section(result):
+    return section(result, "Time and memory")
 
 
 def test_page_is_well_formed_and_needs_nothing_from_outside():
@@ -156,9 +173,9 @@ def test_words_follow_from_the_force(force, words):
 
 
 def test_words_about_time_and_split():
-    assert "200 times less" in summary(evaluation(stepping=0.1))
-    assert "2.0 times more" in summary(evaluation(stepping=40.0))
-    assert "slower than the solver" in render_report(evaluation(stepping=40.0), [])
+    assert "200 times less" in summary(evaluation(rollout=0.1))
+    assert "2.0 times more" in summary(evaluation(rollout=40.0))
+    assert "slower than the solver" in render_report(evaluation(rollout=40.0), [])
     assert "never saw" in summary(evaluation())
     assert "1 run that" in summary(evaluation(names=("one",)))
 
@@ -271,20 +288,20 @@ def test_shared_headings_span_their_columns():
 
 
 def test_costs_that_are_not_known_are_not_made_up():
-    page = cost_table(evaluation())
+    page = costs_section(evaluation())
     assert page.count(">–</td>") == 7  # training twice, parameters, checkpoint, memory three times
     assert ">57 600</td>" in page and ">6</td>" in page and ">28 800</td>" in page
-    assert "no training.json" in cost_note(evaluation())
+    assert "no training.json" in costs_section(evaluation())
     costs = Costs(253_777, 5.4e6, 6000, 240.0, 32)
     known = replace(evaluation(), costs=costs)
-    assert ">0.0400</td>" in cost_table(known) and ">253 777</td>" in cost_table(known)
-    assert "6000 steps of 32 samples" in cost_note(known)
+    assert ">0.0400</td>" in costs_section(known) and ">253 777</td>" in costs_section(known)
+    assert "6000 steps of 32 samples" in costs_section(known)
 
 
 def test_full_space_has_a_column_where_it_was_measured():
     plain = evaluation()
     measured = replace(plain, full_space=FullSpaceCost(40_000, 2.5, 2, 27.0, 3e9))
-    assert "full space" not in cost_table(plain) and "full_space=true" in cost_note(plain)
-    page = cost_table(measured)
+    assert "full space" not in costs_section(plain) and "full_space=true" in costs_section(plain)
+    page = costs_section(measured)
     assert "full space, untrained" in page and ">27.0</td>" in page and ">40 000</td>" in page
-    assert "full_space=true" not in cost_note(measured)
+    assert "full_space=true" not in costs_section(measured)

@@ -4,10 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from sgns.evaluate.results import aggregate, overlap_warning, seen_before
+from sgns.evaluate.results import aggregate, seen_before, seen_warning
 from sgns_testing.surrogates import made_scores
-
-# ---  ---------------------------------------------------------------------------------------------------
 
 
 def test_aggregate_by_hand():
@@ -41,13 +39,9 @@ def test_sinkage_is_the_mean_of_the_wheels_only():
     assert blade.row()["body_rmse_mm"] == 0.0 and math.isnan(blade.row()["sinkage_mae_mm"])
 
 
-# ---  ---------------------------------------------------------------------------------------------------
-
-
 def simulator(fitted_on, validation_runs):
     return SimpleNamespace(
-        basis=SimpleNamespace(fitted_on=fitted_on),
-        card={"settings": {"validation_runs": validation_runs}},
+        basis=SimpleNamespace(fitted_on=fitted_on), card={"settings": {"validation_runs": validation_runs}}
     )
 
 
@@ -72,5 +66,5 @@ def test_checkpoint_that_does_not_tell_its_validation_runs():
 
 def test_warning_counts_and_names():
     judged = SimpleNamespace(runs=[1, 2, 3], trained_on=["x", "y"], chosen_by=[])
-    assert "2 of the 3 evaluated runs" in overlap_warning(judged) and "(x, …)" in overlap_warning(judged)
-    assert overlap_warning(SimpleNamespace(runs=[1], trained_on=[], chosen_by=[])) == ""
+    assert "2 of the 3 evaluated runs" in seen_warning(judged) and "(x, …)" in seen_warning(judged)
+    assert seen_warning(SimpleNamespace(runs=[1], trained_on=[], chosen_by=[])) == ""

@@ -12,7 +12,7 @@ from sgns_testing.surrogates import made_scores
 
 def test_csv_has_a_row_per_run_and_empty_cells_without_meaning(tmp_path):
     rows = [made_scores("a, with comma", 1e-6, 4e-6), made_scores("b", 1e-6, 4e-6)]
-    write_csv(tmp_path / "metrics.csv", [*rows, aggregate(rows)])
+    write_csv(tmp_path / "metrics.csv", [score.row() for score in (*rows, aggregate(rows))])
     with (tmp_path / "metrics.csv").open(newline="", encoding="utf-8") as file:
         read = list(csv.DictReader(file))
     assert [row["run"] for row in read] == ["a, with comma", "b", "all runs"]

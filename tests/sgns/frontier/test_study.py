@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hydra import compose, initialize_config_module
+from hydra import initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns.cli.help import options_of
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
-from sgns.frontier import solver_points
+from sgns.frontier import measure
 from sgns.frontier import study as timing
 from sgns.frontier.command import axes_of, main
 from sgns.frontier.point import read_points
-from sgns.frontier.study import AXES, Study, composed_scene
+from sgns.frontier.study import AXES, Study, composed, composed_scene
 from sgns.simulate.campaign import plan
 from sgns.simulate.scene import asked_effects
 
@@ -77,7 +77,7 @@ def test_what_is_there_is_not_measured_again(folder: Path, monkeypatch: pytest.M
     def refuse(*_: object) -> None:
         raise AssertionError("measured again")
 
-    monkeypatch.setattr(solver_points, "measured", refuse)
+    monkeypatch.setattr(measure, "solver_point", refuse)
     before = (folder / "points.csv").read_bytes()
     main(settings(folder))
     assert (folder / "points.csv").read_bytes() == before
@@ -115,12 +115,14 @@ def test_axes() -> None:
         axes_of("x")
 
 
+def shipped_study(name: str) -> Study:
+    settings = OmegaConf.to_container(composed("frontier", [f"study={name}"]).study)
+    return Study.from_settings(settings, Path("x"))
+
+
 @pytest.mark.parametrize("name", options_of("study"))
 def test_points_of_a_shipped_study_compose(name: str) -> None:
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        study = Study.from_settings(
-            OmegaConf.to_container(compose("frontier", [f"study={name}"]).study), Path("x")
-        )
+    study = shipped_study(name)
     for scene in study.scenes:
         case = scene.cases[next(iter(scene.cases))]
         points = [scene.reference, *scene.points("solver")]
@@ -134,11 +136,9 @@ def test_points_of_a_shipped_study_compose(name: str) -> None:
 def test_cases_are_held_out_runs_of_the_dataset() -> None:
     """They must be in no training run's place: surrogates are judged on them."""
     with initialize_config_module("sgns.conf", version_base="1.3"):
-        study = Study.from_settings(
-            OmegaConf.to_container(compose("frontier", ["study=full"]).study), Path("x")
-        )
+        study = shipped_study("full")
         for scene in study.scenes:
-            cfg = compose("simulate", [f"dataset={scene.dataset}", f"scene={scene.settings['scene']}"])
+            cfg = composed("simulate", [f"dataset={scene.dataset}", f"scene={scene.settings['scene']}"])
             dataset = OmegaConf.to_container(cfg.dataset, resolve=True)
             base, _ = composed_scene([f"scene={scene.settings['scene']}"])
             campaign = plan(dataset, base.to_dict(), asked_effects(cfg), "float32", seed=0)

@@ -1,4 +1,4 @@
-"""Smaller training sets: nested subsets of runs, every nth frame."""
+"""Points of surrogates and of reductions: smaller training sets, trainings of a given time, tiny studies."""
 
 import csv
 import json
@@ -14,25 +14,28 @@ from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.data.writer import RunWriter
 from sgns.evaluate.command import evaluate
-from sgns.frontier import surrogate_points
-from sgns.frontier import surrogate_points as timed_training
-from sgns.frontier.study import Study, composed_scene
-from sgns.frontier.surrogate_points import (
+from sgns.frontier import measure
+from sgns.frontier.measure import (
     EveryNthFrame,
     TrainingPlan,
     every_nth_frame,
     frame_means,
     full_space_fields,
+    measure_reduction,
     measure_surrogates,
     own_errors,
     read_record,
+    reduction_points,
     seconds_per_step,
     train_for,
     training_settings,
     with_training_runs,
 )
+from sgns.frontier.study import Study, composed_scene
 from sgns.model.checkpoint import read_checkpoint
 from sgns.model.settings import ModelSettings
+from sgns.reduction.pca import IncrementalPCA
+from sgns.reduction.reduce import fit_runs
 from sgns_testing.surrogates import FakeSimulator, fitted, frozen_latent, small_dataset
 from sgns_testing.tiny import FIT, MODEL, POLYNOMIAL, REDUCTION, TRAINING, make_dataset, reduced
 
@@ -102,7 +105,7 @@ NETWORK = {"model": MODEL, "training": TRAINING, **NAMES}
 
 @pytest.fixture
 def data(tmp_path, monkeypatch):
-    monkeypatch.setattr(surrogate_points, "seconds_per_step", lambda *_: 0.01)
+    monkeypatch.setattr(measure, "seconds_per_step", lambda *_: 0.01)
     return reduced(tmp_path / "data")
 
 
@@ -137,7 +140,7 @@ def test_what_is_complete_is_taken_and_what_is_not_is_begun_anew(data, tmp_path)
 
 
 def test_other_settings_have_another_folder(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(surrogate_points, "train", lambda *_, output, **__: output.mkdir(parents=True))
+    monkeypatch.setattr(measure, "train", lambda *_, output, **__: output.mkdir(parents=True))
     wider = NETWORK | {"model": MODEL | {"hidden_width": 8}}
     done = {
         train_for(seconds, data, settings, tmp_path / "kept", seed).checkpoint
@@ -168,7 +171,7 @@ def test_a_step_with_more_windows_takes_longer(tmp_path):
 
 
 def test_a_clock_that_stands_still_gives_no_number_of_steps(tmp_path, monkeypatch):
-    monkeypatch.setattr(timed_training.time, "process_time", lambda: 1.0)
+    monkeypatch.setattr(measure.time, "process_time", lambda: 1.0)
     with pytest.raises(UserError, match="the processor's clock stands still"):
         train_for(0.2, reduced(tmp_path / "data"), NETWORK, tmp_path / "kept")
 
@@ -354,9 +357,9 @@ def tiny(data_of_surrogate_points, monkeypatch):
         "preset": {"name": "tiny"},
         "dataset": {"name": "tiny", "path": str(data_of_surrogate_points)},
     }
-    monkeypatch.setattr(surrogate_points, "Workload", NoWorkload)
-    monkeypatch.setattr(surrogate_points, "seconds_per_step", lambda *_: 0.01)
-    monkeypatch.setattr(surrogate_points, "training_settings", lambda *_: settings)
+    monkeypatch.setattr(measure, "Workload", NoWorkload)
+    monkeypatch.setattr(measure, "seconds_per_step", lambda *_: 0.01)
+    monkeypatch.setattr(measure, "training_settings", lambda *_: settings)
 
 
 @pytest.mark.usefixtures("tiny")
@@ -390,7 +393,7 @@ def test_points_from_training_to_observation(tmp_path):
 
 @pytest.mark.usefixtures("tiny")
 def test_a_rollout_that_leaves_the_numbers_is_said_and_not_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(surrogate_points, "finite_frames", lambda _: 7)
+    monkeypatch.setattr(measure, "finite_frames", lambda _: 7)
     asked = study(tmp_path, {"axis": "preset", "label": "whole"}, training={"seconds": 0.1})
     measure_surrogates(asked)
     [(point, cases)] = asked.store.points()
@@ -402,3 +405,69 @@ def test_another_bed_than_the_data_s_is_one_line(tmp_path):
     asked = study(tmp_path, {"axis": "preset", "label": "whole"}, cases={"a": ["scene.duration=0.2"]})
     with pytest.raises(UserError, match="has another bed of particles than dataset=quick"):
         measure_surrogates(asked)
+
+
+# --- Points of the reduction ----------------------------------------------------------------------------
+
+
+def reduction_study(folder, *entries):
+    found = [{"axis": "r", "label": entry["centring"], **entry} for entry in entries]
+    return study(folder, dataset="tiny", cases={"a": []}, reduction=found)
+
+
+@pytest.fixture
+def measured(tmp_path, monkeypatch):
+    make_dataset(tmp_path / "data")
+    monkeypatch.setattr(measure, "Workload", NoWorkload)
+    monkeypatch.setattr(measure, "training_settings", lambda *_: {"dataset": {"path": tmp_path / "data"}})
+    asked = reduction_study(
+        tmp_path / "out",
+        {"centring": "particle_axis", "modes": [1, 2, 4, 500]},
+        {"centring": "scalar", "modes": [4]},
+    )
+    measure_reduction(asked)
+    return asked, {point.label: point for point, _ in asked.store.points()}
+
+
+def test_a_point_for_each_number_of_modes_that_there_is(measured):
+    _, points = measured
+    assert set(points) == {"particle_axis, r 1", "particle_axis, r 2", "particle_axis, r 4", "scalar, r 4"}
+    one, two, four = (points[f"particle_axis, r {r}"] for r in (1, 2, 4))
+    assert one.own_position_rmse_mm > two.own_position_rmse_mm > four.own_position_rmse_mm > 0
+    assert one.energy < two.energy < four.energy < 1
+    assert one.own_runs == 3  # two validation runs and a test run
+    assert four.wall_s_per_simulated_s >= four.decoded_wall_s_per_simulated_s > 0
+    # With all modes of one centring the energy says what the error says.
+    left = (four.own_position_rmse_mm / four.frozen_rmse_mm) ** 2
+    assert four.energy == pytest.approx(1 - left, abs=1e-4)
+
+
+def test_a_reduction_that_is_there_is_not_measured_again(measured, monkeypatch):
+    asked, _ = measured
+    monkeypatch.setattr(measure, "fit_runs", lambda *_: pytest.fail("fitted again"))
+    for name in ("particle_axis, r 500",):  # cannot be had, so it is asked for each time
+        assert not asked.store.has("cut", "reduction", name)
+    measure_reduction(reduction_study(asked.folder, {"centring": "particle_axis", "modes": [1, 2, 4]}))
+
+
+@pytest.mark.parametrize(
+    "entry, line",
+    [
+        ({"centring": "mean", "modes": [1]}, "centring is 'mean'; allowed: scalar"),
+        ({"centring": "scalar", "modes": [0]}, "modes is .0.; it must be a list of whole numbers"),
+        ({"centring": "scalar"}, "modes is None"),
+    ],
+)
+def test_bad_reductions_are_one_line(tmp_path, entry, line):
+    with pytest.raises(UserError, match=line):
+        list(reduction_points(reduction_study(tmp_path, entry).scenes[0]))
+
+
+def test_one_stream_is_the_same_as_by_hand(tmp_path):
+    paths = make_dataset(tmp_path).runs("train")
+    pca = IncrementalPCA(4)
+    for path in paths:
+        with Run(path) as run:
+            pca.partial_fit(run.positions())
+    by_hand, streamed = pca.basis("scalar"), fit_runs(paths, 4).basis("scalar")
+    assert math.isclose(float(by_hand.residual_mse(4)), float(streamed.residual_mse(4)), rel_tol=1e-6)
