@@ -19,7 +19,7 @@ from mpm_warp.inputs import open_file, read_text
 from mpm_warp.poses import fitted_poses, quaternions
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
-from sgns.data.small_files import parse_json
+from sgns.data.files import parse_json
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, ReducedRun
 

@@ -14,8 +14,7 @@ import numpy as np
 from mpm_warp import Scene
 from sgns.arrays import require_shapes
 from sgns.config import UserError
-from sgns.data.files import whole_file
-from sgns.data.small_files import read_arrays
+from sgns.data.files import read_arrays, whole_file
 from sgns.evaluate.metrics import SurfaceGrid, VectorErrors, height_map
 
 # --- What is kept of a run so that it can be compared with runs of the same scene on other beds of particle

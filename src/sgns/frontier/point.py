@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sgns.config import UserError
-from sgns.data.files import whole_file
-from sgns.data.small_files import read_table
+from sgns.data.files import read_table, whole_file
 
 log = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from mpm_warp import Solver, SolverStopped
 from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.data.dataset import Dataset
-from sgns.data.files import claimed
+from sgns.data.files import file_lock
 from sgns.data.run import Run
 from sgns.frontier.observation import Observation, Observer, observed_frames
 from sgns.frontier.point import Point
@@ -53,7 +53,7 @@ def measure_solver(study: Study) -> None:
         for scene in study.scenes:
             for settings in (scene.reference, *scene.points("solver")):
                 file = study.store.file(scene.name, "solver", settings.label)
-                with claimed(file) as ours:
+                with file_lock(file) as ours:
                     if not ours or file.exists():
                         continue
                     workload = workload or Workload()
@@ -173,7 +173,7 @@ def measure_reduction(study: Study) -> None:
             if not missing:
                 continue
             # One process makes all of a scene's: they share the stream over the runs.
-            with claimed(study.store.file(scene.name, "reduction", "all")) as ours:
+            with file_lock(study.store.file(scene.name, "reduction", "all")) as ours:
                 if ours:
                     measure_scene(study, scene, missing)
 

@@ -24,9 +24,8 @@ from mpm_warp import Scene
 from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
-from sgns.data.files import claimed, write_whole
+from sgns.data.files import file_lock, read_json, read_table, write_whole
 from sgns.data.run import Run
-from sgns.data.small_files import read_json, read_table
 from sgns.evaluate.command import roll_out, training_means
 from sgns.evaluate.costs import network_costs
 from sgns.evaluate.metrics import body_errors, position_errors, surface_grid
@@ -411,7 +410,7 @@ def measure_surrogates(study: Study) -> None:
                     continue
                 plan = TrainingPlan.of(scene, entry)
                 file = study.store.file(scene.name, "surrogate", entry.label)
-                with claimed(file) as ours:
+                with file_lock(file) as ours:
                     if not ours or file.exists():
                         continue
                     workload = workload or Workload()

@@ -18,10 +18,9 @@ import torch
 from torch import Tensor
 
 from sgns.config import UserError
-from sgns.data.files import new_hdf5
+from sgns.data.files import new_hdf5, parse_json
 from sgns.data.layout import BROKEN, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
-from sgns.data.small_files import parse_json
 
 # --- The subspace of the soil's motion: modes, what they explain, and the file they are kept in ---------
 # Letters: n particles, r modes; "..." stands for any leading axes, such as frames.

@@ -19,10 +19,9 @@ from tqdm import tqdm
 from sgns.arrays import require_shapes
 from sgns.config import UserError, check_fields
 from sgns.data.dataset import SPLITS, Dataset
-from sgns.data.files import new_hdf5, require_replaceable
+from sgns.data.files import new_hdf5, parse_json, require_replaceable
 from sgns.data.layout import BROKEN, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
-from sgns.data.small_files import parse_json
 from sgns.reduction.basis import CENTRINGS, Basis, reconstruction_curve
 from sgns.reduction.pca import IncrementalPCA, checked_device
 

@@ -24,7 +24,7 @@ from mpm_warp.batch import all_together
 from mpm_warp.launch import Work
 from sgns.clock import elapsed
 from sgns.config import UserError, flattened
-from sgns.data.files import claimed, remove_leftovers
+from sgns.data.files import file_lock, remove_abandoned
 from sgns.data.run import Run
 from sgns.simulate.campaign import (
     Campaign,
@@ -83,7 +83,7 @@ def simulate_campaign(
     share = by_length[shard::shards]
     missing = [name for name in share if not _done(campaign.file(name), campaign.scenes[name])]
     for name in set(share) - set(missing):  # nobody will write these again
-        remove_leftovers(campaign.file(name))
+        remove_abandoned(campaign.file(name))
     part = f", {len(share)} of them in shard {shard} of {shards}" if shards > 1 else ""
     total = f"{len(campaign.scenes)} runs{part}"
     log.info("dataset %s in %s: %s, %d to do", campaign.name, campaign.path, total, len(missing))
@@ -337,7 +337,7 @@ def _make(
     outcome = "made", ""
     try:
         scene = Scene.from_dict(*described)
-        with claimed(output) as ours:
+        with file_lock(output) as ours:
             if not ours or _done(output, scene):
                 outcome = "elsewhere", ""
             else:

@@ -15,7 +15,7 @@ from test_campaign import campaign
 
 from sgns.config import UserError
 from sgns.data.check import check_run
-from sgns.data.files import claimed
+from sgns.data.files import file_lock
 from sgns.data.run import Run
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import run_cost
@@ -26,7 +26,7 @@ MAKE = """
 import sys, pathlib, logging
 sys.path[:0] = sys.argv[2:]
 from test_campaign import campaign
-from sgns.simulate.command.workers import simulate_campaign
+from sgns.simulate.workers import simulate_campaign
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     simulate_campaign(campaign(pathlib.Path(sys.argv[1]), runs=4), device="cpu", workers=1)
@@ -197,7 +197,7 @@ def test_a_run_that_fails_does_not_stop_the_others(tmp_path, batch):
 def test_a_run_that_another_process_makes_is_left_to_it(tmp_path, caplog, batch):
     c = campaign(tmp_path, runs=3)
     first, *others = c.scenes
-    with claimed(c.file(first)) as ours, caplog.at_level(logging.INFO):
+    with file_lock(c.file(first)) as ours, caplog.at_level(logging.INFO):
         assert ours
         simulate_campaign(c, device="cpu", workers=1, batch=batch)
     assert "runs left to another process that is making them or has made them: 1" in caplog.text
