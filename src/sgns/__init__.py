@@ -22,7 +22,7 @@ __version__ = "0.1.0"
 _HOME = {
     "Basis": "sgns.reduction",
     "IncrementalPCA": "sgns.reduction",
-    "Run": "sgns.runs",
+    "Run": "sgns.data.run",
     "Simulator": "sgns.simulator",
     "UserError": "sgns.config",
 }

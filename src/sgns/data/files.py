@@ -23,6 +23,7 @@ from filelock import FileLock, Timeout
 
 from mpm_warp import inputs
 from sgns.config import UserError
+from sgns.data.layout import one_line
 
 try:
     import fcntl
@@ -243,10 +244,9 @@ def _readable(path: Path, wrong: str, advice: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # numpy, zipfile and csv raise almost anything on damaged bytes
-        reason = " ".join(str(error).split()) or type(error).__name__
         if isinstance(error, OSError) and error.strerror:
             raise UserError(f"cannot read {path}: {error.strerror}; {advice}") from error
-        raise UserError(f"{path} is {wrong} ({reason}); {advice}") from error
+        raise UserError(f"{path} is {wrong} ({one_line(error)}); {advice}") from error
 
 
 # --- Hidden files that take their name when they are complete, and what killed processes leave of them --

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from sgns.config import UserError
 from sgns.data.files import new_hdf5, parse_json
-from sgns.data.layout import BROKEN, open_hdf5, own_attribute, own_dataset
+from sgns.data.layout import BROKEN, one_line, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
 
 # --- The subspace of the soil's motion: modes, what they explain, and the file they are kept in ---------
@@ -224,9 +224,8 @@ class Basis:
                 state["fitted_on"] = parse_json(own_dataset(file, "fitted_on")[()])
                 state.update((key, torch.from_numpy(own_dataset(file, key)[()])) for key in _ARRAYS)
         except (*BROKEN, AttributeError) as error:
-            reason = " ".join(str(error).split())
             raise UserError(
-                f"{path}: not a readable basis, truncated or damaged ({reason}); fit again with `sgns reduce`"
+                f"{path}: not a readable basis, truncated or damaged ({one_line(error)}); fit again with `sgns reduce`"
             ) from error
         return cls.from_state(state, where=str(path))
 

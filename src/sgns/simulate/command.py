@@ -17,7 +17,7 @@ from sgns.config import UserError
 from sgns.data.files import only_here
 from sgns.data.run import Run, require_run_place
 from sgns.simulate.campaign import plan, require_space, run_cost
-from sgns.simulate.run import continued, simulate_scene
+from sgns.simulate.run import restart_from, simulate_scene
 from sgns.simulate.scene import asked_effects, decided, decision_line, recorded, scene_from_config
 from sgns.simulate.workers import simulate_campaign
 
@@ -50,15 +50,15 @@ def main(cfg: DictConfig) -> float | None:
     if cfg.continue_from is not None:
         if cfg.get("dataset") is not None:
             raise UserError("continue_from goes on with one run; leave out dataset=")
-        going_on = continued(cfg, HydraConfig.get().overrides.task)
+        restart = restart_from(cfg, HydraConfig.get().overrides.task)
         return _simulate_one(
-            going_on.scene,
+            restart.scene,
             cfg,
-            effects=going_on.effects,
-            reasons=going_on.reasons,
-            seed=going_on.seed,
-            precision=going_on.precision,
-            going_on=going_on,
+            effects=restart.effects,
+            reasons=restart.reasons,
+            seed=restart.seed,
+            precision=restart.precision,
+            restart=restart,
         )
     asked, batch = asked_effects(cfg), cfg.solver.batch
     if type(batch) is not int or batch < 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import random
@@ -113,6 +114,17 @@ def test_a_lock_may_be_waited_for(tmp_path):
         with file_lock(path, wait=True):
             assert holder.stdin.closed
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_system_without_locks_gives_everybody_one(tmp_path, monkeypatch):
+    def flock(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with file_lock(tmp_path / "a") as ours, file_lock(tmp_path / "a") as theirs:
+        assert ours and theirs
+    write_whole(tmp_path / "a", "whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: os.symlink("file", path)])
