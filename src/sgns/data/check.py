@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-# --- Checking a run file: every problem, in words -------------------------------------------------------
+# --- Every problem of a run file, in words --------------------------------------------------------------
 # Letters: T frames, n soil particles, M body points.
 
 RIGID_TOLERANCE = 1e-4

@@ -41,7 +41,7 @@ def frame_chunks(particle_count: int, stop: int, start: int = 0) -> Iterator[sli
         yield slice(first, min(first + size, stop))
 
 
-# --- Reading a run, whether the solver or a network made it ---------------------------------------------
+# --- A run file -----------------------------------------------------------------------------------------
 # Letters: T frames, n soil particles, M body points.
 
 
@@ -64,7 +64,7 @@ class Run:
         try:
             try:
                 problems = structure_problems(self._file)
-                self._attributes = read_attributes(self._file) if not problems else {}
+                self._attributes = read_attributes(self._file)
             except BROKEN as error:
                 problems = [one_line(error)]
             if problems:

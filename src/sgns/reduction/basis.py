@@ -22,9 +22,6 @@ from sgns.data.files import new_hdf5, parse_json
 from sgns.data.layout import BROKEN, one_line, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
 
-# --- The subspace of the soil's motion: modes, what they explain, and the file they are kept in ---------
-# Letters: n particles, r modes; "..." stands for any leading axes, such as frames.
-
 CENTRINGS = ("scalar", "particle", "particle_axis")
 """What is subtracted before modes are found: one number, a mean per particle, one per particle and axis."""
 _FORMAT = "sgns-basis"
@@ -151,11 +148,7 @@ class Basis:
 
     @classmethod
     def from_state(cls, state: dict[str, Any], where: str = "basis state") -> Basis:
-        """Basis of a dict made by `state`.
-
-        Args:
-            state: The dict.
-            where: What to call its origin in an error.
+        """Basis of a dict made by `state`; errors say `where` it comes from.
 
         Raises:
             UserError: If a key is missing, a value is not finite, shapes disagree or modes are askew.
@@ -305,10 +298,6 @@ def reconstruction_curve(paths: Sequence[Path], basis: Basis) -> np.ndarray:
 
     Orthonormal modes take away their share one after the other: the residual with r modes is
     ‖S − S̄‖² less the squared first r coordinates.
-
-    Args:
-        paths: Run files to reconstruct, each read in chunks.
-        basis: `Basis` with R modes.
 
     Returns:
         Mean over frames, particles and axes [m²] for r = 0 … R, shape (R + 1,); NaN without runs.

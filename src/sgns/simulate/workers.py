@@ -96,8 +96,8 @@ def simulate_campaign(
     _compile(campaign, missing, device)
     workers = min(workers or (1 if device != "cpu" else len(os.sched_getaffinity(0))), len(missing))
     batch = min(batch, math.ceil(len(missing) / workers))
-    production = _Production(campaign, {name: costs[name] for name in missing}, device, workers, batch)
-    failed = production.make_all(f"about {size_words(size)} of disk")
+    pool = _Workers(campaign, {name: costs[name] for name in missing}, device, workers, batch)
+    failed = pool.make_all(f"about {size_words(size)} of disk")
     if failed:
         name, message = next(iter(failed.items()))
         raise UserError(
@@ -106,28 +106,27 @@ def simulate_campaign(
 
 
 def _compile(campaign: Campaign, names: list[str], device: str) -> None:
-    """Compile the kernels of every kind of scene, once; the processes find them in Warp's cache.
+    """Compile the kernels that the scenes need, once; the processes find them in Warp's cache.
 
     Kernels can differ only where scenes differ in their effects or in something else than the size of a number.
     """
-    kinds = {}
+
+    def switch(value: Any) -> Any:
+        if isinstance(value, (int, float)):
+            return bool(value)
+        return value if isinstance(value, str) else type(value)
+
+    with_other_kernels = {}
     for name in names:
-        scene = campaign.scenes[name]
-        chosen = {
-            key: value
-            if isinstance(value, str)
-            else bool(value)
-            if isinstance(value, (int, float))
-            else type(value)
-            for key, value in flattened(scene.to_dict()).items()
-            if key != "name"
-        }
-        kinds.setdefault((frozenset(chosen.items()), campaign.physics[name][0]), scene)
-    for (_, physics), scene in kinds.items():
-        next(Solver(scene, physics, device, campaign.precision).frames())
+        scene, effects = campaign.scenes[name], campaign.physics[name][0]
+        settings = flattened(scene.to_dict() | {"name": ""})
+        switches = frozenset((key, switch(value)) for key, value in settings.items())
+        with_other_kernels.setdefault((switches, effects), scene)
+    for (_, effects), scene in with_other_kernels.items():
+        next(Solver(scene, effects, device, campaign.precision).frames())
 
 
-class _Production:
+class _Workers:
     """Worker processes, what they have done, and how long the rest will take."""
 
     def __init__(
@@ -164,10 +163,9 @@ class _Production:
                 for process in multiprocessing.active_children():
                     process.terminate()
                 raise
-        elsewhere = sum(kind == "elsewhere" for kind, _ in outcomes.values())
-        if elsewhere:
+        if elsewhere := sum(outcome == "elsewhere" for outcome, _ in outcomes.values()):
             log.info("runs left to another process that is making them or has made them: %d", elsewhere)
-        return {name: message for name, (kind, message) in outcomes.items() if kind == "failed"}
+        return {name: message for name, (outcome, message) in outcomes.items() if outcome == "failed"}
 
     def _measure(self) -> None:
         """Let all workers step runs from all over the list for a moment, at the same time."""
@@ -193,11 +191,8 @@ class _Production:
             scene, file = _described(self.campaign.scenes[name]), self.campaign.file(name)
             effects, decisions = self.campaign.physics[name]
             jobs.append((name, index, scene, file, effects, recorded(decisions)))
-        if self.batch > 1:
-            shares = [jobs[worker :: self.workers] for worker in range(self.workers)]
-        else:
-            shares = [[job] for job in jobs]
-        for share in shares:
+        shares = self.workers if self.batch > 1 else len(jobs)
+        for share in (jobs[number::shares] for number in range(shares)):
             future = self._pool.submit(_make_share, share, self.batch, *self._settings)
             self._jobs.update((name, future) for name, *_ in share)
 
@@ -334,6 +329,13 @@ def _make(
     def count_frame() -> None:
         _frames_done[index] += 1
 
+    settings = {
+        "effects": effects,
+        "reasons": reasons,
+        "seed": seed,
+        "device": device,
+        "precision": precision,
+    }
     outcome = "made", ""
     try:
         scene = Scene.from_dict(*described)
@@ -341,16 +343,7 @@ def _make(
             if not ours or _done(output, scene):
                 outcome = "elsewhere", ""
             else:
-                for stage in scene_stages(
-                    scene,
-                    output,
-                    effects=effects,
-                    reasons=reasons,
-                    seed=seed,
-                    device=device,
-                    precision=precision,
-                    progress=count_frame,
-                ):
+                for stage in scene_stages(scene, output, progress=count_frame, **settings):
                     if isinstance(stage, Work):
                         yield stage
     except (UserError, SceneError, SolverStopped) as error:

@@ -102,7 +102,7 @@ def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
         raise SolverStopped("particle 1 went wrong")
         yield
 
-    monkeypatch.setattr("sgns.simulate.command.run.Solver.stages", stops)
+    monkeypatch.setattr("sgns.simulate.run.Solver.stages", stops)
     with pytest.raises(SolverStopped):
         simulate_scene(scene, tmp_path / "run.h5", effects=Effects())
     assert not list(tmp_path.glob("*"))

@@ -55,7 +55,7 @@ def order(monkeypatch):
         self._pool.shutdown()
         return {}
 
-    monkeypatch.setattr(campaign_runs._Production, "make_all", make_all)
+    monkeypatch.setattr(campaign_runs._Workers, "make_all", make_all)
     monkeypatch.setattr(campaign_runs, "_compile", lambda *_: None)
     return names
 
@@ -165,22 +165,22 @@ def test_time_left_follows_from_the_work_left_and_the_speed_seen(tmp_path):
     c = campaign(tmp_path, runs=6)
     costs = {name: run_cost(scene) for name, scene in c.scenes.items()}
     per_frame = costs[next(iter(costs))].work_per_frame
-    production = campaign_runs._Production(c, costs, "cpu", 4)
+    workers = campaign_runs._Workers(c, costs, "cpu", 4)
     try:
-        assert production._left() == "an unknown time"
+        assert workers._left() == "an unknown time"
         # A frame takes a worker 100 s; six runs of three steps on four workers end after two runs.
-        production._work_seen, production._seconds_seen = 10 * per_frame, 1000.0
-        assert production._left() == "10 min"
+        workers._work_seen, workers._seconds_seen = 10 * per_frame, 1000.0
+        assert workers._left() == "10 min"
         # Then an hour at half that speed, with three of the workers busy: the estimate says so.
         for _ in range(60):
-            production._see(0.9 * per_frame, elapsed=60.0, busy=3)
-        assert production._left() == "20 min"
+            workers._see(0.9 * per_frame, elapsed=60.0, busy=3)
+        assert workers._left() == "20 min"
         # Four runs have only one step left (frames 0 to 2 are there), two have not begun.
-        production._frames_done[:] = [3, 3, 3, 3, 0, 0]
-        assert production._work_made() == 8 * per_frame
-        assert production._left() == "13 min"
+        workers._frames_done[:] = [3, 3, 3, 3, 0, 0]
+        assert workers._work_made() == 8 * per_frame
+        assert workers._left() == "13 min"
     finally:
-        production._pool.shutdown()
+        workers._pool.shutdown()
 
 
 @pytest.mark.parametrize("batch", [1, 2])
