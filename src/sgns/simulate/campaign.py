@@ -45,14 +45,14 @@ class RunCost:
     """Of the run file [bytes], to a few per cent."""
 
     @property
-    def work_per_frame(self) -> int:
+    def steps_per_frame(self) -> int:
         """Particle-steps between two frames."""
         return self.particles * self.substeps
 
     @property
-    def work(self) -> int:
+    def particle_steps(self) -> int:
         """Particle-steps of the run."""
-        return self.work_per_frame * (self.frames - 1)
+        return self.steps_per_frame * (self.frames - 1)
 
 
 def run_cost(scene: Scene) -> RunCost:

@@ -40,7 +40,7 @@ from sgns.simulate.scene import decision_summary, recorded
 
 log = logging.getLogger(__name__)
 
-_MEASURED = 0.3  # seconds of stepping, at least, that the first estimate rests on
+_MEASURED = 0.3  # seconds of simulating, at least, that the first estimate rests on
 _MEMORY = 600.0  # seconds after which what was seen of the speed counts 1/e
 _LOG_EVERY = 60.0  # seconds between lines about the progress where there is no terminal for a bar
 
@@ -79,7 +79,7 @@ def simulate_campaign(
     physics = campaign.physics  # before anything is written: what was asked for may be impossible
     campaign.record()
     costs = {name: run_cost(scene) for name, scene in campaign.scenes.items()}
-    by_length = sorted(costs, key=lambda name: costs[name].work, reverse=True)
+    by_length = sorted(costs, key=lambda name: costs[name].particle_steps, reverse=True)
     share = by_length[shard::shards]
     missing = [name for name in share if not _done(campaign.file(name), campaign.scenes[name])]
     for name in set(share) - set(missing):  # nobody will write these again
@@ -142,7 +142,7 @@ class _Workers:
         self._pool = ProcessPoolExecutor(workers, context, _start_worker, shared)
         self._jobs: dict[str, Future[dict[str, tuple[str, str]]]] = {}
         # What the estimates rest on: particle-steps made, and the seconds that they took, of each run for itself.
-        self._work_seen, self._seconds_seen = 0.0, 0.0
+        self._steps_seen, self._seconds_seen = 0.0, 0.0
 
     def make_all(self, disk: str) -> dict[str, str]:
         """Make the runs; returns the message of each that could not be made."""
@@ -181,7 +181,7 @@ class _Workers:
         for share, trial in zip(shares, trials, strict=True):
             frames, seconds = trial.result()
             for name, count in zip(share, frames, strict=True):
-                self._work_seen += count * self.costs[name].work_per_frame
+                self._steps_seen += count * self.costs[name].steps_per_frame
                 self._seconds_seen += seconds
 
     def _submit(self) -> None:
@@ -198,15 +198,15 @@ class _Workers:
 
     def _follow(self) -> None:
         """Wait for all runs, keeping the bar and the estimate up to date."""
-        total = sum(cost.work for cost in self.costs.values())
+        total = sum(cost.particle_steps for cost in self.costs.values())
         made, last, last_line = 0, time.monotonic(), time.monotonic()
         layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
         with tqdm(total=total, desc=f"{self.at_once} at once", bar_format=layout, disable=None) as bar:
             while rest := self._rest():
                 time.sleep(0.2)
-                now, work = time.monotonic(), self._work_made()
-                self._see(work - made, elapsed(last, now), busy=min(self.at_once, len(rest)))
-                made, last = work, now
+                now, steps = time.monotonic(), self._steps_made()
+                self._see(steps - made, elapsed(last, now), busy=min(self.at_once, len(rest)))
+                made, last = steps, now
                 done = f"{len(self._jobs) - len(rest)} of {len(self._jobs)} runs"
                 bar.set_postfix_str(f"{done}, {self._left()} left", refresh=False)
                 bar.update(total - sum(rest.values()) - bar.n)
@@ -216,35 +216,35 @@ class _Workers:
             bar.set_postfix_str(f"{len(self._jobs)} of {len(self._jobs)} runs", refresh=False)
             bar.update(total - bar.n)
 
-    def _see(self, work: float, elapsed: float, busy: int) -> None:
+    def _see(self, steps: float, elapsed: float, busy: int) -> None:
         """Add the particle-steps of `busy` runs in the last `elapsed` seconds; a machine's speed may change."""
         kept = math.exp(-elapsed / _MEMORY)
-        self._work_seen = kept * self._work_seen + work
+        self._steps_seen = kept * self._steps_seen + steps
         self._seconds_seen = kept * self._seconds_seen + elapsed * busy
 
-    def _work_made(self) -> int:
+    def _steps_made(self) -> int:
         """Particle-steps in all frames so far; a run's first frame takes none."""
         counts = zip(self._frames_done, self.costs.values(), strict=True)
-        return sum(max(0, frames - 1) * cost.work_per_frame for frames, cost in counts)
+        return sum(max(0, frames - 1) * cost.steps_per_frame for frames, cost in counts)
 
     def _rest(self) -> dict[str, int]:
         """Particle-steps that are left of every run that is not finished."""
         runs = zip(self.costs.items(), self._frames_done, self._ended, strict=True)
         return {
-            name: cost.work - max(0, frames - 1) * cost.work_per_frame
+            name: cost.particle_steps - max(0, frames - 1) * cost.steps_per_frame
             for (name, cost), frames, ended in runs
             if name not in self._jobs or not (ended or self._jobs[name].done())
         }
 
     def _left(self) -> str:
         """Time to the end of the last run at the speed seen so far, in words."""
-        if not self._work_seen:
+        if not self._steps_seen:
             return "an unknown time"
         rest = self._rest()
         begun = {name for name, frames in zip(self.costs, self._frames_done, strict=True) if frames}
-        running = [work for name, work in rest.items() if name in begun][: self.at_once]
-        waiting = [work for name, work in rest.items() if name not in begun]
-        rate = self._work_seen / self._seconds_seen
+        running = [steps for name, steps in rest.items() if name in begun][: self.at_once]
+        waiting = [steps for name, steps in rest.items() if name not in begun]
+        rate = self._steps_seen / self._seconds_seen
         return duration_words(finishing_time(waiting, running, self.at_once) / rate)
 
 

@@ -108,7 +108,7 @@ def test_shards_are_the_campaign_in_shares_of_like_work(tmp_path, order):
     shares = []
     for shard in range(2):
         simulate_campaign(c, device="cpu", shard=shard, shards=2)
-        shares.append([run_cost(c.scenes[name]).work for name in order])
+        shares.append([run_cost(c.scenes[name]).particle_steps for name in order])
         done = list(order)
         order.clear()
         assert len(done) == 3
@@ -164,12 +164,12 @@ def test_kernels_are_compiled_once_for_each_kind_of_scene(tmp_path, monkeypatch)
 def test_time_left_follows_from_the_work_left_and_the_speed_seen(tmp_path):
     c = campaign(tmp_path, runs=6)
     costs = {name: run_cost(scene) for name, scene in c.scenes.items()}
-    per_frame = costs[next(iter(costs))].work_per_frame
+    per_frame = costs[next(iter(costs))].steps_per_frame
     workers = campaign_runs._Workers(c, costs, "cpu", 4)
     try:
         assert workers._left() == "an unknown time"
         # A frame takes a worker 100 s; six runs of three steps on four workers end after two runs.
-        workers._work_seen, workers._seconds_seen = 10 * per_frame, 1000.0
+        workers._steps_seen, workers._seconds_seen = 10 * per_frame, 1000.0
         assert workers._left() == "10 min"
         # Then an hour at half that speed, with three of the workers busy: the estimate says so.
         for _ in range(60):
@@ -177,7 +177,7 @@ def test_time_left_follows_from_the_work_left_and_the_speed_seen(tmp_path):
         assert workers._left() == "20 min"
         # Four runs have only one step left (frames 0 to 2 are there), two have not begun.
         workers._frames_done[:] = [3, 3, 3, 3, 0, 0]
-        assert workers._work_made() == 8 * per_frame
+        assert workers._steps_made() == 8 * per_frame
         assert workers._left() == "13 min"
     finally:
         workers._pool.shutdown()
