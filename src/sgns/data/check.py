@@ -244,10 +244,7 @@ def _check_frames(file: h5py.File) -> list[str]:
     values = {name: file[f"{element.path}/value"] for name, element in ELEMENTS.items()}
     small = {name: values[name][...] for name in values if name not in ("position", "velocity")}
     small["time"] = file[f"{ELEMENTS['position'].path}/time"][...]
-    views = {
-        "position": _view(file, "VTKHDF/Points"),
-        "velocity": _view(file, "VTKHDF/PointData/velocity"),
-    }
+    views = {"position": _view(file, "VTKHDF/Points"), "velocity": _view(file, "VTKHDF/PointData/velocity")}
     frames, particles, _ = values["position"].shape
     found: dict[str, str] = {}  # the first problem of each kind
     content = ContentHash()

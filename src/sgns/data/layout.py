@@ -156,19 +156,8 @@ ATTRIBUTES: dict[str, type | tuple[type, ...]] = {
 """Root attributes and their types; `scene`, `effects` and `extra` are YAML text in UTF-8."""
 OPTIONAL = ("stopped",)
 """Root attributes that only some files have: why a run ended before its time."""
-_SCENE_NUMBERS = (
-    "depth",
-    "speed",
-    "rake",
-    "diameter",
-    "width",
-    "grouser_height",
-    "load",
-    "slip",
-    "friction_angle",
-    "gravity",
-)
-_SCENE_GROUPS = {"blade": ("thickness", "width", "length")}
+_SCENE_NUMBERS = "depth speed rake diameter width grouser_height load slip friction_angle gravity".split()
+_BLADE_NUMBERS = ("thickness", "width", "length")
 MESH = {"vertices": ("parameters/tool/vertices", "<f8"), "triangles": ("parameters/tool/triangles", "<i4")}
 """Path and type of the datasets that a run has whose tool is a mesh, shape (V, 3) [m] and (F, 3)."""
 
@@ -244,11 +233,10 @@ def open_run(path: str | os.PathLike[str]) -> h5py.File:
         raise UserError(f"no such run file: {path}; check the path, or make one with `sgns simulate`")
     if path.is_dir():
         raise UserError(f"{path} is a folder, not a run file; give one of the .h5 files in it")
-    if not path.is_file():
-        raise UserError(f"{path} is a pipe or device, not a run file")
     try:
-        with path.open("rb") as file:
-            file.read(1)
+        open_file(path, _ANY_SIZE).close()
+    except ValueError:
+        raise UserError(f"{path} is a pipe or device, not a run file") from None
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}; check its permissions") from error
     if not h5py.is_hdf5(path):
@@ -339,26 +327,23 @@ def require_mesh_was_read(scene: object) -> None:
 
 
 def _mesh_problems(file: h5py.File) -> list[str]:
-    found = {}
-    problems = []
-    for name, (path, dtype) in MESH.items():
+    missing, problems = [], []
+    for path, dtype in MESH.values():
         try:
-            if own_object(file, path) is not None:
-                found[name] = own_dataset(file, path)
+            if own_object(file, path) is None:
+                missing.append(f"dataset /{path} is missing")
+                continue
+            found = own_dataset(file, path)
         except (KeyError, ValueError) as error:
             problems.append(one_line(error).strip("'"))
             continue
-        if name in found and (found[name].ndim != 2 or found[name].shape[1] != 3 or not len(found[name])):
-            problems.append(f"dataset /{path} has shape {found[name].shape}, expected (at least 1, 3)")
-        elif name in found and found[name].dtype != np.dtype(dtype):
-            problems.append(f"dataset /{path} has the wrong type {found[name].dtype}")
-        elif name in found and found[name].size * found[name].dtype.itemsize > MOST_BYTES:
+        if found.ndim != 2 or found.shape[1] != 3 or not len(found):
+            problems.append(f"dataset /{path} has shape {found.shape}, expected (at least 1, 3)")
+        elif found.dtype != np.dtype(dtype):
+            problems.append(f"dataset /{path} has the wrong type {found.dtype}")
+        elif found.size * found.dtype.itemsize > MOST_BYTES:
             problems.append(f"dataset /{path} is larger than {MOST_BYTES / 1e6:.0f} MB")
-    if not problems and len(found) == 1:
-        (there,) = found
-        missing = next(path for name, (path, _) in MESH.items() if name != there)
-        problems.append(f"dataset /{missing} is missing")
-    return problems
+    return problems or (missing if len(missing) == 1 else [])  # without both there is no mesh
 
 
 def _attribute_problems(file: h5py.File) -> list[str]:
@@ -380,13 +365,11 @@ def _attribute_problems(file: h5py.File) -> list[str]:
 def scene_problems(scene: Mapping[str, Any]) -> list[str]:
     """Values of a scene that are not the numbers which others calculate with, in words; what is not there is none."""
     found = [(key, scene[key]) for key in _SCENE_NUMBERS if scene.get(key) is not None]
-    for group, keys in _SCENE_GROUPS.items():
-        part = scene.get(group)
-        if part is None:
-            continue
-        if not isinstance(part, Mapping):
-            return [f"scene.{group} is {part!r:.40}, not a group of keys"]
-        found += [(f"{group}.{key}", part.get(key)) for key in keys]
+    blade = scene.get("blade")
+    if blade is not None:
+        if not isinstance(blade, Mapping):
+            return [f"scene.blade is {blade!r:.40}, not a group of keys"]
+        found += [(f"blade.{key}", blade.get(key)) for key in _BLADE_NUMBERS]
     return [
         f"scene.{key} is {value!r:.40}, not a finite number"
         for key, value in found

@@ -158,14 +158,7 @@ def _run(case: int | None, record: bytes, bin_size: tuple[float, float, float] |
     lx, _, lz = bin_size or _BINS[kind]
     x, y, z = np.moveaxis(nodes[:, ~soil], -1, 0)
     body = np.stack([_MARGIN + lx - x, z - _MARGIN, y - _MARGIN - lz], axis=-1)
-    return PublishedRun(
-        kind,
-        case,
-        body,
-        nodes[:, soil],
-        force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0],
-        context,
-    )
+    return PublishedRun(kind, case, body, nodes[:, soil], force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0], context)
 
 
 def _series(frames: Sequence[bytes], values: int) -> np.ndarray:

@@ -103,13 +103,7 @@ def _simulate_one(scene: Scene, cfg: DictConfig, **settings: Any) -> float:
         require_run_place(output)
         require_space(output.parent, run_cost(scene).size)
         with tqdm(total=scene.frame_count, unit="frame", desc=scene.name, disable=None) as bar:
-            timing = simulate_scene(
-                scene,
-                output,
-                device=cfg.device,
-                progress=bar.update,
-                **settings,
-            )
+            timing = simulate_scene(scene, output, device=cfg.device, progress=bar.update, **settings)
     with Run(output) as run:
         every = scene.bed.store_every
         kept = f" (one of every {every} recorded)" if every > 1 else ""

@@ -25,9 +25,7 @@ from mpm_warp import (
     bodies,
     effects_for,
 )
-from mpm_warp import (
-    mesh as mesh_file,
-)
+from mpm_warp import mesh as mesh_file
 from mpm_warp.batch import all_together
 from sgns.config import UserError
 from sgns.data.check import check_run
