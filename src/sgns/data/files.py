@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 # --- Names that a file may take -------------------------------------------------------------------------
 
-_KINDS = {
+_FILE_TYPES = {
     stat.S_IFLNK: "a symbolic link; give the name of the file itself",
     stat.S_IFDIR: "a folder; give the name of a file in it, or another name",
     stat.S_IFIFO: "a pipe; give the name of a file",
@@ -56,16 +56,16 @@ def require_replaceable(*paths: Path) -> None:
     """
     for path in paths:
         if not is_replaceable(path):
-            what = _KINDS.get(_kind(path), "no plain file; give the name of a file")
+            what = _FILE_TYPES.get(_file_type(path), "no plain file; give the name of a file")
             raise UserError(f"cannot write {path}: it is {what}")
 
 
 def is_replaceable(path: Path) -> bool:
     """Whether a file of ours may be there, or be put there: see `require_replaceable`."""
-    return _kind(path) in (None, stat.S_IFREG)
+    return _file_type(path) in (None, stat.S_IFREG)
 
 
-def _kind(path: Path) -> int | None:
+def _file_type(path: Path) -> int | None:
     """What the name itself stands for, as in `stat`; None for nothing, or where that cannot be asked."""
     try:
         return stat.S_IFMT(os.lstat(path).st_mode)
@@ -298,7 +298,7 @@ def remove_abandoned(path: Path) -> None:
     for found in path.parent.iterdir():
         if not (found.name.startswith(start) and found.name.endswith(_SUFFIX)):
             continue
-        if _kind(found) == stat.S_IFREG:  # others are none of ours; opening a pipe may never end
+        if _file_type(found) == stat.S_IFREG:  # others are none of ours; opening a pipe may never end
             with suppress(OSError, ValueError), inputs.open_file(found, 1 << 62) as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 found.unlink()

@@ -245,11 +245,7 @@ class RunWriter:
         self._hash.update(frame)
 
     def finish(self, wall_time_s: float) -> None:
-        """Complete the file and give it its name.
-
-        Args:
-            wall_time_s: time it took to compute the run [s].
-        """
+        """Complete the file and give it its name; `wall_time_s` is what it took to compute the run [s]."""
         self._open_file()
         if self.frame_count == 0:
             raise ValueError("no frame was appended")
@@ -257,15 +253,12 @@ class RunWriter:
         remove_stopped(self.path)
 
     def stop(self, wall_time_s: float, reason: str, state: State | None = None) -> Path:
-        """Complete the file with the frames so far, as a stopped run beside the one it was to be (stopped.py).
+        """Complete the file with the frames so far, as a stopped run beside the one it was to be.
 
         Args:
             wall_time_s: time it took so far [s].
             reason: why there are no more frames.
             state: at the last of them, to go on from; a rollout has none.
-
-        Returns:
-            The file's path.
         """
         file = self._open_file()
         write_text(file, "stopped", reason)

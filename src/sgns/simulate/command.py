@@ -51,15 +51,8 @@ def main(cfg: DictConfig) -> float | None:
         if cfg.get("dataset") is not None:
             raise UserError("continue_from goes on with one run; leave out dataset=")
         restart = restart_from(cfg, HydraConfig.get().overrides.task)
-        return _simulate_one(
-            restart.scene,
-            cfg,
-            effects=restart.effects,
-            reasons=restart.reasons,
-            seed=restart.seed,
-            precision=restart.precision,
-            restart=restart,
-        )
+        same = {name: getattr(restart, name) for name in ("effects", "reasons", "seed", "precision")}
+        return _simulate_one(restart.scene, cfg, **same, restart=restart)
     asked, batch = asked_effects(cfg), cfg.solver.batch
     if type(batch) is not int or batch < 1:
         raise UserError(f"solver.batch is {batch!r}; it must be a whole number, 1 or more")
@@ -70,13 +63,8 @@ def main(cfg: DictConfig) -> float | None:
                 "dataset.where picks among runs that are there; to simulate fewer change dataset.draw"
             )
         campaign = plan(settings, _base_scene(settings), asked, cfg.solver.precision, cfg.seed)
-        simulate_campaign(
-            campaign,
-            device=cfg.device,
-            batch=1 if cfg.device == "cpu" else batch,
-            shard=cfg.shard,
-            shards=cfg.shards,
-        )
+        batch = 1 if cfg.device == "cpu" else batch
+        simulate_campaign(campaign, device=cfg.device, batch=batch, shard=cfg.shard, shards=cfg.shards)
         return None
     if (cfg.shard, cfg.shards) != (0, 1):
         raise UserError("shard and shards divide the runs of a dataset; give dataset=... or leave them out")
@@ -86,14 +74,8 @@ def main(cfg: DictConfig) -> float | None:
     effects, decisions = decided(scene, asked)
     for name, decision in decisions.items():
         log.info("%s", decision_line(name, decision))
-    return _simulate_one(
-        scene,
-        cfg,
-        effects=effects,
-        reasons=recorded(decisions),
-        seed=cfg.seed,
-        precision=cfg.solver.precision,
-    )
+    settings = {"reasons": recorded(decisions), "seed": cfg.seed, "precision": cfg.solver.precision}
+    return _simulate_one(scene, cfg, effects=effects, **settings)
 
 
 def _simulate_one(scene: Scene, cfg: DictConfig, **settings: Any) -> float:

@@ -199,7 +199,7 @@ def scene_stages(
         restart: a stopped run of this scene; its frames are copied and the solver begins after them.
 
     Yields:
-        All work that the device has to do (mpm_warp's work.py), and at the end what it cost.
+        All work that the device has to do (mpm_warp.launch), and at the end what it cost.
 
     Raises:
         SolverStopped: the line says where the frames before it are kept and how to go on.
