@@ -344,7 +344,7 @@ def write_whole(path: Path, text: str) -> None:
 T = TypeVar("T")
 
 
-class NewFile:
+class NewFile(io.RawIOBase):
     """A hidden file beside `path`, for `h5py.File(NewFile(path), "w")`; `complete` gives it its name.
 
     Until then an existing file of that name stays as it is. Hidden files that killed processes of this
@@ -412,19 +412,10 @@ class NewFile:
         with suppress(OSError):
             self._temporary.unlink(missing_ok=True)
 
-    # --- what h5py asks of a file: nothing of this may raise ----------------------------------------------
+    # --- what h5py asks of a file, as in `io.RawIOBase`: nothing of this may raise ------------------------
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move; see io.IOBase."""
         return self._kept(lambda: self._file.seek(offset, whence), 0)
-
-    def tell(self) -> int:
-        """Where we are; see io.IOBase."""
-        return self._kept(self._file.tell, 0)
-
-    def read(self, size: int = -1) -> bytes:
-        """Read; see io.RawIOBase."""
-        return self._kept(lambda: self._file.read(size), b"") or b""
 
     def readinto(self, buffer: memoryview) -> int:
         """Fill the buffer, with zeros where nothing can be read."""
@@ -447,11 +438,7 @@ class NewFile:
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
-        """Set the length; see io.IOBase."""
         return self._kept(lambda: self._file.truncate(size), 0)
-
-    def flush(self) -> None:
-        """Nothing is buffered here."""
 
     def _kept(self, action: Callable[[], T], otherwise: T) -> T:
         try:
