@@ -187,7 +187,7 @@ def test_a_clock_that_is_set(days, tmp_path, monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("collected", [True, False])
-def test_leftovers_of_a_killed_process_do_not_stay(collected, tmp_path) -> None:
+def test_hidden_files_of_a_killed_process_do_not_stay(collected, tmp_path) -> None:
     """Also not while its number is still taken because nobody has asked for its status."""
     if not collected and not Path("/proc/self/stat").exists():
         pytest.skip("this system does not show the states of processes as files")

@@ -14,9 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from sgns.config import UserError
-from sgns.data.files import whole_file
+from sgns.data.files import read_json, whole_file
 from sgns.data.layout import require_mesh_was_read
-from sgns.data.small_files import read_json
 from sgns.model.dynamics import Dynamics
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.polynomial import PolynomialDynamics

@@ -56,6 +56,17 @@ def test_the_desktop_excavation_is_part_of_the_papers(planned):
         assert min(Counter(values).values()) >= 12
 
 
+@pytest.mark.parametrize(("name", "runs"), [("paper_wheel", 243), ("desktop_wheel", 60), ("quick_wheel", 16)])
+def test_the_wheels(planned, name, runs):
+    scenes = planned(name).scenes.values()
+    assert len(scenes) == runs
+    if name == "paper_wheel":
+        small = {s.load for s in scenes if s.diameter == 0.05}
+        assert sorted(small) == pytest.approx([100 / 9, 164 / 9, 225 / 9])
+        assert {s.width for s in scenes if s.diameter == 0.30} == {0.125}
+        assert {round(1e3 * s.speed, 6) for s in scenes} == {15.6, 12.0, 5.85}
+
+
 def test_the_command_line_comes_after_what_the_dataset_changes(planned):
     def recorded(*overrides):
         return next(iter(planned("desktop_excavation", *overrides).scenes.values())).bed.store_every

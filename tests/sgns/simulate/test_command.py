@@ -9,6 +9,7 @@ import time
 
 import h5py
 import pytest
+from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from test_campaign import campaign
 
@@ -32,9 +33,25 @@ SMALL = [
 
 
 def sgns(folder, *arguments):
+    """`sgns <arguments>` as a process."""
     return subprocess.run(
         [sys.executable, "-m", "sgns", *arguments], cwd=folder, capture_output=True, text=True, check=False
     )
+
+
+def refusal(folder, *arguments):
+    """The line with which `sgns <arguments>` refuses; nothing is written."""
+    before = sorted(folder.iterdir())
+    done = sgns(folder, *arguments)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert sorted(folder.iterdir()) == before
+    return done.stderr
+
+
+def composed(*overrides):
+    """The settings of `sgns simulate <overrides>`."""
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        return compose("simulate", list(overrides))
 
 
 def test_command_writes_a_complete_run(tmp_path):
@@ -79,20 +96,13 @@ def test_command_writes_fewer_particles(tmp_path):
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, override, words):
-    done = sgns(tmp_path, "simulate", *SMALL, *override.split())
-    assert done.returncode == 2
-    lines = done.stderr.splitlines()
-    assert len(lines) == 1
-    assert words in lines[0]
-    assert list(tmp_path.iterdir()) == []
+    assert words in refusal(tmp_path, "simulate", *SMALL, *override.split())
 
 
 def test_nan_in_a_path(tmp_path):
     (tmp_path / "path.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0.1,0.1,0.1,0,0,0,1\n1,nan,0.1,0.1,0,0,0,1\n")
-    done = sgns(tmp_path, "simulate", *SMALL, "scene.motion=path", "scene.path=path.csv")
-    assert done.returncode == 2
-    assert "not finite in row 2, column 2" in done.stderr
-    assert [p.name for p in tmp_path.iterdir()] == ["path.csv"]
+    said = refusal(tmp_path, "simulate", *SMALL, "scene.motion=path", "scene.path=path.csv")
+    assert "not finite in row 2, column 2" in said
 
 
 def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
@@ -102,7 +112,7 @@ def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
         raise SolverStopped("particle 1 went wrong")
         yield
 
-    monkeypatch.setattr("sgns.simulate.command.run.Solver.stages", stops)
+    monkeypatch.setattr("sgns.simulate.run.Solver.stages", stops)
     with pytest.raises(SolverStopped):
         simulate_scene(scene, tmp_path / "run.h5", effects=Effects())
     assert not list(tmp_path.glob("*"))
@@ -156,7 +166,5 @@ def test_a_campaign_refuses_a_pipe_before_the_first_frame(tmp_path, monkeypatch)
 
 def test_the_command_says_that_an_output_is_a_device(tmp_path):
     (tmp_path / "run.h5").symlink_to("/dev/null")
-    done = sgns(tmp_path, "simulate", *SMALL, "output=run.h5")
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert "cannot write run.h5: it is a symbolic link" in done.stderr
-    assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
+    said = refusal(tmp_path, "simulate", *SMALL, "output=run.h5")
+    assert "cannot write run.h5: it is a symbolic link" in said

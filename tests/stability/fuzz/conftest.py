@@ -45,7 +45,7 @@ def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for name in (
         "sgns.simulate.command.simulate_scene",
-        "sgns.simulate.command.workers._compile",
+        "sgns.simulate.workers._compile",
         "sgns.train.command.fit",
         "sgns.train.command.fit_polynomial",
         "sgns.evaluate.command.roll_out",
