@@ -5,24 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
-from .ranges import (
-    MOST_NODES,
-    MOST_PARTICLES,
-)
+from .settings import Settings, lengths, setting, settings
 from .state import SceneError
 
 # --- What soil may do at the floor and the walls of its bin ---------------------------------------------
 
-KINDS = ("no_slip", "slip", "periodic")
+
+def _wall(where: str, kinds: str) -> Any:
+    return setting("no_slip", where, ge=0, words=f"; allowed: {kinds} or a friction coefficient of 0 or more")
 
 
-@dataclass(frozen=True)
-class Walls:
+@settings
+class Walls(Settings):
     """Condition at each pair of walls and at the floor.
 
     - `no_slip`: soil sticks, also where it would move away.
@@ -31,24 +30,15 @@ class Walls:
     - `periodic` (x or y): no walls; what leaves at one end comes in at the other.
     """
 
-    x: str | float = "no_slip"
-    """The walls at x = 0 and x = Lx."""
-    y: str | float = "no_slip"
-    """The walls at y = 0 and y = Ly."""
-    floor: str | float = "no_slip"
-    """The floor at z = -Lz."""
+    group: ClassVar[str] = "bed.walls"
 
-    def __post_init__(self) -> None:
-        for name in ("x", "y", "floor"):
-            value = getattr(self, name)
-            kinds = KINDS if name != "floor" else KINDS[:2]
-            friction = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if friction and math.isfinite(value) and value >= 0:
-                object.__setattr__(self, name, float(value))
-            elif friction or value not in kinds:
-                raise SceneError(
-                    f"bed.walls.{name} is {value!r}; allowed: {', '.join(kinds)} or a friction coefficient of 0 or more"
-                )
+    x: Literal["no_slip", "slip", "periodic"] | float = _wall(
+        "walls at x = 0, x = Lx", "no_slip, slip, periodic"
+    )
+    y: Literal["no_slip", "slip", "periodic"] | float = _wall(
+        "walls at y = 0, y = Ly", "no_slip, slip, periodic"
+    )
+    floor: Literal["no_slip", "slip"] | float = _wall("the floor at z = -Lz", "no_slip, slip")
 
     @property
     def kinds(self) -> tuple[str, str, str]:
@@ -63,7 +53,7 @@ class Walls:
 
 # --- Where the particles of an undisturbed bed are ------------------------------------------------------
 
-ARRANGEMENTS = ("lattice", "jittered", "poisson")
+Arrangement = Literal["lattice", "jittered", "poisson"]
 # Poisson-disk radius in units of the particle spacing; with it a bed holds about 0.8 points per cube of the
 # spacing, which is the published beds' density.
 POISSON_RADIUS = 0.897
@@ -130,7 +120,7 @@ def _arranged(
         points += [-margin, -margin, margin]
         inside = (points >= [0.0, 0.0, -size[2]]) & (points <= [size[0], size[1], 0.0])
         return points[inside.all(axis=1)], spacing**3
-    raise SceneError(f"bed.arrangement is {kind!r}; allowed: {', '.join(ARRANGEMENTS)}")
+    raise SceneError(f"bed.arrangement is {kind!r}; allowed: {', '.join(get_args(Arrangement))}")
 
 
 def rows_of(size: tuple[float, float, float], spacing: float) -> np.ndarray:
@@ -211,50 +201,48 @@ def _reading_order(points: np.ndarray, radius: float) -> np.ndarray:
     return np.lexsort((points[:, 2] // radius, points[:, 1] // radius, points[:, 0] // radius))
 
 
-# --- What is to be simulated: plain data, checked, without physics --------------------------------------
+# --- The bed: its bin, grid and particles ----------------------------------------------------------------
 
 PADDING = 3
 """Grid cells outside the bin, so that the nodes around a particle at a wall exist."""
-INITIAL_STRESSES = ("geostatic", "k0", "none")
+MOST_PARTICLES = 20_000_000
+MOST_NODES = 200_000_000
+"""Of the grid; both far beyond what has been computed, and short of what ends in an error or never ends."""
 
 
-@dataclass(frozen=True)
-class Bed:
+@settings
+class Bed(Settings):
     """The soil bin and how it is filled. z = 0 is the undisturbed surface."""
 
-    size: tuple[float, float, float] = (0.80, 0.60, 0.15)
-    """Lx, Ly, Lz [m]."""
-    spacing: float = 0.8 / 60
-    """Grid spacing dx [m]."""
-    particles_per_cell: float = 1.0
-    """Particles per grid cell of a full bed."""
-    arrangement: str = "lattice"
-    """lattice | jittered | poisson (arrangement.py)."""
-    seed: int = 0
-    """Of the random arrangements."""
-    mirrored: bool = False
-    """A random arrangement is its own mirror image about y = Ly / 2, which mirror symmetry needs."""
-    initial_stress: str = "geostatic"
-    """geostatic: isotropic pressure rho g depth; k0: the horizontal stress is nu / (1 - nu) times the vertical one;
-    none: stress-free, settles in the first frames."""
-    headroom: float = 0.25
-    """Height above the surface up to which soil may be thrown or piled [m]."""
-    store_every: int = 1
-    """Particles per particle that is recorded; the solver computes all of them."""
-    walls: Walls = field(default_factory=Walls)
-    """What soil may do at walls and floor."""
+    group: ClassVar[str] = "bed"
+
+    size: tuple[float, float, float] = lengths((0.80, 0.60, 0.15), "Lx, Ly, Lz")
+    spacing: float = setting(0.0133333333, "grid spacing, at most half the bin's smallest side", "m")
+    particles_per_cell: float = setting(1.0, "particles in a grid cell of a full bed", gt=0, le=64)
+    arrangement: Arrangement = setting(
+        "lattice", "of the particles: a lattice, one with each particle moved at random, or random points"
+    )
+    seed: int = setting(0, "of the random arrangements")
+    mirrored: bool = setting(False, "a random arrangement mirrors itself about y = Ly / 2, as symmetry needs")
+    initial_stress: Literal["geostatic", "k0", "none"] = setting(
+        "geostatic",
+        "geostatic: the pressure is rho g depth, the same in all directions; k0: the horizontal stress is "
+        "nu / (1 - nu) times the vertical one; none: stress-free, settles in the first frames",
+    )
+    headroom: float = setting(0.25, "height above the surface that soil may reach", "m", gt=0)
+    store_every: int = setting(
+        1,
+        "one particle of so many is recorded; the solver computes all",
+        ge=1,
+        words="; it must be a whole number, 1 or more",
+    )
+    walls: Walls = setting(Walls, "what soil may do at walls and floor")
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "size", tuple(float(s) for s in self.size))
-        if len(self.size) != 3 or not all(math.isfinite(s) and s > 0 for s in self.size):
-            raise SceneError(f"bed.size is {self.size}; it needs three lengths above 0 m")
-        if not (math.isfinite(self.spacing) and 0 < self.spacing <= min(self.size) / 2):
+        super().__post_init__()
+        if not 0 < self.spacing <= min(self.size) / 2:
             raise SceneError(
                 f"bed.spacing is {self.spacing} m; allowed: above 0, at most half the bin's smallest side"
-            )
-        if not 0 < self.particles_per_cell <= 64:
-            raise SceneError(
-                f"bed.particles_per_cell is {self.particles_per_cell}; allowed: above 0, at most 64"
             )
         particles = math.prod(s / self.spacing for s in self.size) * self.particles_per_cell
         if not particles <= MOST_PARTICLES:
@@ -262,14 +250,6 @@ class Bed:
                 f"the bed would hold {particles:.2g} particles; at most {MOST_PARTICLES:g} are allowed: use a larger "
                 "bed.spacing, a smaller bed.size or fewer bed.particles_per_cell"
             )
-        if self.arrangement not in ARRANGEMENTS:
-            raise SceneError(f"bed.arrangement is {self.arrangement!r}; allowed: {', '.join(ARRANGEMENTS)}")
-        if self.initial_stress not in INITIAL_STRESSES:
-            raise SceneError(
-                f"bed.initial_stress is {self.initial_stress!r}; allowed: {', '.join(INITIAL_STRESSES)}"
-            )
-        if not (math.isfinite(self.headroom) and self.headroom > 0):
-            raise SceneError(f"bed.headroom is {self.headroom} m; it must be above 0")
         height, margin = self.size[2] + self.headroom, 2.0 * PADDING + 2.0
         floor = math.prod(s / self.spacing + margin for s in self.size[:2])
         nodes = floor * (height / self.spacing + margin)
@@ -280,10 +260,6 @@ class Bed:
                 f"bed.headroom is {self.headroom} m and bed.spacing {self.spacing} m: the grid would have {nodes:.3g} "
                 f"nodes; at most {MOST_NODES:g} are allowed: {key}"
             )
-        if not (self.store_every >= 1 and self.store_every == int(self.store_every)):
-            raise SceneError(f"bed.store_every is {self.store_every}; it must be a whole number, 1 or more")
-        if not isinstance(self.mirrored, bool):
-            raise SceneError(f"bed.mirrored is {self.mirrored!r}; allowed: true, false")
         for name, kind, length in zip("xy", self.walls.kinds, self.size, strict=False):
             if kind == "periodic" and abs(length / self.spacing - round(length / self.spacing)) > 1e-6:
                 raise SceneError(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
+from typing import ClassVar
 
+from .settings import Settings, setting, settings
 from .state import SceneError
 
 _REASONS = {
@@ -26,33 +28,32 @@ _REASONS = {
 }
 
 
-@dataclass(frozen=True)
-class Effects:
+@settings
+class Effects(Settings):
     """Physics that can be left out; the kernels are compiled without what is off."""
 
-    yielding: bool = True
-    """Frictional yield; off: elastic soil."""
-    rate_dependence: bool = True
-    """mu(I) instead of a constant mu_s. Needs `yielding`."""
-    fluidity: bool = False
-    """The fluidity as a field with its own dynamics. Needs `rate_dependence`."""
-    nonlocality: bool = False
-    """Cooperative flow, the Laplacian of the fluidity. Needs `rate_dependence`."""
-    separation: bool = True
-    """A stress-free state below the critical density; off: the soil can carry tension."""
-    symmetry: bool = False
-    """Half the bed is computed, the other half is its mirror image. Needs a scene that is mirror symmetric about
-    y = Ly / 2."""
-    torque: bool = True
-    """The torque on a body is added up; off: it is recorded as 0."""
+    group: ClassVar[str] = "effects"
+
+    yielding: bool = setting(True, "frictional yield; off: elastic soil")
+    rate_dependence: bool = setting(True, "mu(I); off: a constant mu_s; needs yielding")
+    fluidity: bool = setting(False, "the fluidity has its own dynamics; needs rate_dependence")
+    nonlocality: bool = setting(
+        False, "cooperative flow, the Laplacian of the fluidity; needs rate_dependence"
+    )
+    separation: bool = setting(True, "no stress below the critical density; off: soil can carry tension")
+    symmetry: bool = setting(
+        False,
+        "half the bed is computed and mirrored; needs a scene that is mirror symmetric about y = Ly / 2",
+    )
+    torque: bool = setting(True, "the torque on a body is added up; off: it is recorded as 0")
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.rate_dependence and not self.yielding:
             raise SceneError(
                 "effects.rate_dependence needs effects.yielding: soil that does not yield has no friction that could "
                 "depend on the rate; set effects.rate_dependence=false"
             )
-
         for name in ("fluidity", "nonlocality"):
             if getattr(self, name) and not self.rate_dependence:
                 raise SceneError(

@@ -12,10 +12,14 @@ import warp as wp
 from .bed import Bed
 from .launch import find_device
 from .material import Material
-from .ranges import MOST_STEPS, MOST_SUBSTEPS
 from .rigid_body import longest_step
 from .scene import Scene
 from .state import SceneError
+
+MOST_SUBSTEPS = 1_000_000
+"""Between two frames."""
+MOST_STEPS = 1_000_000_000
+"""Substeps of a whole run."""
 
 # --- How long a step may be, and how many of them pass between two remaps -------------------------------
 
