@@ -18,8 +18,8 @@ from sgns.data.run import frame_chunks
 
 
 def is_wheel(scene: Mapping[str, Any]) -> bool:
-    """Whether the body is a wheel."""
-    return "diameter" in scene
+    """Whether the body is a wheel, the only one whose height the soil decides (`mpm_warp.Scene.axle`)."""
+    return scene.get("kind") == "wheel"
 
 
 def forward_force(scene: Mapping[str, Any]) -> tuple[str, float]:

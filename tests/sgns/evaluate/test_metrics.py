@@ -273,7 +273,7 @@ def test_body_errors_by_hand():
     moved[0, 0] = 9.0  # within the history: does not count
     moved[2:, 2] = [-0.003, 0.003, -0.003]
     moved[2:, 1] = 0.004
-    wheel = {"diameter": 0.15}
+    wheel = {"kind": "wheel"}
     errors = body_errors(SimpleNamespace(pose=poses, scene=wheel), SimpleNamespace(pose=moved), 2)
     assert errors.mse == pytest.approx(0.005**2)
     assert errors.sinkage_mae == pytest.approx(0.003)

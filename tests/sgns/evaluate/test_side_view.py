@@ -13,9 +13,9 @@ REST = np.array([[0.3, 0.2, 0.1, 0.0, 0.0, 0.0, 1.0]])
 
 
 def test_forward_force_follows_the_kind_of_body():
-    assert forward_force({"diameter": 0.15}) == ("drawbar pull Fx", 1.0)
+    assert forward_force({"kind": "wheel"}) == ("drawbar pull Fx", 1.0)
     assert forward_force({"blade": {}}) == ("draft −Fx", -1.0)
-    assert is_wheel({"diameter": 0.15}) and not is_wheel({"kind": "bed"})
+    assert is_wheel({"kind": "wheel"}) and not is_wheel({"kind": "bed"})
 
 
 @pytest.mark.parametrize("grousers", [{}, {"grousers": 6, "grouser_height": 0.01, "grouser_thickness": 0.02}])
@@ -26,7 +26,7 @@ def test_sinkage_is_that_of_the_scene(grousers):
 
 
 def test_corners_of_a_wheel_lie_on_its_rims():
-    run = SimpleNamespace(scene={"diameter": 0.15, "width": 0.08}, pose=REST)
+    run = SimpleNamespace(scene={"kind": "wheel", "diameter": 0.15, "width": 0.08}, pose=REST)
     corners = body_corners(run, 0) - REST[0, :3]
     assert np.hypot(corners[:, 0], corners[:, 2]) == pytest.approx(0.075)
     assert np.abs(corners[:, 1]) == pytest.approx(0.04)

@@ -35,7 +35,7 @@ def test_whole_bed_is_drawn_three_times_with_one_scale_of_displacement(pair):
 @pytest.mark.parametrize(
     "scene",
     [
-        {"blade": None, "diameter": 0.15, "width": 0.08},
+        {"blade": None, "kind": "wheel", "diameter": 0.15, "width": 0.08},
         {"blade": None, "kind": "body"},
         {"blade": None, "speed": 1e-12, "depth": 0.0},
     ],
