@@ -14,7 +14,7 @@ import numpy as np
 
 from .inputs import read_bytes
 from .mesh import checked_mesh, closed_mesh, read_mesh
-from .settings import Settings, lengths, setting, settings
+from .settings import Settings, lengths, same, setting, settings
 from .state import SceneError
 
 # --- A body whose height is free: it carries a load and rests on the soil -------------------------------
@@ -72,10 +72,6 @@ def _length(default: float, words: str) -> Any:
     return setting(default, words, "m", gt=0, words="; it must be above 0 m")
 
 
-def _friction() -> Any:
-    return setting(0.3, "Coulomb friction between soil and body", ge=0)
-
-
 def _corners(half_size: np.ndarray) -> np.ndarray:
     signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     return signs * half_size
@@ -101,7 +97,7 @@ class Plate(Settings, Tool):
     length: float = _length(0.305, "along the blade, tip to top")
     width: float = _length(0.457, "across the direction of travel")
     thickness: float = _length(0.028, "2 to 3 grid spacings keep the soil on its two sides apart")
-    friction: float = _friction()
+    friction: float = setting(0.3, "Coulomb friction between soil and body", ge=0)
 
     @property
     def half_size(self) -> np.ndarray:
@@ -132,7 +128,7 @@ class Box(Settings, Tool):
 
     shape: Literal["box"] = setting("box", "of the body")
     size: tuple[float, float, float] = lengths((0.08, 0.20, 0.10), "sides along the body's x, y, z")
-    friction: float = _friction()
+    friction: float = same(Plate, "friction")
 
     @property
     def half_size(self) -> np.ndarray:
@@ -155,7 +151,7 @@ class Cylinder(Settings, Tool):
     shape: Literal["cylinder"] = setting("cylinder", "of the body")
     diameter: float = _length(0.15, "of the rim, without grousers")
     width: float = _length(0.083, "along the axis")
-    friction: float = _friction()
+    friction: float = same(Plate, "friction")
     grousers: int = setting(
         0, "bars along the rim, evenly spaced; the first is at the body's +x", ge=0, le=360
     )
@@ -218,7 +214,7 @@ class MeshBody(Settings, Tool):
     shape: Literal["mesh"] = setting("mesh", "of the body")
     file: str = setting("", "STL (text or binary) or OBJ")
     scale: float = setting(1.0, "metres per unit of the file, 0.001 for millimetres", gt=0)
-    friction: float = _friction()
+    friction: float = same(Plate, "friction")
     digest: str = setting(
         "", "names the file's content; filled in when it is read, and checked if it is given"
     )

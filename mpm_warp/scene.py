@@ -30,7 +30,7 @@ class Scene(Settings):
     A subclass with a `kind` of its own is a kind of scene that `from_dict` knows.
     """
 
-    kinds: ClassVar[dict[str, type[Scene]]] = {}
+    classes: ClassVar[dict[str, type[Scene]]] = {}
     """Kind → class."""
     group: ClassVar[str] = "scene"
     bilateral: ClassVar[bool] = False
@@ -86,7 +86,7 @@ class Scene(Settings):
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         if "kind" in cls.__dict__:
-            Scene.kinds[cls.kind] = cls
+            Scene.classes[cls.kind] = cls
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -233,8 +233,8 @@ class Scene(Settings):
             mesh: of such a tool, see `mesh`.
         """
         kind = data.get("kind", "bed")
-        if not isinstance(kind, str) or kind not in Scene.kinds:
-            raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(Scene.kinds)}")
+        if not isinstance(kind, str) or kind not in Scene.classes:
+            raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(Scene.classes)}")
         tool = data.get("tool")
         if mesh is None and isinstance(tool, dict) and tool.get("shape") == "mesh" and tool.get("digest"):
             raise SceneError(
@@ -244,7 +244,7 @@ class Scene(Settings):
         if mesh is not None and isinstance(tool, dict) and tool.get("shape") == "mesh":
             made = build(MeshBody, tool, "scene.tool", partial(MeshBody.of_mesh, *mesh))
             data = data | {"tool": made}
-        return build(Scene.kinds[kind], data, "scene")
+        return build(Scene.classes[kind], data, "scene")
 
     # --- checks for scenes with a body --------------------------------------------------------------------
 
@@ -282,4 +282,4 @@ class Scene(Settings):
                     )
 
 
-Scene.kinds["bed"] = Scene
+Scene.classes["bed"] = Scene

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -197,6 +198,20 @@ LEAST_MASS, MOST_MASS = 1.0e-9, 1.0e9
 """Of a body whose height is free [kg]."""
 
 
+def sinkage(scene: Mapping[str, Any], poses: np.ndarray) -> np.ndarray:
+    """Depth of a wheel's lowest point below the undisturbed surface [m], shape (T,) for poses (T, 7).
+
+    Args:
+        scene: the wheel's as plain data, such as a run file's; published ones say nothing of grousers.
+        poses: of the wheel.
+    """
+    return 0.5 * scene["diameter"] + scene.get("grouser_height", 0.0) - poses[:, 2]
+
+
+def _positive(default: float, words: str, unit: str) -> Any:
+    return setting(default, words, unit, gt=0, words=f" {unit}; a wheel needs more than 0")
+
+
 @settings
 class Wheel(Scene):
     """A wheel settles under its load, then drives along x with a given slip.
@@ -212,9 +227,10 @@ class Wheel(Scene):
             size=(0.40, 0.19, 0.06), spacing=0.01, particles_per_cell=4.0, headroom=0.10
         )
     )
+    gravity: float = setting(9.81, "downwards; gives the wheel its mass", "m/s^2", gt=0, le=1e5)
     contact_margin: float = 0.0
     duration: float = 6.3333333333
-    load: float = setting(100.0, "weight that the wheel carries, its own included", "N")
+    load: float = _positive(100.0, "weight that the wheel carries, its own included", "N")
     diameter: float = same(Cylinder, "diameter")
     width: float = same(Cylinder, "width")
     friction: float = same(Cylinder, "friction", default=0.5)
@@ -224,7 +240,7 @@ class Wheel(Scene):
     slip: float = setting(
         0.2, "1 - forward speed / rim speed", ge=-1, le=1, note=" (0: rolls freely, 1: turns on the spot)"
     )
-    rim_speed: float = setting(0.0195, "angular speed times half the diameter", "m/s")
+    rim_speed: float = _positive(0.0195, "angular speed times half the diameter", "m/s")
     friction_angle: float | None = setting(
         37.0, "in place of material.friction_angle; None: the material's own", "degrees"
     )
@@ -240,10 +256,6 @@ class Wheel(Scene):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, unit in (("load", "N"), ("rim_speed", "m/s"), ("gravity", "m/s^2")):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise SceneError(f"scene.{name} is {value} {unit}; a wheel needs more than 0")
         if not LEAST_MASS <= self.load / self.gravity <= MOST_MASS:
             raise SceneError(
                 f"scene.load is {self.load} N at scene.gravity {self.gravity} m/s^2: a wheel of "
@@ -304,8 +316,8 @@ class Wheel(Scene):
         return abs(self.speed) * driven, self.angular_speed * driven
 
     def sinkage(self, poses: np.ndarray) -> np.ndarray:
-        """Depth of the wheel's lowest point below the undisturbed surface [m], shape (T,) for poses (T, 7)."""
-        return self.body.tip_radius - poses[:, 2]
+        """See `sinkage`."""
+        return sinkage(vars(self), poses)
 
     def body_points(self) -> np.ndarray:
         return self.body.points()

@@ -7,30 +7,22 @@ are checked by the classes themselves.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
-from dataclasses import KW_ONLY, MISSING, dataclass, field, fields, is_dataclass
+from collections.abc import Callable
+from dataclasses import KW_ONLY, MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from types import UnionType
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from annotated_types import GroupedMetadata, Interval
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from .state import SceneError
 
-_CONFIG = ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
-_TYPES = {
-    "float_type": "it must be a finite number",
-    "finite_number": "it must be a finite number",
-    "int_type": "it must be a whole number",
-    "bool_type": "allowed: true, false",
-    "string_type": "it must be text",
-}
+_CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True)
 
 
 @dataclass(frozen=True)
-class Setting(GroupedMetadata):
+class Setting:
     """What is known of a setting beside its type and default."""
 
     help: str
@@ -40,13 +32,11 @@ class Setting(GroupedMetadata):
     ge: float | None = None
     lt: float | None = None
     le: float | None = None
+    choices: tuple[str, ...] = ()
     note: str = ""
     """Follows the range in an error, to say why it is so."""
     words: str = ""
     """Stands after the value in an error, in place of unit, range and note."""
-
-    def __iter__(self) -> Iterator[object]:
-        return iter(Interval(gt=self.gt, ge=self.ge, lt=self.lt, le=self.le))
 
     @property
     def range(self) -> str:
@@ -59,14 +49,15 @@ class Setting(GroupedMetadata):
             "below {:g}": self.lt,
             "at most {:g}": self.le,
         }
-        return ", ".join(words.format(limit) for words, limit in limits.items() if limit is not None)
+        given = [words.format(limit) for words, limit in limits.items() if limit is not None]
+        return ", ".join([*self.choices, *given])
 
     @property
     def refusal(self) -> str:
-        """What an error says after a value out of range."""
-        upper = self.lt is not None or self.le is not None
+        """What an error says after a value that is not allowed."""
         unit = self.unit and f" {self.unit}"
-        return self.words or f"{unit}; {'allowed:' if upper else 'it must be'} {self.range}{self.note}"
+        only_from = self.lt is None and self.le is None and not self.choices
+        return self.words or f"{unit}; {'it must be' if only_from else 'allowed:'} {self.range}{self.note}"
 
 
 def setting(default: Any, *known: str, **limits: Any) -> Any:
@@ -116,10 +107,9 @@ def described(cls: type) -> list[str]:
     """Each setting of a class: name, default with unit, help, and what is allowed."""
     lines = []
     for one in fields(cls):
-        known, kind, _ = _fields_of(cls)[one.name]
+        known = _fields_of(cls)[one.name].setting
         default = one.default if one.default_factory is MISSING else one.default_factory()
-        allowed = known.range or (" | ".join(get_args(kind)) if get_origin(kind) is Literal else "")
-        unit, allowed = known.unit and f" {known.unit}", allowed and f" ({allowed})"
+        unit, allowed = known.unit and f" {known.unit}", known.range and f" ({known.range})"
         lines.append(f"{one.name} = {_short(default)}{unit}: {known.help}{allowed}")
     return lines
 
@@ -182,17 +172,20 @@ def _fields_of(cls: type) -> dict[str, _Field]:
         # A class that changes only a default has the setting of its base.
         bases = (base.__dict__.get("__dataclass_fields__", {}).get(one.name) for base in cls.__mro__)
         known = next((f.metadata["setting"] for f in bases if f and "setting" in f.metadata), Setting(""))
+        if get_origin(hint) is Literal:
+            known = replace(known, choices=get_args(hint))
         group = any(map(is_dataclass, (hint, *get_args(hint))))
-        found[one.name] = _Field(
-            known, hint, None if group else TypeAdapter(_limited(hint, known), config=_CONFIG)
-        )
+        adapter = None if group else TypeAdapter(_limited(hint, known), config=_CONFIG)
+        found[one.name] = _Field(known, hint, adapter)
     return found
 
 
 def _limited(hint: Any, known: Setting) -> Any:
-    """A type whose numbers keep to the range of a setting."""
+    """A type whose numbers keep to the range of a setting, and are not made of text or of each other."""
+    if hint in (bool, str):
+        return Annotated[hint, Field(strict=True)]
     if hint in (int, float):
-        return Annotated[hint, known]
+        return Annotated[hint, Field(strict=True, gt=known.gt, ge=known.ge, lt=known.lt, le=known.le)]
     parts = tuple(_limited(part, known) for part in get_args(hint))
     if get_origin(hint) in (Union, UnionType):
         return Union[parts]  # noqa: UP007
@@ -201,36 +194,42 @@ def _limited(hint: Any, known: Setting) -> Any:
 
 def _checked(cls: type, name: str, value: Any, place: str = "") -> Any:
     """A value of the right type and in its range; `place` is where it stands if it comes from plain data."""
-    setting, kind, adapter = _fields_of(cls)[name]
+    known, kind, adapter = _fields_of(cls)[name]
     if adapter is None:
         return value
-    if isinstance(value, (list, np.ndarray)) and tuple in (
-        get_origin(kind),
-        *map(get_origin, get_args(kind)),
-    ):
-        value = tuple(value)
-    elif kind is int and isinstance(value, (float, np.number)) and np.isfinite(value) and value == int(value):
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if kind is int and isinstance(value, float) and value.is_integer():
         value = int(value)
-    elif isinstance(value, np.bool_):
-        value = bool(value)
-    elif isinstance(value, int) and kind in (float, float | None) and not isinstance(value, bool):
+    elif type(value) is int and kind in (float, float | None):
         value = float(value)
     try:
         return adapter.validate_python(value)
     except ValidationError as error:
         problem = error.errors(include_url=False, include_context=False)[0]
-    own = f"{cls.group}.{name} is {value!r}"
-    words = _TYPES.get(problem["type"], "")
-    if words and (place or not (setting.words or (setting.range and problem["type"] == "finite_number"))):
-        index = "".join(f"[{i}]" for i in problem["loc"] if isinstance(i, int))
-        if words.endswith("whole number") and not isinstance(problem["input"], float):
-            words = _TYPES["float_type"]
-        raise SceneError(f"{place or f'{cls.group}.{name}'}{index} is {problem['input']!r}; {words}")
-    if problem["type"] in ("tuple_type", "missing", "too_long") and (place or not setting.words):
-        count = "some" if ... in get_args(kind) or get_origin(kind) is not tuple else len(get_args(kind))
-        raise SceneError(
-            f"{place or f'{cls.group}.{name}'} is {value!r}; it must be a list of {count} values"
-        )
-    if get_origin(kind) is Literal and not setting.words:
-        raise SceneError(f"{own}; allowed: {', '.join(get_args(kind))}")
-    raise SceneError(f"{own}{setting.refusal}")
+    own = f"{cls.group}.{name}"
+    wrong_type = _wrong_type(problem, kind)
+    # To somebody who writes Python the range says more than that a number must be finite.
+    if wrong_type and (
+        place or (not known.words and not (known.range and problem["type"] == "finite_number"))
+    ):
+        index = "" if problem["type"] == "missing" else "".join(f"[{i}]" for i in problem["loc"])
+        raise SceneError(f"{place or own}{index} is {problem['input']!r}; {wrong_type}")
+    raise SceneError(f"{own} is {value!r}{known.refusal}")
+
+
+def _wrong_type(problem: Any, kind: Any) -> str:
+    """What a value must be that is not of its type; empty for one that is, but is not allowed."""
+    match problem["type"]:
+        case "int_type" if isinstance(problem["input"], float):
+            return "it must be a whole number"
+        case "float_type" | "finite_number" | "int_type":
+            return "it must be a finite number"
+        case "bool_type":
+            return "allowed: true, false"
+        case "string_type":
+            return "it must be text"
+        case "tuple_type" | "missing" | "too_long":
+            count = "some" if get_origin(kind) is not tuple else len(get_args(kind))
+            return f"it must be a list of {count} values"
+    return ""

@@ -10,8 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from mpm_warp.scenes import sinkage
 from sgns.evaluate.figures import ACCENT, BASELINE, NETWORK, PICTURE_WIDTH, TRUTH, new_figure, styled
-from sgns.evaluate.metrics import NEGLIGIBLE_SHARE, PositionErrors, forward_force, is_wheel, sinkage
+from sgns.evaluate.metrics import NEGLIGIBLE_SHARE, PositionErrors, forward_force, is_wheel
 
 # A component below this share of the largest is drawn as small as it is, not blown up to fill its panel.
 SMALLEST_PANEL = 0.1

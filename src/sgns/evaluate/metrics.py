@@ -27,11 +27,6 @@ def forward_force(scene: Mapping[str, Any]) -> tuple[str, float]:
     return ("drawbar pull Fx", 1.0) if is_wheel(scene) else ("draft −Fx", -1.0)
 
 
-def sinkage(scene: Mapping[str, Any], poses: np.ndarray) -> np.ndarray:
-    """Depth of a wheel's lowest point below the undisturbed surface [m], shape (T,) for poses (T, 7)."""
-    return 0.5 * float(scene["diameter"]) + float(scene.get("grouser_height", 0.0)) - poses[:, 2]
-
-
 # --- The free surface of a bed of particles as a height map on a regular horizontal grid ----------------
 
 # A column two particle spacings wide holds several particles of an undisturbed top layer, so that

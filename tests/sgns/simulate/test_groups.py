@@ -101,7 +101,7 @@ def test_the_numerics_and_effects_are_the_solvers_own() -> None:
 def test_the_help_of_a_scene_lists_every_setting(cls: type) -> None:
     listed = [line.split(" = ")[0].strip() for line in cls.__doc__.splitlines() if line.startswith("    ")]
     assert listed[-len(fields(cls)) :] == [one.name for one in fields(cls)]
-    assert "    gravity = 9.81 m/s^2: downwards (0 to 100000)" in cls.__doc__.splitlines()
+    assert "    frame_rate = 60.0 Hz: recorded frames per second (0.001 to 1e+06)" in cls.__doc__.splitlines()
     assert all(line.split(": ")[1:] for line in cls.__doc__.splitlines() if line.startswith("    "))
 
 
