@@ -7,7 +7,7 @@ are checked by the classes themselves.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from types import UnionType
@@ -98,20 +98,35 @@ class Settings:
 def settings(cls: type) -> type:
     """An immutable dataclass of settings, which its documentation lists."""
     cls = dataclass(frozen=True)(cls)
-    lines = [f"    {line}" for line in described(cls)]
-    cls.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__), "", "Settings and their defaults:", *lines])
+    lines = [inspect.cleandoc(cls.__doc__), "", "Settings and their defaults:"]
+    for name, default, allowed, meaning in described(cls):
+        lines.append(f"    {name} = {default}: {meaning}{allowed and f' ({allowed})'}")
+    cls.__doc__ = "\n".join(lines)
     return cls
 
 
-def described(cls: type) -> list[str]:
-    """Each setting of a class: name, default with unit, help, and what is allowed."""
-    lines = []
+def described(cls: type) -> list[tuple[str, str, str, str]]:
+    """Of each setting of a class its name, its default with the unit, what is allowed, and its meaning."""
+    found = []
     for one in fields(cls):
         known = _fields_of(cls)[one.name].setting
-        default = one.default if one.default_factory is MISSING else one.default_factory()
-        unit, allowed = known.unit and f" {known.unit}", known.range and f" ({known.range})"
-        lines.append(f"{one.name} = {_short(default)}{unit}: {known.help}{allowed}")
-    return lines
+        default = _short(one.default if one.default_factory is MISSING else one.default_factory())
+        found.append((one.name, f"{default} {known.unit}".rstrip(), known.range, known.help))
+    return found
+
+
+def reference(groups: Iterable[type]) -> str:
+    """The page of the documentation that lists the settings of some classes, in Markdown."""
+    lines = ["# Settings of scenes, soil and physics", "", "Python and the command line have the same names."]
+    for cls in groups:
+        shared = described(cls.__base__) if is_dataclass(cls.__base__) else []
+        also = f" It has the settings of {cls.__base__.__name__}, too." if shared else ""
+        lines += ["", f"## {cls.__name__}", "", cls.__doc__.splitlines()[0] + also, ""]
+        lines += ["| setting | default | allowed | meaning |", "|---|---|---|---|"]
+        for name, *known in described(cls):
+            if (name, *known) not in shared:
+                lines.append(f"| `{name}` | {' | '.join(known)} |")
+    return "\n".join(lines) + "\n"
 
 
 def _short(value: Any) -> str:

@@ -133,7 +133,7 @@ CASES = [
         limit=0.0,
         unit="",
         measure=partial(
-            refused, lambda: cut(courant=1.05 * MOST_COURANT), f"allowed: above 0, at most {MOST_COURANT}"
+            refused, lambda: cut(courant=1.05 * MOST_COURANT), f"allowed: 0.0001 to {MOST_COURANT}"
         ),
         quick=True,
     ),
