@@ -41,7 +41,7 @@ class Walls(Settings):
     floor: Literal["no_slip", "slip"] | float = _wall("the floor at z = -Lz", "no_slip, slip")
 
     @property
-    def kinds(self) -> tuple[str, str, str]:
+    def conditions(self) -> tuple[str, str, str]:
         """`no_slip`, `slip`, `friction` or `periodic` for x, y and the floor: what the kernels are compiled for."""
         return tuple(v if isinstance(v, str) else "friction" for v in (self.x, self.y, self.floor))
 
@@ -260,7 +260,7 @@ class Bed(Settings):
                 f"bed.headroom is {self.headroom} m and bed.spacing {self.spacing} m: the grid would have {nodes:.3g} "
                 f"nodes; at most {MOST_NODES:g} are allowed: {key}"
             )
-        for name, kind, length in zip("xy", self.walls.kinds, self.size, strict=False):
+        for name, kind, length in zip("xy", self.walls.conditions, self.size, strict=False):
             if kind == "periodic" and abs(length / self.spacing - round(length / self.spacing)) > 1e-6:
                 raise SceneError(
                     f"bed.walls.{name} is periodic but the bin's {length} m are {length / self.spacing:.3f} grid "

@@ -36,8 +36,8 @@ class Scene(Settings):
     bilateral: ClassVar[bool] = False
     """Whether soil in contact with the body is held, too (contact.py); a kind of scene may make it a key."""
 
-    name: str = setting("bed", "of the scene")
-    kind: str = setting("bed", "of scene")
+    name: str = setting("bed", "what reports call the scene")
+    kind: str = setting("bed", "of scene: what moves, or how the soil starts")
     bed: Bed = setting(Bed, "the soil bin and how it is filled")
     material: Material = setting(Material, "the soil")
     gravity: float = setting(9.81, "downwards", "m/s^2", ge=0, le=1e5)
@@ -170,7 +170,7 @@ class Scene(Settings):
         """Times at which a prescribed path may turn [s], increasing, shape (k,); none for a smooth motion."""
         return np.zeros(0)
 
-    def travel(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def displacement(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What the body's centre travels [m] and by what angle the body turns [rad] from each of the increasing times
         (T,) [s] to the next, both of shape (T - 1,).
 
@@ -185,10 +185,10 @@ class Scene(Settings):
         first = np.searchsorted(every, time[:-1])
         return np.add.reduceat(way, first), np.add.reduceat(angle, first)
 
-    def ways(self, time: np.ndarray) -> np.ndarray:
+    def largest_displacement(self, time: np.ndarray) -> np.ndarray:
         """The most that any point of the body travels from each of the increasing times (T,) [s] to the next [m],
         shape (T - 1,)."""
-        way, angle = self.travel(time)
+        way, angle = self.displacement(time)
         return way + self.body.reach * angle
 
     def body_points(self) -> np.ndarray:
@@ -261,7 +261,7 @@ class Scene(Settings):
         """The part of the body that is below the surface must stay within the bin."""
         lx, ly, lz = self.bed.size
         # Nothing is in the way of a body at the sides of a channel, whose walls stand for more of the same soil.
-        side = math.inf if self.bed.walls.kinds[1] in ("slip", "periodic") else 0.0
+        side = math.inf if self.bed.walls.conditions[1] in ("slip", "periodic") else 0.0
         outline = self.body.outline()
         rows, times = self.path_times(), self.times()
         times = np.union1d(times, rows[(rows > 0.0) & (rows < times[-1])])

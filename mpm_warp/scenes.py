@@ -310,7 +310,7 @@ class Wheel(Scene):
         poses[:, 3:] = np.array([about_y(angle) for angle in self.angular_speed * driven])
         return poses
 
-    def travel(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def displacement(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # From the speeds: poses do not show a whole turn.
         driven = np.diff(np.maximum(time - self.settle, 0.0))
         return abs(self.speed) * driven, self.angular_speed * driven

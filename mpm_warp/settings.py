@@ -187,8 +187,8 @@ def _fields_of(cls: type) -> dict[str, _Field]:
         # A class that changes only a default has the setting of its base.
         bases = (base.__dict__.get("__dataclass_fields__", {}).get(one.name) for base in cls.__mro__)
         known = next((f.metadata["setting"] for f in bases if f and "setting" in f.metadata), Setting(""))
-        if get_origin(hint) is Literal:
-            known = replace(known, choices=get_args(hint))
+        choices = [get_args(part) for part in (hint, *get_args(hint)) if get_origin(part) is Literal]
+        known = replace(known, choices=sum(choices, ()))
         group = any(map(is_dataclass, (hint, *get_args(hint))))
         adapter = None if group else TypeAdapter(_limited(hint, known), config=_CONFIG)
         found[one.name] = _Field(known, hint, adapter)

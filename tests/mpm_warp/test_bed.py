@@ -137,7 +137,7 @@ def test_a_period_is_a_whole_number_of_cells():
 def test_walls_survive_plain_data():
     scene = cut(bed=Bed(size=(0.48, 0.4, 0.16), spacing=0.02, walls=Walls("slip", 0.3, 0.5)))
     assert Scene.from_dict(scene.to_dict()) == scene
-    assert scene.bed.walls.kinds == ("slip", "friction", "friction")
+    assert scene.bed.walls.conditions == ("slip", "friction", "friction")
 
 
 def test_no_two_kinds_of_walls_share_a_kernel():
