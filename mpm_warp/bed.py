@@ -76,73 +76,67 @@ def arrange(
     Returns:
         Positions [m], shape (n, 3), float64, read-only, and the volume of one particle [m^3].
     """
-    points, volume = _arranged(kind, size, spacing, seed, mirrored)
+    if kind not in get_args(Arrangement):
+        raise SceneError(f"bed.arrangement is {kind!r}; allowed: {', '.join(get_args(Arrangement))}")
+    volume = particle_volume(kind, size, spacing)
+    if kind == "poisson":
+        points = _random_points(size, POISSON_RADIUS * spacing, seed, mirrored)
+    else:
+        counts = _lattice_counts(size, spacing)
+        axes = [(np.arange(c) + 0.5) * s for c, s in zip(counts, np.asarray(size) / counts, strict=True)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        points[:, 2] -= size[2]
+        if kind == "jittered":
+            points = points + _jitter(np.asarray(size), counts, seed, mirrored)
     points.flags.writeable = False
     return points, volume
 
 
-def _arranged(
-    kind: str, size: tuple[float, float, float], spacing: float, seed: int, mirrored: bool
-) -> tuple[np.ndarray, float]:
-    if kind == "lattice":
-        return lattice(size, spacing)
-    if kind == "jittered":
-        points, volume = lattice(size, spacing)
-        rng = np.random.default_rng(seed)
-        counts = rows_of(size, spacing)
-        moved = (np.asarray(size) / counts * rng.uniform(-0.5, 0.5, points.shape)).reshape(*counts, 3)
-        if mirrored:
-            # The far half of the rows moves as the near one does, mirrored; a row in the middle stays in the plane.
-            image = moved[:, ::-1] * [1.0, -1.0, 1.0]
-            far = np.arange(counts[1]) >= (counts[1] + 1) // 2
-            moved[:, far] = image[:, far]
-            if counts[1] % 2:
-                moved[:, counts[1] // 2, :, 1] = 0.0
-        points = points + moved.reshape(-1, 3)
-        return points, volume
-    if kind == "poisson":
-        # Sampled on a larger box and trimmed: points crowd at the edge of the box they were sampled in.
-        radius = POISSON_RADIUS * spacing
-        margin = 2.0 * radius
-        if mirrored:
-            # Points that would be too close to their own image go onto the plane.
-            lx, ly, lz = size
-            points = poisson_disk(
-                (lx + 2.0 * margin, 0.5 * ly + margin, lz + 2.0 * margin), radius, seed, snap=0.5 * radius
-            )
-            points += [-margin, 0.5 * ly, margin]
-            off_plane = points[points[:, 1] > 0.5 * ly]
-            points = np.concatenate([points, off_plane * [1.0, -1.0, 1.0] + [0.0, ly, 0.0]])
-            points = points[_reading_order(points, radius)]
-            inside = (points >= [0.0, 0.0, -lz]) & (points <= [lx, ly, 0.0])
-            return points[inside.all(axis=1)], spacing**3
-        points = poisson_disk(tuple(s + 2.0 * margin for s in size), radius, seed)
-        points += [-margin, -margin, margin]
-        inside = (points >= [0.0, 0.0, -size[2]]) & (points <= [size[0], size[1], 0.0])
-        return points[inside.all(axis=1)], spacing**3
-    raise SceneError(f"bed.arrangement is {kind!r}; allowed: {', '.join(get_args(Arrangement))}")
+def particle_volume(kind: str, size: tuple[float, float, float], spacing: float) -> float:
+    """The volume that `arrange` gives with the particles [m^3], without making these."""
+    return (
+        spacing**3 if kind == "poisson" else float(np.prod(np.asarray(size) / _lattice_counts(size, spacing)))
+    )
 
 
-def rows_of(size: tuple[float, float, float], spacing: float) -> np.ndarray:
-    """Particles of a lattice along each side, shape (3,)."""
+def _lattice_counts(size: tuple[float, float, float], spacing: float) -> np.ndarray:
+    """Particles of a lattice along each side, whose spacing is adjusted to fit it, shape (3,)."""
     return np.maximum(1, np.round(np.asarray(size) / spacing)).astype(int)
 
 
-def particle_volume(kind: str, size: tuple[float, float, float], spacing: float) -> float:
-    """The volume that `arrange` gives with the particles [m^3], without making these."""
-    if kind == "poisson":
-        return spacing**3
-    return float(np.prod(np.asarray(size) / rows_of(size, spacing)))
+def _jitter(size: np.ndarray, counts: np.ndarray, seed: int, mirrored: bool) -> np.ndarray:
+    """By what the particles of a lattice move [m], shape (n, 3)."""
+    random = np.random.default_rng(seed).uniform(-0.5, 0.5, (np.prod(counts), 3))
+    moved = (size / counts * random).reshape(*counts, 3)
+    if mirrored:
+        # The far half moves as the near one does, mirrored; particles in the middle stay in the plane.
+        image = moved[:, ::-1] * [1.0, -1.0, 1.0]
+        far = np.arange(counts[1]) >= (counts[1] + 1) // 2
+        moved[:, far] = image[:, far]
+        if counts[1] % 2:
+            moved[:, counts[1] // 2, :, 1] = 0.0
+    return moved.reshape(-1, 3)
 
 
-def lattice(size: tuple[float, float, float], spacing: float) -> tuple[np.ndarray, float]:
-    """A regular lattice that fills the bed exactly; the spacing is adjusted to fit each side."""
-    counts = rows_of(size, spacing)
-    step = np.asarray(size) / counts
-    axes = [(np.arange(c) + 0.5) * s for c, s in zip(counts, step, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    grid[:, 2] -= size[2]
-    return grid, float(np.prod(step))
+def _random_points(size: tuple[float, float, float], radius: float, seed: int, mirrored: bool) -> np.ndarray:
+    """Points of a bed that keep `radius` apart [m], shape (n, 3).
+
+    Sampled in a larger box and trimmed: points crowd at the edge of the box they were sampled in.
+    """
+    lx, ly, lz = size
+    margin = 2.0 * radius
+    if mirrored:
+        # Points that would be too close to their own image go onto the plane.
+        half = (lx + 2.0 * margin, 0.5 * ly + margin, lz + 2.0 * margin)
+        points = poisson_disk(half, radius, seed, snap=0.5 * radius)
+        points += [-margin, 0.5 * ly, margin]
+        off_plane = points[points[:, 1] > 0.5 * ly]
+        points = np.concatenate([points, off_plane * [1.0, -1.0, 1.0] + [0.0, ly, 0.0]])
+        points = points[_reading_order(points, radius)]
+    else:
+        points = poisson_disk(tuple(s + 2.0 * margin for s in size), radius, seed)
+        points += [-margin, -margin, margin]
+    return points[((points >= [0.0, 0.0, -lz]) & (points <= [lx, ly, 0.0])).all(axis=1)]
 
 
 def poisson_disk(
@@ -298,22 +292,6 @@ class Bed(Settings):
     @property
     def _arranged(self) -> tuple[np.ndarray, float]:
         return arrange(self.arrangement, self.size, self.particle_spacing, self.seed, self.mirrored)
-
-    @cached_property
-    def stored(self) -> np.ndarray:
-        """Indices of the particles of a full bed that are recorded; see `stored_of`."""
-        return self.stored_of(len(self.filled[0]))
-
-    def stored_of(self, count: int) -> np.ndarray:
-        """Indices of those of `count` particles that are recorded, increasing: one of every `store_every` that follow
-        each other.
-
-        Which one is drawn at random, always the same way: at fixed steps a lattice would be recorded in some of
-        its layers only.
-        """
-        first = np.arange(0, count, self.store_every)
-        left = np.minimum(self.store_every, count - first)
-        return first + np.random.default_rng(0).integers(left)
 
     @property
     def arrangement_hash(self) -> str:

@@ -119,8 +119,14 @@ class Scene(Settings):
 
     @property
     def stored(self) -> np.ndarray:
-        """Indices of the particles that are recorded; see `Bed.stored_of`."""
-        return self.bed.stored_of(len(self.filled[0]))
+        """Indices of the particles that are recorded, increasing: one of every `bed.store_every` in a row.
+
+        Which one is drawn at random, always the same way: at fixed steps a lattice would be recorded in some of
+        its layers only.
+        """
+        count, every = len(self.filled[0]), self.bed.store_every
+        first = np.arange(0, count, every)
+        return first + np.random.default_rng(0).integers(np.minimum(every, count - first))
 
     @property
     def soil_volume(self) -> float:

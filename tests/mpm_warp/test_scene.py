@@ -61,12 +61,12 @@ def test_arrangement_hash_names_the_start():
 
 
 def test_recorded_particles_are_one_of_every_few():
-    bed = Bed(spacing=0.02)
-    assert (bed.stored == np.arange(len(bed.filled[0]))).all()
-    thinned = Bed(spacing=0.02, store_every=8)
-    count = len(thinned.filled[0])
+    whole = Scene(bed=Bed(spacing=0.02))
+    count = len(whole.filled[0])
+    assert (whole.stored == np.arange(count)).all()
+    thinned, again = (Scene(bed=Bed(spacing=0.02, store_every=8)) for _ in range(2))
     assert (thinned.stored // 8 == np.arange(-(-count // 8))).all()
-    assert (Bed(spacing=0.02, store_every=8).stored == thinned.stored).all()
+    assert (again.stored == thinned.stored).all()
     # The bed is 8 layers deep: a fixed step of 8 would leave a single layer.
     depth = thinned.filled[0][thinned.stored, 2]
     share = np.unique(np.round(depth, 6), return_counts=True)[1] / len(depth)

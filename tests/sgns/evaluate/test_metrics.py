@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from mpm_warp import Bed
+from mpm_warp import Bed, Scene
 from sgns.config import UserError
 from sgns.data import run as chunks
 from sgns.evaluate.metrics import (
@@ -91,7 +91,7 @@ def test_surface_error_of_a_thinned_bed_is_that_of_the_bed(arrangement):
         )  # a column without particles makes it NaN
 
     full = bed.filled[0]
-    thinned = full[bed.stored]
+    thinned = full[Scene(bed=bed).stored]
     assert error(thinned) == pytest.approx(error(full), rel=0.05)
     assert particle_spacing(thinned) == pytest.approx(5 ** (1 / 3) * particle_spacing(full), rel=0.05)
 
