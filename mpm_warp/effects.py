@@ -8,25 +8,6 @@ from typing import ClassVar
 from .settings import Settings, setting, settings
 from .state import SceneError
 
-_REASONS = {
-    "yielding": ("soil flows when shear exceeds friction", "purely elastic soil was asked for"),
-    "rate_dependence": (
-        "friction rises with the inertial number, mu(I)",
-        "friction is the constant mu_s (Drucker-Prager)",
-    ),
-    "fluidity": (
-        "the fluidity follows its own dynamics with the time t_0",
-        "the fluidity takes its steady value at once",
-    ),
-    "nonlocality": (
-        "flow spreads over a few grain diameters",
-        "flow depends on the stress at the same place only",
-    ),
-    "separation": ("soil below its critical density carries no stress", "soil may carry tension"),
-    "symmetry": ("half the bed is computed and mirrored", "the whole bed is computed"),
-    "torque": ("the torque on the body is recorded", "no torque is recorded"),
-}
-
 
 @settings
 class Effects(Settings):
@@ -34,18 +15,30 @@ class Effects(Settings):
 
     group: ClassVar[str] = "effects"
 
-    yielding: bool = setting(True, "frictional yield; off: elastic soil")
-    rate_dependence: bool = setting(True, "mu(I); off: a constant mu_s; needs yielding")
-    fluidity: bool = setting(False, "the fluidity has its own dynamics; needs rate_dependence")
-    nonlocality: bool = setting(
-        False, "cooperative flow, the Laplacian of the fluidity; needs rate_dependence"
+    # The help says why a run has an effect, the note why it does not, in run files too.
+    yielding: bool = setting(
+        True, "soil flows when shear exceeds friction", note="purely elastic soil was asked for"
     )
-    separation: bool = setting(True, "no stress below the critical density; off: soil can carry tension")
-    symmetry: bool = setting(
+    rate_dependence: bool = setting(
+        True,
+        "friction rises with the inertial number, mu(I)",
+        note="friction is the constant mu_s (Drucker-Prager)",
+    )
+    fluidity: bool = setting(
         False,
-        "half the bed is computed and mirrored; needs a scene that is mirror symmetric about y = Ly / 2",
+        "the fluidity follows its own dynamics with the time t_0",
+        note="the fluidity takes its steady value at once",
     )
-    torque: bool = setting(True, "the torque on a body is added up; off: it is recorded as 0")
+    nonlocality: bool = setting(
+        False,
+        "flow spreads over a few grain diameters",
+        note="flow depends on the stress at the same place only",
+    )
+    separation: bool = setting(
+        True, "soil below its critical density carries no stress", note="soil may carry tension"
+    )
+    symmetry: bool = setting(False, "half the bed is computed and mirrored", note="the whole bed is computed")
+    torque: bool = setting(True, "the torque on the body is recorded", note="no torque is recorded")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,10 +56,8 @@ class Effects(Settings):
 
     def described(self) -> dict[str, dict[str, bool | str]]:
         """Each effect with its state and the reason, as stored in a run file."""
+        known = {f.name: (getattr(self, f.name), f.metadata["setting"]) for f in fields(self)}
         return {
-            f.name: {
-                "on": getattr(self, f.name),
-                "reason": _REASONS[f.name][0 if getattr(self, f.name) else 1],
-            }
-            for f in fields(self)
+            name: {"on": on, "reason": effect.help if on else effect.note}
+            for name, (on, effect) in known.items()
         }

@@ -44,21 +44,14 @@ class Material(Settings):
 
     group: ClassVar[str] = "material"
 
-    youngs_modulus: float = setting(
-        1.0e6, "Young's modulus E; the cost of a run grows with its square root", "Pa", ge=1e-9, le=1e12
-    )
+    youngs_modulus: float = setting(1.0e6, "E; the cost grows with its square root", "Pa", ge=1e-9, le=1e12)
     poissons_ratio: float = setting(
         0.3, "nu", ge=0, le=0.499, note=": soil that keeps its volume has infinitely fast waves"
     )
     grain_density: float = _positive(2583.0, "density of the grains' material", "kg/m^3")
     packing: float = setting(0.67, "solid volume fraction at the critical density", ge=0.05, le=1)
     grain_diameter: float = _positive(3.0e-4, "d", "m")
-    static_friction: float = setting(
-        0.76,
-        "mu_s: ratio of shear stress to pressure below which the soil does not flow; follows from friction_angle "
-        "where that is given",
-        gt=0,
-    )
+    static_friction: float = setting(0.76, "mu_s, where flow begins; friction_angle goes before it", gt=0)
     limit_friction: float = setting(0.9616, "mu_2: the ratio approached in very fast flow")
     reference_inertial_number: float = _positive(0.278, "I_0 of the rate law")
     rate_law: Literal["saturating", "linear"] = setting(
@@ -75,12 +68,8 @@ class Material(Settings):
     friction_map: Literal["sin", "tan", "triaxial"] = setting(
         "tan", "mu_s of the angle: tan (simple shear), sin (plane strain) or triaxial (compression)"
     )
-    nonlocal_amplitude: float = setting(
-        0.48, "A: reach of cooperative flow in grain diameters; for the effect nonlocality", ge=0
-    )
-    fluidity_time: float = _positive(
-        2.0e-4, "t_0 of the fluidity's own dynamics; for the effect fluidity", "s"
-    )
+    nonlocal_amplitude: float = setting(0.48, "A: reach of cooperative flow in grain diameters", ge=0)
+    fluidity_time: float = _positive(2.0e-4, "t_0 of the fluidity's own dynamics", "s")
     fluidity_at_walls: Literal["zero", "free"] = setting(
         "zero",
         "zero: no flow at rough floor and walls; free: no gradient across them; for the effect nonlocality",

@@ -41,17 +41,11 @@ class Scene(Settings):
     bed: Bed = setting(Bed, "the soil bin and how it is filled")
     material: Material = setting(Material, "the soil")
     gravity: float = setting(9.81, "downwards", "m/s^2", ge=0, le=1e5)
-    tilt: float = setting(
-        0.0, "the bin's slope, falling towards +x: gravity is turned about y", "degrees", gt=-90, lt=90
-    )
+    tilt: float = setting(0.0, "the bin's slope, falling towards +x", "degrees", gt=-90, lt=90)
     duration: float = setting(5.3333333333, "one frame or more", "s", le=1e6)
     frame_rate: float = setting(60.0, "recorded frames per second", "Hz", ge=1e-3, le=1e6)
     contact_margin: float = setting(
-        -0.25,
-        "where the body begins to act on soil, from its surface outwards (contact.py)",
-        "grid spacings",
-        ge=-1,
-        le=1,
+        -0.25, "where contact begins, from the body's surface outwards", "grid spacings", ge=-1, le=1
     )
     courant: float = setting(
         0.6,
@@ -60,15 +54,8 @@ class Scene(Settings):
         le=MOST_COURANT,
         note=": with longer steps elastic waves in the soil grow",
     )
-    elastic_damping: float = setting(
-        0.1,
-        "damping ratio of elastic waves as short as the grid can carry; longer ones are damped less",
-        ge=0,
-        le=1,
-    )
-    volume_averaging: float = setting(
-        1.0, "share of a particle's own volume change that the mean around it replaces", ge=0, le=1
-    )
+    elastic_damping: float = setting(0.1, "damping ratio of the grid's shortest elastic waves", ge=0, le=1)
+    volume_averaging: float = setting(1.0, "share of volume changes that a local mean replaces", ge=0, le=1)
     remap_time: float = setting(
         4.0e-3,
         "longest time between two remaps of the velocities (solver.py)",
@@ -76,12 +63,8 @@ class Scene(Settings):
         ge=0,
         words=" s; it must be 0 (every step) or more",
     )
-    remap_distance: float = setting(
-        0.1, "longest way of soil between two remaps", "grid spacings", gt=0, le=0.5
-    )
-    velocity_memory: float = setting(
-        0.1, "time after which 63 % of the velocities that the grid does not resolve are gone", "s", gt=0
-    )
+    remap_distance: float = setting(0.1, "soil's way between two remaps", "grid spacings", gt=0, le=0.5)
+    velocity_memory: float = setting(0.1, "time in which velocities below the grid fade to 37 %", "s", gt=0)
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()

@@ -13,14 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .bed import Bed, Walls
-from .bodies import (
-    Axle,
-    Box,
-    Cylinder,
-    MeshBody,
-    Plate,
-    Tool,
-)
+from .bodies import Axle, Box, Cylinder, MeshBody, Plate, Tool
 from .material import Material
 from .poses import about_y, rotate, sampled_poses
 from .scene import Scene
@@ -68,6 +61,7 @@ def ramp(time: np.ndarray, depth: float, speed: float) -> np.ndarray:
 
 # --- A plate cuts through a bed -------------------------------------------------------------------------
 
+_PATH = "rows t [s], x, y, z [m], qx, qy, qz, qw of the body's centre of mass"
 _SHARE = ", a share of the bin's length"
 
 
@@ -84,12 +78,8 @@ class Excavation(Scene):
     rake: float = setting(10.0, "angle of the plate from vertical, tip leading", "degrees", ge=-60, le=60)
     motion: Literal["curved", "ramp", "rest", "path"] = setting("curved", "of the tip")
     start: float = setting(0.10, "where the tip starts" + _SHARE, ge=0, le=1, note=_SHARE)
-    clearance: float = setting(
-        0.00665, "height of the tip above the surface at the start; the cut is this much shallower", "m"
-    )
-    path: tuple[Any, ...] | None = setting(
-        None, "for motion=path: rows t [s], x, y, z [m], qx, qy, qz, qw of the plate's centre of mass"
-    )
+    clearance: float = setting(0.00665, "height of the tip above the surface at the start", "m")
+    path: tuple[Any, ...] | None = setting(None, "for motion=path: " + _PATH)
     body_grid: tuple[int, int] = setting(
         (3, 5),
         "rows and columns of body nodes on the front face",
@@ -162,9 +152,7 @@ class Body(Scene):
     kind: str = "body"
     duration: float = 2.0
     tool: Box | Cylinder | MeshBody = setting(Box, "the body")
-    path: tuple[Any, ...] | None = setting(
-        None, "rows t [s], x, y, z [m], qx, qy, qz, qw of the body's centre of mass"
-    )
+    path: tuple[Any, ...] | None = setting(None, _PATH)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -241,18 +229,12 @@ class Wheel(Scene):
         0.2, "1 - forward speed / rim speed", ge=-1, le=1, note=" (0: rolls freely, 1: turns on the spot)"
     )
     rim_speed: float = _positive(0.0195, "angular speed times half the diameter", "m/s")
-    friction_angle: float | None = setting(
-        37.0, "in place of material.friction_angle; None: the material's own", "degrees"
-    )
+    friction_angle: float | None = setting(37.0, "of the soil; None: material.friction_angle", "degrees")
     settle: float = setting(1.0, "time at rest under the load before driving; recorded like the rest", "s")
     damping: float = setting(5.0, "force against the vertical velocity per mass of the wheel", "1/s", ge=0)
-    bilateral: bool = setting(
-        False, "soil in contact may not leave the wheel along its normal (bilateral contact)"
-    )
+    bilateral: bool = setting(False, "soil in contact may not leave the wheel along its normal")
     start: float = setting(0.30, "where the axle starts" + _SHARE, ge=0, le=1, note=_SHARE)
-    clearance: float = setting(
-        0.0, "height of the wheel's lowest point above the undisturbed surface at the start", "m"
-    )
+    clearance: float = setting(0.0, "of the wheel's lowest point above the surface at the start", "m")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -372,9 +354,7 @@ class Column(Scene):
         "the floor around the column; Lz is the column's height",
     )
     duration: float = 1.0
-    shape: Literal["cylinder", "slab"] = setting(
-        "cylinder", "cylinder, or slab: all of the bin's width, for a channel"
-    )
+    shape: Literal["cylinder", "slab"] = setting("cylinder", "slab: as wide as the bin, for a channel")
     radius: float = setting(0.08, "of the cylinder, or half the slab's length along x", "m")
 
     def __post_init__(self) -> None:
