@@ -215,7 +215,6 @@ class Wheel(Scene):
             size=(0.40, 0.19, 0.06), spacing=0.01, particles_per_cell=4.0, headroom=0.10
         )
     )
-    gravity: float = setting(9.81, "downwards; gives the wheel its mass", "m/s^2", gt=0, le=1e5)
     contact_margin: float = 0.0
     duration: float = 6.3333333333
     load: float = _positive(100.0, "weight that the wheel carries, its own included", "N")
@@ -238,6 +237,8 @@ class Wheel(Scene):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.gravity > 0:
+            raise SceneError(f"scene.gravity is {self.gravity} m/s^2; a wheel needs more than 0")
         if not LEAST_MASS <= self.load / self.gravity <= MOST_MASS:
             raise SceneError(
                 f"scene.load is {self.load} N at scene.gravity {self.gravity} m/s^2: a wheel of "

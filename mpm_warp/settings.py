@@ -216,7 +216,7 @@ def _checked(cls: type, name: str, value: Any, place: str = "") -> Any:
         value = value.tolist()
     if kind is int and isinstance(value, float) and value.is_integer():
         value = int(value)
-    elif type(value) is int and kind in (float, float | None):
+    elif type(value) is int and float in (kind, *get_args(kind)) and get_origin(kind) is not tuple:
         value = float(value)
     try:
         return adapter.validate_python(value)
@@ -230,6 +230,8 @@ def _checked(cls: type, name: str, value: Any, place: str = "") -> Any:
     ):
         index = "" if problem["type"] == "missing" else "".join(f"[{i}]" for i in problem["loc"])
         raise SceneError(f"{place or own}{index} is {problem['input']!r}; {wrong_type}")
+    if isinstance(value, list):
+        value = tuple(float(v) if type(v) is int and float in get_args(kind) else v for v in value)
     raise SceneError(f"{own} is {value!r}{known.refusal}")
 
 
