@@ -200,7 +200,7 @@ class RigidBody:
 
     def _require_steady(self, frame: int, times: np.ndarray, position: np.ndarray) -> None:
         """A body that is somewhere else in the next substep does not push soil: it appears in its midst."""
-        way, angle = self.scene.travel(times)
+        way, angle = self.scene.displacement(times)
         farthest, most = way + self.scene.body.reach * angle, LONGEST_WAY * self.scene.bed.spacing
         far = ~(farthest <= most)
         if not far.any():

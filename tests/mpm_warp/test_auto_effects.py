@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from beds import cut
+from beds import UNDAMPED, cut
 from test_nonlocal_solver import compiled_source, launches
 
 from mpm_warp import (
@@ -38,7 +38,11 @@ BEADS = Material(
 )
 SLOPE = Bed(size=(0.006, 0.006, 0.03), spacing=0.0015, headroom=0.006, walls=Walls("periodic", "periodic"))
 WHEEL = Wheel(
-    bed=Bed(size=(0.4, 0.2, 0.08), spacing=0.02, headroom=0.1), duration=0.3, settle=0.1, rim_speed=0.06
+    bed=Bed(size=(0.4, 0.2, 0.08), spacing=0.02, headroom=0.1),
+    duration=0.3,
+    settle=0.1,
+    rim_speed=0.06,
+    **UNDAMPED,
 )
 COLUMN = Column(bed=Bed(size=(0.3, 0.3, 0.06), spacing=0.015, headroom=0.03), radius=0.06, duration=0.3)
 FINE_COLUMN = replace(COLUMN, material=replace(COLUMN.material, grain_diameter=2e-4))

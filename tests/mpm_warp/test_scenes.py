@@ -8,15 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from beds import BlockBed, block, cut
+from beds import UNDAMPED, BlockBed, block, cut
 from scipy.spatial.transform import Rotation
 from test_solver import momenta
 
 from mpm_warp import (
     Bed,
+    Body,
     Box,
     Material,
-    Push,
     Scene,
     SceneError,
     Solver,
@@ -100,10 +100,10 @@ def test_quaternions_agree_with_scipy():
     np.testing.assert_allclose(rotate(half, v), turned, atol=1e-9)
 
 
-def turning(*rows: tuple[float, float], **kw) -> Push:
+def turning(*rows: tuple[float, float], **kw) -> Body:
     """A box in the bed of `cut`, turned about its middle by angles [degrees] at times [s]."""
     path = tuple((t, 0.24, 0.2, 0.02, *about_y(math.radians(angle))) for t, angle in rows)
-    return Push(bed=cut().bed, tool=Box(size=(0.1, 0.1, 0.06)), path=path, **({"duration": 0.1} | kw))
+    return Body(bed=cut().bed, tool=Box(size=(0.1, 0.1, 0.06)), path=path, **({"duration": 0.1} | kw))
 
 
 def test_the_fastest_point_counts():
@@ -165,10 +165,10 @@ def test_a_body_that_comes_back_within_a_substep_stops_the_solver():
 
 def test_a_wheel_that_turns_too_fast_stops_the_solver():
     """On the spot, so fast that no step is short enough; a wheel's poses show no whole turns."""
-    wheel = Wheel(bed=cut().bed, duration=0.05, settle=0.0, slip=1.0, rim_speed=3000.0)
+    wheel = Wheel(bed=cut().bed, duration=0.05, settle=0.0, slip=1.0, rim_speed=3000.0, **UNDAMPED)
     with pytest.raises(SolverStopped, match=r"the body jumps by 0 m .* half a grid spacing"):
         list(Solver(wheel).frames())
-    slow = Wheel(bed=cut().bed)
+    slow = Wheel(bed=cut().bed, **UNDAMPED)
     assert top_body_speed(slow) == pytest.approx(slow.speed + slow.angular_speed * slow.body.reach)
 
 
@@ -191,6 +191,7 @@ def wheel(**kw) -> Wheel:
         "bed": Bed(size=(0.30, 0.16, 0.08), spacing=0.02, particles_per_cell=2.5, headroom=0.1),
         "diameter": 0.12,
         "load": 60.0,
+        "friction_angle": None,
         "damping": 20.0,
         "rim_speed": 0.1,
         "settle": 0.4,

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from beds import block, cut
+from beds import UNDAMPED, block, cut
 
 from mpm_warp import Bed, Effects, Incline, Material, SceneError, Solver, SolverStopped, State, Walls, Wheel
 from mpm_warp.batch import all_together
@@ -16,7 +16,7 @@ from mpm_warp.limits import Guard
 
 def wheel() -> Wheel:
     bed = Bed(size=(0.4, 0.24, 0.08), spacing=0.02, headroom=0.1)
-    return Wheel(bed=bed, duration=0.1, settle=0.05, load=20.0)
+    return Wheel(bed=bed, duration=0.1, settle=0.05, load=20.0, **UNDAMPED)
 
 
 def slope(**kw) -> Incline:

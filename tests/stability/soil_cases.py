@@ -10,7 +10,7 @@ from beds import BlockBed, block, cut
 from case import Case
 from measures import energies, frames_of, shares, stopped_with, top_speed, volume_gain, work_on_soil
 
-from mpm_warp import Bed, Box, Column, Effects, Excavation, Incline, Push, Scene, Solver, Walls
+from mpm_warp import Bed, Box, Column, Effects, Excavation, Incline, Material, Push, Scene, Solver, Walls
 from mpm_warp.diagnostics import leakage
 
 
@@ -281,7 +281,7 @@ def steep_slope() -> tuple[float, str]:
     Its base cannot hold it: friction there is at most mu_2, at least mu_s.
     """
     bed = Bed(size=(0.08, 0.08, 0.08), spacing=0.02, headroom=0.08, walls=Walls("periodic", "periodic"))
-    scene = Incline(bed=bed, flowing=False, tilt=60.0, duration=0.5, gravity=9.81)
+    scene = Incline(bed=bed, material=Material(), flowing=False, tilt=60.0, duration=0.5, gravity=9.81)
     last = frames_of(scene, every=10**6)[-1]
     speed = float(last.velocity[:, 0].mean())
     low, high = (

@@ -31,6 +31,7 @@ from mpm_warp.poses import in_body_frame
 from sgns.clock import elapsed
 from sgns.config import UserError, differences, flattened
 from sgns.data.files import only_here, require_replaceable, write_whole
+from sgns.evaluate.metrics import is_wheel
 from sgns.model.checkpoint import (
     SUMMARY,
     Surrogate,
@@ -301,7 +302,7 @@ def prepared(
 
 def moves_freely(runs: Sequence[ReducedRun]) -> bool:
     """Whether the body moves as the soil lets it, which only a wheel's axle does; refuses a mixture."""
-    free = {run.scene.get("kind") == "wheel" for run in runs}
+    free = {is_wheel(run.scene) for run in runs}
     if len(free) > 1:
         raise UserError(
             "the training runs mix wheels, whose height is predicted, with bodies whose motion is prescribed; keep one "
