@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mpm_warp.poses import rotation_matrices, rotation_vectors
+from mpm_warp.poses import fitted_rotations, rotation_matrices, rotation_vectors
 from sgns.config import UserError
 
 if TYPE_CHECKING:
@@ -201,14 +201,8 @@ def nearest_rigid(reference: Tensor, points: Tensor) -> Tensor:
         Shape (..., M, 3); not finite where the points are not.
     """
     here, there = reference.mean(-2, keepdim=True), points.mean(-2, keepdim=True)
-    product = (reference - here).transpose(-1, -2) @ (points - there)
-    # The decomposition fails where one of many is not finite; there `there` is not finite either, and what comes out.
-    sound = product.isfinite().flatten(-2).all(-1)[..., None, None]
-    u, _, vh = torch.linalg.svd(torch.where(sound, product, 0.0))
-    # A reflection is no motion: turn the direction of least extent round.
-    flip = torch.ones_like(u[..., 0])
-    flip[..., 2] = torch.sign(torch.linalg.det(u @ vh))
-    return (reference - here) @ ((u * flip.unsqueeze(-2)) @ vh) + there
+    rotation = torch.from_numpy(fitted_rotations(reference.cpu().numpy(), points.cpu().numpy()))
+    return (reference - here) @ rotation.to(points.device).transpose(-1, -2) + there
 
 
 # --- Constants of a run that the tool's path does not show: gravity, load, the friction angle of the soil,
