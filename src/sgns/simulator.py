@@ -25,11 +25,11 @@ from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step
-from sgns.model.features import BodyTrack, Travel, body_track, context_of, markers, stepped_frames
+from sgns.model.features import BodyTrack, ToolMotion, body_track, context_of, markers, step_frames
 from sgns.model.training_range import Excess, TrainingRange
 from sgns.states import Rollout, Rollouts, State
 
-# Soil follows the clock for so long after the tool has moved at the pace of the training runs, then its travel [s].
+# Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
 _SETTLING = 0.5
 
 
@@ -44,8 +44,8 @@ class Simulator:
         surrogate: Network, basis and start.
         device: "cpu" or "cuda".
         num_modes: Of the soil, the first of those it was trained with; None: all.
-        rate_independent: Whether the soil follows the travel of a prescribed tool, not the clock, where the tool is
-            slower than in all training runs (see `sgns.model.features`).
+        rate_independent: Whether the soil follows a prescribed tool, not the clock, where the tool is slower than in
+            all training runs (see `sgns.model.features`).
 
     Attributes:
         start_positions: Of all particles at rest [m], shape (n, 3).
@@ -79,7 +79,7 @@ class Simulator:
         self._dynamics, self.basis = surrogate.dynamics, surrogate.basis
         if num_modes is not None:
             self._dynamics, self.basis = self._dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
-        self._follows_travel = rate_independent and not self._dynamics.predicts_body
+        self._rate_independent = rate_independent and not self._dynamics.predicts_body
         self._pace = surrogate.slowest_travel, math.ceil(_SETTLING * surrogate.frame_rate)
         # Copies: what a tensor shares with an array is freed when the tensor is sent to another process.
         self.start_positions = surrogate.start_positions.cpu().numpy().copy()
@@ -207,7 +207,7 @@ class Simulator:
         self._frame, self._points, self._numbers, self._stepper = 0, points, numbers, stepper
         self._poses, self._latent = poses, latent.clone()[None].to(self.device)
         self._load = np.zeros(3), np.zeros(3)
-        self._travel: Travel | None = None
+        self._motion: ToolMotion | None = None
         # The last two frames; what the network sees may be further apart.
         last = poses[-2:] or [np.full(7, np.nan)]
         self._shown = list(zip(last, latent[-len(last) :].numpy().copy(), strict=True))
@@ -230,13 +230,13 @@ class Simulator:
         poses, shown = self._poses, self._shown[-1]
         if not poses:
             poses, shown = [pose] * self.history, (pose, shown[1])
-        before = self._travel or Travel.along(self._markers(poses), *self._pace)
-        travel = before.moved(self._markers([pose])[0])
+        before = self._motion or ToolMotion.along(self._markers(poses), *self._pace)
+        motion = before.moved(self._markers([pose])[0])
         latent, load = self._latent, self._load
-        if travel.steps or not self._follows_travel:
+        if motion.steps or not self._rate_independent:
             pose, latent, load = self._step_soil(poses, pose)
             poses = [*poses[1:], pose]
-        self._poses, self._travel, self._latent, self._load = poses, travel, latent, load
+        self._poses, self._motion, self._latent, self._load = poses, motion, latent, load
         self._shown = [shown, (pose, latent[0, -1].cpu().numpy().copy())]
         self._frame += 1
         return self._state()
@@ -313,7 +313,8 @@ class Simulator:
         context = self._told(numbers)
         began = time.perf_counter()
         frames, newest = self._steps_of(poses, world, given)
-        track = self._track(pad_start(poses[frames], padding), pad_start(world[frames], padding))
+        shown = np.pad(frames, (padding, 0), mode="edge")  # before its first frame a path is at rest
+        track = self._track(poses[shown], world[shown])
         with torch.inference_mode():
             path = self._dynamics.unroll(latent[None].to(self.device), track, context)
             states, force, torque = (
@@ -378,9 +379,9 @@ class Simulator:
         # Side by side all take as many steps: those that are done rest.
         longest = max(len(frames) for frames, _ in steps)
         tracks = [
-            self._track(pad_start(path[shown], padding), pad_start(world[shown], padding))
+            self._track(path[shown], world[shown])
             for path, world, (frames, _) in zip(poses, worlds, steps, strict=True)
-            for shown in [np.pad(frames, (0, longest - len(frames)), mode="edge")]
+            for shown in [np.pad(frames, (padding, longest - len(frames)), mode="edge")]
         ]
         track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
         latent = self._start_latent.to(self.device).expand(len(poses), self.history, -1, -1)
@@ -399,9 +400,9 @@ class Simulator:
     def _steps_of(self, poses: np.ndarray, world: np.ndarray, given: int) -> tuple[np.ndarray, np.ndarray]:
         """Frames that the soil takes a step into, the given ones first, and for each frame of the path which of them
         is the newest; poses (T, 7) and body points (T, M, 3)."""
-        if not self._follows_travel:
+        if not self._rate_independent:
             return np.arange(len(poses)), np.arange(len(poses))
-        frames = stepped_frames(markers(poses, world), given, *self._pace)
+        frames = step_frames(markers(poses, world), given, *self._pace)
         return frames, np.searchsorted(frames, np.arange(len(poses)), side="right") - 1
 
     def _predicted_poses(self, poses: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -503,8 +504,3 @@ def excess_of(
     if known is None or not np.isfinite(poses).all():
         return None
     return known.excess(poses, in_world_frame(poses, points), latent, context)
-
-
-def pad_start(values: np.ndarray, count: int) -> np.ndarray:
-    """`count` copies of the first frame put before all frames."""
-    return np.concatenate([values[:1].repeat(count, 0), values])

@@ -1,4 +1,4 @@
-"""What the network is told: the graph, the body, the scene's constants, the tool's travel."""
+"""What the network is told: the graph, the body, the scene's constants, the steps under a slow tool."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ def nearest_rigid(reference: Tensor, points: Tensor) -> Tensor:
     return (reference - here) @ rotation.to(points.device).transpose(-1, -2) + there
 
 
-# --- Constants of a run that the tool's path does not show: gravity, load, the friction angle of the soil,
+# --- Constants of a run that the tool's path does not show: gravity, load, friction angle of the soil -----
 
 
 def varying_context(runs: Sequence[ReducedRun], candidates: Sequence[str]) -> list[str]:
@@ -243,11 +243,10 @@ def _value(scene: Mapping[str, Any], key: str) -> float | None:
     return float(found) if isinstance(found, Real) and not isinstance(found, bool) else None
 
 
-# --- Slow dry soil follows the way a tool travels, not the time that it takes ---------------------------
-# Dynamics learn from tools that move by so much per frame, and in every step they err a little: along a
-# path much slower
-# than that, or at rest, the errors of thousands of steps add up to soil that flows on its own. There the soil takes a
-# step only each time that the tool has travelled as far as the slowest trained one does in a frame.
+# --- Rate independence: slow dry soil follows the way a tool goes, not the time that it takes -----------
+# Dynamics learn from tools that move by so much per frame, and in every step they err a little: along a path much
+# slower than that, or at rest, the errors of thousands of steps add up to soil that flows on its own. There the soil
+# takes a step only each time that the tool has gone as far as the slowest trained one does in a frame.
 #
 # Shapes: T frames, M body points.
 
@@ -258,7 +257,7 @@ _STILL = 1e-9
 _STOPPING, _ROUNDING = 0.01, 0.01
 
 
-class Travel(NamedTuple):
+class ToolMotion(NamedTuple):
     """How a tool has moved, as far as the next step of the soil depends on it.
 
     Attributes:
@@ -278,36 +277,36 @@ class Travel(NamedTuple):
     steps: bool
 
     @classmethod
-    def along(cls, given: np.ndarray, least: float, settling: int) -> Travel:
+    def along(cls, given: np.ndarray, least: float, settling: int) -> ToolMotion:
         """In the last of some given frames of markers (any, M + 1, 3), before which it rested."""
-        travel = cls(max(least, _STILL), settling, given[0], given[0], settling, True)
+        motion = cls(max(least, _STILL), settling, given[0], given[0], settling, True)
         for here in given[1:]:
-            travel = travel.moved(here)
-        return travel._replace(stepped=given[-1], steps=True)
+            motion = motion.moved(here)
+        return motion._replace(stepped=given[-1], steps=True)
 
-    def moved(self, here: np.ndarray) -> Travel:
+    def moved(self, here: np.ndarray) -> ToolMotion:
         """One frame later."""
         slow = 0 if distance(here, self.here) >= self.least else self.slow + 1
         steps = slow < self.settling or bool(distance(here, self.stepped) >= self.least)
         return self._replace(here=here, stepped=here if steps else self.stepped, slow=slow, steps=steps)
 
 
-def stepped_frames(path: np.ndarray, given: int, least: float, settling: int) -> np.ndarray:
+def step_frames(path: np.ndarray, given: int, least: float, settling: int) -> np.ndarray:
     """Numbers of the frames of a path that the soil takes a step into, and before them of those that are given.
 
     Args:
         path: Markers [m], shape (T, M + 1, 3).
         given: Frames at the start that are given: 1 for a bed at rest, or d.
-        least: See `Travel`.
-        settling: See `Travel`.
+        least: See `ToolMotion`.
+        settling: See `ToolMotion`.
     """
-    travel = Travel.along(path[:given], least, settling)
-    if (distance(path[given:], path[given - 1 : -1]) >= travel.least).all():
+    motion = ToolMotion.along(path[:given], least, settling)
+    if (distance(path[given:], path[given - 1 : -1]) >= motion.least).all():
         return np.arange(len(path))  # as most paths; one by one it takes as long as the steps of many paths
     frames = list(range(given))
     for t in range(given, len(path)):
-        travel = travel.moved(path[t])
-        if travel.steps:
+        motion = motion.moved(path[t])
+        if motion.steps:
             frames.append(t)
     return np.array(frames)
 

@@ -7,7 +7,7 @@ definition. What `EncodeProcessDecode.forward` runs is the same function by exac
 - the first layer of the edge update is linear, so its receiver and sender blocks are applied to the V nodes and
   not to the E edges, and its edge block can be multiplied into the last layer of whatever made the edges;
 - the last layer of the edge update is linear, so it is applied to the V sums and not to the E edges;
-- a complete graph needs no index: senders and receivers are broadcast (`pairs`);
+- a complete graph needs no index: senders and receivers are broadcast (`adjacency`);
 - without gradients batches go through in blocks, so that memory is bounded and stays in the cache.
 
 A layer normalisation stands in the way of the second, and of the multiplication in the first; the rest holds.
@@ -15,27 +15,14 @@ A layer normalisation stands in the way of the second, and of the multiplication
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch_geometric.nn import MessagePassing
 
-from sgns.model.algebra import Pairs, affine, pairs_of
-
-# --- Encode, pass messages, decode: the graph network of the paper (section 3.3), batched over graphs of on
-# topology.
-#
-# Every part is written twice. `forward` of `MLP` and `InteractionNetwork` and `EncodeProcessDecode.plain` are the
-# definition. What `EncodeProcessDecode.forward` runs is the same function by exact algebra:
-#
-# - the first layer of the edge update is linear, so its receiver and sender blocks are applied to the V nodes and
-#   not to the E edges, and its edge block can be multiplied into the last layer of whatever made the edges;
-# - the last layer of the edge update is linear, so it is applied to the V sums and not to the E edges;
-# - a complete graph needs no index: senders and receivers are broadcast (`pairs`);
-# - without gradients batches go through in blocks, so that memory is bounded and stays in the cache.
-#
-# A layer normalisation stands in the way of the second, and of the multiplication in the first; the rest holds.
+from sgns.model.algebra import Adjacency, adjacency_of, affine
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "silu": nn.SiLU, "gelu": nn.GELU, "tanh": nn.Tanh}
 # Edges that go through the network at once on a CPU when nothing is kept for gradients.
@@ -150,9 +137,9 @@ class Unapplied(NamedTuple):
         """The output of the linear layer that follows, as one product."""
         return affine(self.hidden, weight @ self.weight, torch.addmv(bias, weight, self.bias))
 
-    def gathered(self, pairs: Pairs) -> Tensor:
+    def gathered(self, adjacency: Adjacency) -> Tensor:
         """Sum of the output at the receivers: the layer applied to the sum of its input."""
-        return nn.functional.linear(pairs.gather(self.hidden), self.weight) + pairs.degree * self.bias
+        return nn.functional.linear(adjacency.gather(self.hidden), self.weight) + adjacency.degree * self.bias
 
 
 def value_of(features: Tensor | Unapplied) -> Tensor:
@@ -215,7 +202,7 @@ class InteractionNetwork(MessagePassing):
         return edges
 
     def rearranged(
-        self, nodes: Tensor, edges: Tensor | Unapplied, pairs: Pairs
+        self, nodes: Tensor, edges: Tensor | Unapplied, adjacency: Adjacency
     ) -> tuple[Tensor, Tensor | Unapplied]:
         """The same by the algebra of this module's head; nodes (B, V, width), edges (B, E, width)."""
         first = self.edge_mlp.first
@@ -225,11 +212,11 @@ class InteractionNetwork(MessagePassing):
             if isinstance(edges, Unapplied)
             else affine(edges, own_weight, first.bias)
         )
-        spread = pairs.spread(
+        spread = adjacency.spread(
             own, nn.functional.linear(nodes, receiver_weight), nn.functional.linear(nodes, sender_weight)
         )
         updated = self.edge_mlp.ending(self.edge_mlp.hidden_after_first(spread))
-        summed = updated.gathered(pairs) if isinstance(updated, Unapplied) else pairs.gather(updated)
+        summed = updated.gathered(adjacency) if isinstance(updated, Unapplied) else adjacency.gather(updated)
         moved = value_of(self.node_mlp.ending(self.node_mlp.hidden(torch.cat([nodes, summed], dim=-1))))
         if self.residual:
             return nodes + moved, value_of(edges) + value_of(updated)
@@ -277,7 +264,7 @@ class EncodeProcessDecode(nn.Module):
         )
         self.decode = MLP(hidden, hidden, hidden_layers, outputs, activation=activation)
         # The edges of the last call: a training or a rollout keeps them.
-        self._known_pairs: tuple[Tensor, Pairs] | None = None
+        self._known_adjacency: tuple[Tensor, Adjacency] | None = None
 
     def plain(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> Tensor:
         """Node quantities from a batch of graphs, as defined."""
@@ -291,29 +278,29 @@ class EncodeProcessDecode(nn.Module):
         """Node quantities from a batch of graphs: `plain` to rounding, in less time and memory."""
         leading = nodes.shape[:-2]
         nodes, edges = nodes.reshape(-1, *nodes.shape[-2:]), edges.reshape(-1, *edges.shape[-2:])
-        pairs = self.pairs(edge_index, nodes.shape[1])
+        adjacency = self.adjacency(edge_index, nodes.shape[1])
         at_once = len(nodes)
         if nodes.device.type == "cpu" and not torch.is_grad_enabled():
             at_once = max(1, EDGES_AT_ONCE // max(1, edges.shape[1]))
         blocks = zip(nodes.split(at_once), edges.split(at_once), strict=True)
-        decoded = torch.cat([self.rearranged(*block, pairs) for block in blocks])
+        decoded = torch.cat([self.rearranged(*block, adjacency) for block in blocks])
         return decoded.reshape(*leading, *decoded.shape[1:])
 
-    def rearranged(self, nodes: Tensor, edges: Tensor, pairs: Pairs) -> Tensor:
+    def rearranged(self, nodes: Tensor, edges: Tensor, adjacency: Adjacency) -> Tensor:
         """`plain` by the algebra of this module's head; nodes (B, V, node_inputs), edges (B, E, edge_inputs)."""
         nodes = value_of(self.encode_nodes.ending(self.encode_nodes.hidden(nodes)))
         messages = self.encode_edges.ending(self.encode_edges.hidden(edges))
         for step in self.process:
-            nodes, messages = step.rearranged(nodes, messages, pairs)
+            nodes, messages = step.rearranged(nodes, messages, adjacency)
         return value_of(self.decode.ending(self.decode.hidden(nodes)))
 
-    def pairs(self, edge_index: Tensor, node_count: int) -> Pairs:
+    def adjacency(self, edge_index: Tensor, node_count: int) -> Adjacency:
         """The edges as sums; looked at once per `edge_index` object."""
-        known = self._known_pairs  # looked up once: another thread may have other edges
+        known = self._known_adjacency  # looked up once: another thread may have other edges
         if known is None or known[0] is not edge_index:
             # What is made in inference mode could not be trained with later.
             with torch.inference_mode(False):
-                known = self._known_pairs = edge_index, pairs_of(edge_index, node_count)
+                known = self._known_adjacency = edge_index, adjacency_of(edge_index, node_count)
         return known[1]
 
 
@@ -364,6 +351,11 @@ class Standardiser(nn.Module):
         if largest <= 1e-12 * float(samples.abs().max()) or largest == 0.0:
             return cls(mean, torch.ones_like(scale))
         return cls(mean, scale.clamp_min(max(floor, 1e-9) * largest))
+
+    @classmethod
+    def cat(cls, parts: Iterable[Standardiser]) -> Standardiser:
+        """Of several quantities side by side."""
+        return cls(*(torch.cat(values) for values in zip(*((p.mean, p.scale) for p in parts), strict=True)))
 
     @classmethod
     def empty(cls, *shape: int) -> Standardiser:

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from sgns.model.algebra import GraphStepper
 from sgns.model.dynamics import Dynamics, Path, Prediction, Step, unrolled
-from sgns.model.fast_step import GraphStepper
 from sgns.model.features import BodyTrack, build_graph, edge_indices, free_axes, nearest_rigid
 from sgns.model.network import EncodeProcessDecode, Standardiser
 from sgns.model.settings import ModelSettings
@@ -49,8 +49,8 @@ class LatentDynamics(Dynamics):
         mode_width = place + 3 * (settings.history - 1)
         body_width = place + (6 if pose else 0) + motion * motions
         # A learned vector for each mode, or one for all of them, and one for the body's nodes.
-        kinds = num_modes if settings.identity == "mode" else 1
-        self.identity = nn.Embedding(kinds + 1, settings.identity_width)
+        vectors = num_modes if settings.identity == "mode" else 1
+        self.identity = nn.Embedding(vectors + 1, settings.identity_width)
         self.network = EncodeProcessDecode(
             max(mode_width, body_width) + settings.identity_width + len(context),
             4 if settings.edge_length else 3,

@@ -110,7 +110,7 @@ def unfitted(
     # prescribed, and the numbers of the context have nothing in common: no floor for these.
     centred = (True, False, True, True, False, False, True, False, True)
     floors = (floor,) * 6 + (0.0,) * 3
-    inputs = joined([Standardiser.fit(*of_group) for of_group in zip(groups, floors, centred, strict=True)])
+    inputs = Standardiser.cat(map(Standardiser.fit, groups, floors, centred))
     values = normalised(inputs, groups)
     used = (values.std(0) > _STILL).nonzero()[:, 0]
     model = PolynomialDynamics(settings, modes, context, predicts_body, used.tolist())
@@ -135,11 +135,6 @@ def true_outputs(model: PolynomialDynamics, batch: Batch) -> list[Tensor]:
     return [velocity.flatten(1), rise, batch.force[:, 0], batch.torque[:, 0]]
 
 
-def joined(parts: Sequence[Standardiser]) -> Standardiser:
-    """Statistics of quantities side by side."""
-    return Standardiser(torch.cat([p.mean for p in parts]), torch.cat([p.scale for p in parts]))
-
-
 def moments(
     model: PolynomialDynamics, windows: TrainingWindows, noise: float = 0.0, draws: int = 2
 ) -> Moments:
@@ -154,7 +149,7 @@ def moments(
     scale = noise * model.velocity.scale.unflatten(0, (-1, 3))
     body_scale = torch.zeros(1, 3, dtype=torch.float64)
     body_scale[:, model.free] = noise * model.body_displacement.scale
-    outputs = joined(model.outputs())
+    outputs = Standardiser.cat(model.outputs())
     gram = torch.zeros(2 * model.weights.shape[:1], dtype=torch.float64)
     target = torch.zeros_like(model.weights)
     for draw in range(draws):

@@ -337,7 +337,7 @@ def fit_normalisation(
         dynamics.position, dynamics.body_position = pooled(position, body_position)
         dynamics.velocity, moved = pooled(velocity, body_velocity)
         turned = Standardiser.fit(motion[:, 3:], floor, centred=True)
-        dynamics.body_motion = joined(moved, turned) if pose else moved
+        dynamics.body_motion = Standardiser.cat([moved, turned]) if pose else moved
         clean, body_clean = pooled(change, body_change)
     else:
         dynamics.position = Standardiser.fit(position, floor)
@@ -345,7 +345,9 @@ def fit_normalisation(
         dynamics.body_position = Standardiser.fit(body_position, floor)
         # Displacement [m] and rotation [rad] have their own largest scale each.
         parts = motion.split(3, dim=-1)
-        dynamics.body_motion = joined(*(Standardiser.fit(part, floor, centred=False) for part in parts))
+        dynamics.body_motion = Standardiser.cat(
+            Standardiser.fit(part, floor, centred=False) for part in parts
+        )
         clean = Standardiser.fit(change, floor, centred=False)
         # No floor here: a wheel rises and sinks far less than it drives, and that little is to be predicted.
         body_clean = Standardiser.fit(body_change, centred=False)
@@ -385,11 +387,6 @@ def pooled(modes: Tensor, body: Tensor) -> tuple[Standardiser, Standardiser]:
     both = Standardiser.fit(torch.cat([modes.flatten(0, 1), body]))
     count = modes.shape[1]
     return Standardiser(both.mean.expand(count, 3), both.scale.expand(count, 3)), both
-
-
-def joined(*parts: Standardiser) -> Standardiser:
-    """Of several quantities side by side."""
-    return Standardiser(torch.cat([p.mean for p in parts]), torch.cat([p.scale for p in parts]))
 
 
 def widened(clean: Standardiser, noise: Tensor) -> Standardiser:
