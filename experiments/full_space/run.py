@@ -39,9 +39,8 @@ from sgns.model.network import Standardiser
 from sgns.model.settings import ModelSettings
 from sgns.reduction.reduce import reduce_dataset
 from sgns.simulator import Simulator
-from sgns.train.command import prepared
 from sgns.train.command import train as train_subspace
-from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
+from sgns.train.lightning_module import SurrogateTraining, TrainingSettings, prepared
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -8,21 +8,26 @@ import pickle
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
+from mpm_warp.poses import in_body_frame
 from sgns.config import UserError
 from sgns.data.files import whole_file
 from sgns.data.layout import require_mesh_was_read
 from sgns.data.small_files import read_json
 from sgns.model.dynamics import Dynamics
+from sgns.model.features import slowest_travel
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.polynomial import PolynomialDynamics
 from sgns.model.settings import ModelSettings, PolynomialSettings
 from sgns.model.training_range import TrainingRange
 from sgns.reduction.basis import Basis
+
+if TYPE_CHECKING:
+    from sgns.reduction.reduce import ReducedDataset
 
 # --- Which kind of latent dynamics a `model` describes: a network or polynomials. Everywhere else they are
 
@@ -131,6 +136,21 @@ class Surrogate(nn.Module):
             **dynamics.card(),
             "basis": state,
         }
+
+    @classmethod
+    def of(cls, dynamics: Dynamics, reduced: ReducedDataset, card: Mapping[str, Any]) -> Surrogate:
+        """Dynamics with the basis, the start and the body points of the dataset that they are trained on."""
+        runs = reduced.runs("train")
+        points = in_body_frame(runs[0].pose[0], runs[0].body_points[0])
+        sees_points = dynamics.settings.body_nodes == "points"
+        known = TrainingRange.of(runs, dynamics.num_modes, dynamics.context_keys, sees_points)
+        return cls(
+            dynamics,
+            reduced.basis.sliced(dynamics.num_modes),
+            torch.as_tensor(reduced.start_positions),
+            torch.as_tensor(points),
+            {**card, "training_range": known.plain(), "slowest_travel": slowest_travel(runs)},
+        )
 
     @property
     def frame_rate(self) -> float:

@@ -190,6 +190,17 @@ def free_axes(predicted: bool, body_nodes: str) -> Tensor:
     return torch.tensor([0.0, 0.0, 1.0] if body_nodes == "pose" else [1.0, 1.0, 1.0], dtype=torch.float64)
 
 
+def moves_freely(runs: Sequence[ReducedRun]) -> bool:
+    """Whether the body moves as the soil lets it, which only a wheel's axle does; refuses a mixture."""
+    free = {run.scene.get("kind") == "wheel" for run in runs}
+    if len(free) > 1:
+        raise UserError(
+            "the training runs mix wheels, whose height is predicted, with bodies whose motion is prescribed; keep one "
+            "dataset for each"
+        )
+    return free.pop()
+
+
 def nearest_rigid(reference: Tensor, points: Tensor) -> Tensor:
     """The rigidly moved reference that lies nearest to some points (Kabsch 1976), in the sense of least squares.
 

@@ -21,16 +21,16 @@ from tqdm import tqdm
 from sgns.clock import elapsed
 from sgns.model.dynamics import Dynamics
 from sgns.model.features import BodyTrack, body_track, context_of
-from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
 from sgns.train.windows import filled, pad_start, require_finite
 
 if TYPE_CHECKING:
     from sgns.reduction.reduce import ReducedRun
+    from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
 
 log = logging.getLogger(__name__)
 
 
-# --- How well the dynamics follow the validation runs, all at once: what a checkpoint is chosen by ------
+# --- How well dynamics follow the validation runs, all at once: what every kind of model is chosen by -----
 # Letters: B runs, T frames of the longest run, d history positions, r modes.
 
 
@@ -155,7 +155,7 @@ class ValidationRollouts:
         return states, force, found
 
 
-# --- What is seen of a training: rollouts of the validation runs, checkpoints, TensorBoard, a progress bar
+# --- On the way: rollouts of the validation runs, checkpoints, TensorBoard, a progress bar -----------------
 
 
 class RolloutValidation(L.Callback):
@@ -187,10 +187,9 @@ class RolloutValidation(L.Callback):
         self.best = float(state_dict["best"])
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: L.Trainer, pl_module: SurrogateTraining, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Log speed and learning rate, validate when it is time."""
-        assert isinstance(pl_module, SurrogateTraining)
         step = trainer.global_step
         if self._mark is None:
             self._mark = (step, time.perf_counter())

@@ -1,38 +1,39 @@
-"""How `sgns train model=polynomial` comes to its coefficients."""
+"""Coefficients of `PolynomialDynamics`: ridge regression (dynamic mode decomposition with control: Proctor, Brunton,
+Kutz 2016, doi:10.1137/15M1013857) and sequentially thresholded least squares (SINDy: Brunton, Proctor, Kutz 2016,
+doi:10.1073/pnas.1517384113).
+
+Both need only the moments of monomials and outputs, summed once over all windows and noise draws. What one step
+cannot tell, the noise and the penalty, is selected by rollouts of validation runs.
+
+Letters: B batch, r modes, p inputs, m monomials, f free axes of the body, o = 3r + f + 6 outputs.
+"""
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from sgns.clock import elapsed
 from sgns.config import UserError
-from sgns.model.features import varying_context
+from sgns.model.checkpoint import Surrogate
+from sgns.model.features import moves_freely, varying_context
 from sgns.model.network import Standardiser
 from sgns.model.polynomial import PolynomialDynamics, normalised
 from sgns.model.settings import FitSettings, PolynomialSettings
+from sgns.train import Fit, Fitted, Task
 from sgns.train.callbacks import RolloutScore, ValidationRollouts
 from sgns.train.windows import Batch, TrainingWindows, generator, random_walk
 
 if TYPE_CHECKING:
     from sgns.reduction.reduce import ReducedRun
-    from sgns.train.callbacks import RolloutScore, ValidationRollouts
 
 log = logging.getLogger(__name__)
 
-
-# --- Coefficients of `PolynomialDynamics`: ridge regression (dynamic mode decomposition with control: Proct
-# Kutz 2016, doi:10.1137/15M1013857) and sequentially thresholded least squares (SINDy: Brunton, Proctor, Kutz 2016,
-# doi:10.1073/pnas.1517384113).
-#
-# Both need only the moments of monomials and outputs, summed once over all windows and noise draws. What one step
-# cannot tell, the noise and the penalty, is chosen by rollouts of validation runs.
-#
-# Letters: B batch, r modes, p inputs, m monomials, f free axes of the body, o = 3r + f + 6 outputs.
 
 # Windows whose monomials are in memory at once.
 _CHUNK = 2048
@@ -56,7 +57,7 @@ class Setting(NamedTuple):
     linear: bool = False
 
 
-class Choice(NamedTuple):
+class Selection(NamedTuple):
     """How the coefficients of each group of outputs are found.
 
     Attributes:
@@ -239,9 +240,9 @@ def candidates(
     return {setting: coefficients(known[setting.noise], setting) for setting in settings}
 
 
-def choose(
+def select(
     model: PolynomialDynamics, found: Mapping[Setting, Tensor], rollouts: ValidationRollouts
-) -> Choice:
+) -> Selection:
     """Give a model the best coefficients: of the modes by the skill of rollouts, then of a free body by its error
     along the rollouts of these modes, then of force and torque by the force error along those of both.
 
@@ -251,8 +252,8 @@ def choose(
         rollouts: Of the validation runs.
     """
 
-    def score(*choice: Setting) -> RolloutScore:
-        take(model, *(found[setting] for setting in choice))
+    def score(*selection: Setting) -> RolloutScore:
+        take(model, *(found[setting] for setting in selection))
         return rollouts.measure(model)
 
     motion = body = max(found, key=lambda setting: score(setting, setting, setting).skill)
@@ -260,7 +261,7 @@ def choose(
         body = min(found, key=lambda setting: score(motion, setting, motion).body_rmse)
     force = min(found, key=lambda setting: score(motion, body, setting).force_nrmse)
     take(model, found[motion], found[body], found[force])
-    return Choice(motion, body, force)
+    return Selection(motion, body, force)
 
 
 def take(model: PolynomialDynamics, motion: Tensor, body: Tensor, force: Tensor) -> None:
@@ -269,26 +270,30 @@ def take(model: PolynomialDynamics, motion: Tensor, body: Tensor, force: Tensor)
     model.weights.copy_(torch.cat([motion[:, :modes], body[:, modes:-6], force[:, -6:]], dim=1))
 
 
-def refitted(model: PolynomialDynamics, windows: TrainingWindows, choice: Choice, draws: int = 2) -> None:
-    """Give a model the coefficients of settings that `choose` found on a part of these windows."""
-    known = {noise: moments(model, windows, noise, draws) for noise in {setting.noise for setting in choice}}
-    take(model, *(coefficients(known[setting.noise], setting) for setting in choice))
+def refitted(
+    model: PolynomialDynamics, windows: TrainingWindows, selection: Selection, draws: int = 2
+) -> None:
+    """Give a model the coefficients of settings that `select` found on a part of these windows."""
+    known = {
+        noise: moments(model, windows, noise, draws) for noise in {setting.noise for setting in selection}
+    }
+    take(model, *(coefficients(known[setting.noise], setting) for setting in selection))
 
 
-# --- How `sgns train model=polynomial` comes to its coefficients ----------------------------------------
+# --- From runs to a checkpoint ----------------------------------------------------------------------------
 
 
-class Fitted(NamedTuple):
+class FittedPolynomial(NamedTuple):
     """Fitted polynomials.
 
     Attributes:
         dynamics: The polynomials.
-        choice: Noise and penalty of each group of outputs.
+        selection: Noise and penalty of each group of outputs.
         score: On the runs that chose these.
     """
 
     dynamics: PolynomialDynamics
-    choice: Choice
+    selection: Selection
     score: RolloutScore
 
     def about(self) -> dict[str, Any]:
@@ -296,13 +301,13 @@ class Fitted(NamedTuple):
         groups = ("motion", "body", "force") if self.dynamics.predicts_body else ("motion", "force")
         found: dict[str, Any] = {"coefficients": self.dynamics.num_terms}
         for group in groups:
-            setting = getattr(self.choice, group)
+            setting = getattr(self.selection, group)
             degree = 1 if setting.linear else self.dynamics.settings.degree
             found[group] = {"degree": degree, "noise": setting.noise, "penalty": setting.penalty}
         return found
 
 
-def fit_polynomial(
+def best_polynomial(
     runs: Sequence[ReducedRun],
     choosing: Sequence[ReducedRun],
     num_modes: int,
@@ -310,7 +315,7 @@ def fit_polynomial(
     settings: FitSettings,
     predicts_body: bool,
     seed: int = 0,
-) -> Fitted:
+) -> FittedPolynomial:
     """Fit polynomials for every noise and penalty and take what follows some runs best.
 
     Args:
@@ -341,20 +346,38 @@ def fit_polynomial(
     rollouts = ValidationRollouts(choosing, num_modes, model.history, model.body_nodes, context)
     linear = settings.linear and model.degree > 1
     found = candidates(known, settings.penalties, linear=linear)
-    choice = choose(dynamics, found, rollouts)
+    selection = select(dynamics, found, rollouts)
     score = rollouts.measure(dynamics)
     if len(fitting) < len(runs):
         windows = windows_of(runs)
         dynamics = blank(windows)
-        refitted(dynamics, windows, choice, settings.draws)
-    return Fitted(dynamics, choice, score)
+        refitted(dynamics, windows, selection, settings.draws)
+    return FittedPolynomial(dynamics, selection, score)
 
 
-def check_start(start_from: str | Path | None, device: str) -> None:
-    """Refuses what polynomials have no use for."""
-    if start_from is not None:
+def fit_polynomial(task: Task) -> Fitted:
+    """Fit polynomials and write their checkpoint; nothing of before is of use to them."""
+    if task.start_from is not None:
         raise UserError(
-            f"checkpoint is {start_from}, but polynomials start from nothing; use checkpoint=null"
+            f"checkpoint is {task.start_from}, but polynomials start from nothing; use checkpoint=null"
         )
-    if device != "cpu":
-        raise UserError(f"device is {device}, but polynomials are fitted on the CPU; use device=cpu")
+    if task.device != "cpu":
+        raise UserError(f"device is {task.device}, but polynomials are fitted on the CPU; use device=cpu")
+    runs = task.reduced.runs("train")
+    began = time.perf_counter()
+    best = best_polynomial(
+        runs, task.validation_runs, task.num_modes, task.model, task.settings, moves_freely(runs), task.seed
+    )
+    seconds = elapsed(began, time.perf_counter())
+    surrogate = Surrogate.of(best.dynamics, task.reduced, task.card)
+    surrogate.save(task.output / "best.ckpt")
+    return Fitted(surrogate, best.score, seconds, best.about())
+
+
+def stand_ins(runs: list[ReducedRun]) -> list[ReducedRun]:
+    """See `Fit.stand_ins`."""
+    log.warning("the validation split is empty; every third training run chooses noise and penalty")
+    return runs[::3]
+
+
+POLYNOMIAL = Fit(FitSettings.from_dict, stand_ins, fit_polynomial)

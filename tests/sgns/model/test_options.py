@@ -10,8 +10,8 @@ from tiny import MODEL, TRAINING, reduced
 
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
-from sgns.train.command import prepared, train
-from sgns.train.lightning_module import TrainingSettings
+from sgns.train.command import train
+from sgns.train.lightning_module import TrainingSettings, prepared
 
 OPTIONS = {
     "velocity": ({"predicts": "velocity"}, {}),
