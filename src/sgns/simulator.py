@@ -493,14 +493,14 @@ class Simulator:
 
 
 def excess_of(
-    known: TrainingRange | None,
+    known: TrainingRange,
     poses: np.ndarray,
     points: np.ndarray,
     latent: np.ndarray,
     context: Mapping[str, float],
 ) -> Excess | None:
     """How far frames are outside a training range; body points (M, 3) in the body frame [m], else as
-    `TrainingRange.excess`. None where nobody knows, or the tool is nowhere yet."""
-    if known is None or not np.isfinite(poses).all():
+    `TrainingRange.excess`. None where the tool is nowhere yet."""
+    if not np.isfinite(poses).all():
         return None
     return known.excess(poses, in_world_frame(poses, points), latent, context)

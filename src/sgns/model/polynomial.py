@@ -8,7 +8,7 @@ Letters: B batch, d history positions, r modes, K context numbers, p inputs, m m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -77,6 +77,17 @@ class PolynomialDynamics(Dynamics):
         self.register_buffer("terms", polynomial_terms(len(used), settings.degree), persistent=False)
         weights = torch.zeros(len(self.terms), 3 * r + f + 6, dtype=torch.float64)
         self.weights = nn.Parameter(weights, requires_grad=False)
+
+    @classmethod
+    def from_card(cls, card: Mapping[str, Any], state: Mapping[str, Tensor]) -> PolynomialDynamics:
+        """As for all `Dynamics`."""
+        model, num_modes, used = card["model"], int(card["num_modes"]), card["used"]
+        most = len(used) * (len(used) + 1) // 2 if model["degree"] == 2 else len(used)
+        groups = len(state["inputs.mean"]) // (3 * num_modes)
+        if model["history"] > groups or most > len(state["weights"]):
+            raise ValueError("its card describes other polynomials")
+        told = tuple(map(str, card["context"])), bool(card["predicts_body"])
+        return cls(PolynomialSettings(**model), num_modes, *told, used)
 
     def card(self) -> dict[str, Any]:
         """As for all `Dynamics`."""
