@@ -144,10 +144,7 @@ def check_poses(poses: np.ndarray, what: str = "tool path") -> np.ndarray:
 
 
 def pose_rows(
-    poses: np.ndarray,
-    what: str,
-    needs: str = "rows x, y, z, qx, qy, qz, qw, shape (T, 7)",
-    most: int = 2,
+    poses: np.ndarray, what: str, needs: str = "rows x, y, z, qx, qy, qz, qw, shape (T, 7)", most: int = 2
 ) -> np.ndarray:
     """A float64 copy of what has the shape of poses, (T, 7) or (7,), of at most so many axes; shape (T, 7)."""
     poses = real_array(poses, what, needs)

@@ -163,11 +163,7 @@ def test_bad_input_is_named(trained) -> None:
 def test_bad_checkpoints_are_named(trained, tmp_path) -> None:
     _, folder = trained
     whole = (folder / "pose" / "best.ckpt").read_bytes()
-    for name, content in (
-        ("truncated", whole[: len(whole) // 2]),
-        ("empty", b""),
-        ("text", b"hello"),
-    ):
+    for name, content in (("truncated", whole[: len(whole) // 2]), ("empty", b""), ("text", b"hello")):
         path = tmp_path / f"{name}.ckpt"
         path.write_bytes(content)
         with pytest.raises(UserError, match=f"{name}.ckpt"):

@@ -249,15 +249,8 @@ class FullSpaceDynamics(nn.Module):
         return prediction.force.double() * share * self.force.scale + self.force.mean / nodes
 
     def advance(self, soil: Tensor, body: BodyTrack) -> tuple[Tensor, Tensor]:
-        """Take one step: x+ = x + (x - x-) + a.
-
-        Args:
-            soil: As for `forward`.
-            body: As for `forward`.
-
-        Returns:
-            Next positions [m] (B, n, 3) and force [N] (B, 3), float64.
-        """
+        """Take one step, x+ = x + (x - x-) + a: next positions [m] (B, n, 3) and force [N] (B, 3), float64; arguments
+        as for `forward`."""
         prediction = self(soil, body)
         acceleration = self.acceleration.denormalise(prediction.acceleration)
         following = 2 * soil[:, -1] - soil[:, -2] + acceleration
@@ -403,13 +396,8 @@ class FullSpaceWindows:
         return FullSpaceBatch(soil, torch.zeros_like(soil[:, :-1]), body, run.force[None, target])
 
     def batch(self, step: int, size: int, noise_scale: Tensor) -> FullSpaceBatch:
-        """The batch of a step, a function of (seed, step) and nothing else.
-
-        Args:
-            step: Optimisation step from 0.
-            size: B.
-            noise_scale: Deviation of the newest velocity's noise [m], shape (3,).
-        """
+        """The batch of an optimisation step from 0, a function of (seed, step) and nothing else; `noise_scale` is the
+        deviation of the newest velocity's noise [m], shape (3,)."""
         source = torch.Generator().manual_seed(
             int(np.random.SeedSequence([self.seed, step]).generate_state(1)[0])
         )
@@ -422,12 +410,8 @@ class FullSpaceWindows:
 
 
 def losses(dynamics: FullSpaceDynamics, batch: FullSpaceBatch) -> tuple[Tensor, Tensor]:
-    """Squared errors of the normalised acceleration, mean over particles, and of the normalised force.
-
-    Args:
-        dynamics: On any device.
-        batch: From `FullSpaceWindows`; taken to that device.
-    """
+    """Squared errors of the normalised acceleration, mean over particles, and of the normalised force; the batch is
+    taken to the device of the dynamics."""
     batch = batch.to(dynamics.bin_size.device)
     prediction = dynamics(batch.history, batch.body)
     acceleration = prediction.acceleration - dynamics.acceleration.normalise(batch.acceleration)

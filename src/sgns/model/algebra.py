@@ -30,17 +30,7 @@ _AVAILABLE = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, 
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
-    """x Wᵀ + b, then ReLU if asked for; the function of `torch.nn.functional.linear`, to rounding.
-
-    Args:
-        x: Shape (..., inputs).
-        weight: Shape (outputs, inputs).
-        bias: Shape (outputs,).
-        relu: Whether negative values become zero.
-
-    Returns:
-        Shape (..., outputs).
-    """
+    """x Wᵀ + b, then ReLU if asked for; shapes and values of `torch.nn.functional.linear`, to rounding."""
     if prefers_onednn(x, weight):
         if torch.is_grad_enabled():
             return _Affine.apply(x, weight, bias, relu)
@@ -103,28 +93,15 @@ class Adjacency(Protocol):
         """Edges that each node receives: a number, or one per node, shape (V, 1)."""
 
     def spread(self, edges: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
-        """Each edge's own value plus that of its receiver and that of its sender.
-
-        Args:
-            edges: Shape (B, E, H); may be overwritten.
-            receiver: Shape (B, V, H).
-            sender: Shape (B, V, H).
-
-        Returns:
-            Shape (B, E, H).
-        """
+        """Each edge's own value (B, E, H), which may be overwritten, plus that of its receiver and that of its sender
+        (B, V, H)."""
 
     def gather(self, edges: Tensor) -> Tensor:
         """Sum of the edges at their receivers, (B, E, H) to (B, V, H)."""
 
 
 class CompleteAdjacency:
-    """Every ordered pair of nodes, receivers ascending: no index is needed.
-
-    Args:
-        node_count: V.
-        self_loops: Whether a node is its own neighbour, too.
-    """
+    """Every ordered pair of V nodes, receivers ascending: no index is needed."""
 
     def __init__(self, node_count: int, self_loops: bool) -> None:
         self.node_count = node_count
@@ -193,12 +170,7 @@ class _Spread(torch.autograd.Function):
 
 
 class IndexedAdjacency:
-    """Any set of edges.
-
-    Args:
-        edge_index: Senders and receivers, shape (2, E).
-        node_count: V.
-    """
+    """Any set of edges: senders and receivers (2, E) between V nodes."""
 
     def __init__(self, edge_index: Tensor, node_count: int) -> None:
         self.sender, self.receiver = edge_index
@@ -238,7 +210,7 @@ class Layer:
     Args:
         weight: Shape (outputs, inputs).
         bias: Shape (outputs,).
-        rows: Number of rows.
+        rows: Their number.
         activation: What follows; None for nothing.
     """
 

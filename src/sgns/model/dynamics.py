@@ -204,10 +204,7 @@ class Dynamics(nn.Module):
             context: As for `advance`.
         """
         return unrolled(
-            lambda history, window: self.advance(history, window, context),
-            latent,
-            body,
-            self.predicts_body,
+            lambda history, window: self.advance(history, window, context), latent, body, self.predicts_body
         )
 
     def check_modes(self, num_modes: int) -> None:
@@ -228,18 +225,12 @@ class Dynamics(nn.Module):
 
 
 def unrolled(
-    advance: Callable[[Tensor, BodyTrack], Step],
-    latent: Tensor,
-    body: BodyTrack,
-    predicts_body: bool,
+    advance: Callable[[Tensor, BodyTrack], Step], latent: Tensor, body: BodyTrack, predicts_body: bool
 ) -> Path:
     """Whole paths by steps that see what the steps before said.
 
-    Args:
-        advance: Takes a step from d latent positions (B, d, r, 3) and the body (B, d, N, ...).
-        latent: As for `Dynamics.unroll`.
-        body: As for `Dynamics.unroll`.
-        predicts_body: Whether the body goes where the steps say.
+    `advance` takes a step from d latent positions (B, d, r, 3) and the body (B, d, N, ...), which goes where the steps
+    say if it is predicted; the others as for `Dynamics.unroll`.
     """
     d, frames = latent.shape[1], body.position.shape[1]
     states = latent.new_empty((latent.shape[0], frames, *latent.shape[2:]), dtype=torch.float64)

@@ -45,17 +45,10 @@ def edge_indices(
     self_loops: bool = False,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """The edges between modes, which come first, and body nodes, receivers ascending.
+    """The edges between modes, which come first, and body nodes: senders in row 0 and receivers, ascending, in row 1
+    (PyG's order), shape (2, E).
 
-    Args:
-        modes: r.
-        body_nodes: N.
-        edges: "complete", every ordered pair of different nodes; "star", only those with one mode and one body node.
-        self_loops: Whether every node has an edge to itself.
-        device: Where the indices live.
-
-    Returns:
-        Senders in row 0 and receivers in row 1 (PyG's order), int64, shape (2, E).
+    "complete" is every ordered pair of different nodes; "star" only those with one mode and one body node.
     """
     index = torch.arange(modes + body_nodes, device=device)
     receiver, sender = torch.meshgrid(index, index, indexing="ij")
@@ -78,14 +71,11 @@ def build_graph(
     relative to the receiver's, and its length.
 
     Args:
-        mode_features: Of the modes [1], shape (B, r, any).
-        body_features: Of the body nodes [1], shape (B, N, any).
+        mode_features: [1], shape (B, r, any).
+        body_features: [1], shape (B, N, any).
         position: Of all nodes, modes first, in the unit of edges [1], shape (B, V, 3).
         edge_index: Senders and receivers, shape (2, E).
         edge_length: Whether edges hold their length.
-
-    Returns:
-        The graph with modes first and body nodes last.
     """
     width = max(mode_features.shape[-1], body_features.shape[-1])
     nodes = torch.cat(
@@ -148,15 +138,12 @@ class BodyTrack(NamedTuple):
 
 
 def body_track(poses: np.ndarray, points: np.ndarray | None, body_nodes: str) -> BodyTrack:
-    """Describe a path as the network sees it.
+    """A path as the network sees it, float64.
 
     Args:
         poses: Centre of mass [m] and unit quaternion x, y, z, w, shape (T, 7).
         points: Body points in the world frame [m], shape (T, M, 3); only read for "points".
         body_nodes: "pose" (one node) or "points" (one node per point).
-
-    Returns:
-        The track, float64.
     """
     if body_nodes == "points":
         if points is None or points.shape[1] == 0:
@@ -202,15 +189,8 @@ def moves_freely(runs: Sequence[ReducedRun]) -> bool:
 
 
 def nearest_rigid(reference: Tensor, points: Tensor) -> Tensor:
-    """The rigidly moved reference that lies nearest to some points (Kabsch 1976), in the sense of least squares.
-
-    Args:
-        reference: Points of the body in any one pose [m], shape (..., M, 3).
-        points: Where they are said to be [m], shape (..., M, 3).
-
-    Returns:
-        Shape (..., M, 3); not finite where the points are not.
-    """
+    """The points of a body in any one pose (..., M, 3) [m], moved rigidly to where they lie nearest to some points
+    (..., M, 3); not finite where these are not."""
     here, there = reference.mean(-2, keepdim=True), points.mean(-2, keepdim=True)
     rotation = torch.from_numpy(fitted_rotations(reference.cpu().numpy(), points.cpu().numpy()))
     return (reference - here) @ rotation.to(points.device).transpose(-1, -2) + there
@@ -303,14 +283,8 @@ class ToolMotion(NamedTuple):
 
 
 def step_frames(path: np.ndarray, given: int, least: float, settling: int) -> np.ndarray:
-    """Numbers of the frames of a path that the soil takes a step into, and before them of those that are given.
-
-    Args:
-        path: Markers [m], shape (T, M + 1, 3).
-        given: Frames at the start that are given: 1 for a bed at rest, or d.
-        least: See `ToolMotion`.
-        settling: See `ToolMotion`.
-    """
+    """Numbers of the frames of a path of markers (T, M + 1, 3) that the soil takes a step into, and before them of
+    those that are given: 1 for a bed at rest, or d. For the others see `ToolMotion`."""
     motion = ToolMotion.along(path[:given], least, settling)
     if (distance(path[given:], path[given - 1 : -1]) >= motion.least).all():
         return np.arange(len(path))  # as most paths; one by one it takes as long as the steps of many paths
@@ -323,12 +297,8 @@ def step_frames(path: np.ndarray, given: int, least: float, settling: int) -> np
 
 
 def markers(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """What shows how far a tool moves: its centre of mass and its points, shape (T, M + 1, 3).
-
-    Args:
-        poses: Shape (T, 7).
-        points: World frame [m], shape (T, M, 3).
-    """
+    """What shows how far a tool moves: its centre of mass, of poses (T, 7), and its points in the world frame
+    (T, M, 3); shape (T, M + 1, 3)."""
     return np.concatenate([np.asarray(poses)[:, None, :3], points], axis=1)
 
 

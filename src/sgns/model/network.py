@@ -40,16 +40,7 @@ def keep_freed_memory() -> None:
 
 
 class MLP(nn.Module):
-    """A multilayer perceptron.
-
-    Args:
-        inputs: Width of the input.
-        hidden: Width of the hidden layers.
-        hidden_layers: Number of hidden layers.
-        outputs: Width of the output.
-        layer_norm: Whether the output is layer-normalised.
-        activation: One of "relu", "silu", "gelu", "tanh".
-    """
+    """A multilayer perceptron: widths of input, hidden layers and output; the output may be layer-normalised."""
 
     def __init__(
         self,
@@ -156,12 +147,12 @@ class InteractionNetwork(MessagePassing):
     for the edge from sender j to receiver i.
 
     Args:
-        width: Width of node and edge features.
-        hidden: Width of the hidden layers.
-        hidden_layers: Number of hidden layers of each MLP.
+        width: Of node and edge features.
+        hidden: Width of the hidden layers of each MLP.
+        hidden_layers: Their number.
         layer_norm: Whether updates are layer-normalised.
         residual: Whether updates are added to what they update.
-        activation: Activation between layers.
+        activation: Between layers.
 
     Shapes:
         nodes (..., V, width), edges (..., E, width), edge_index (2, E) with senders in row 0.
@@ -224,22 +215,12 @@ class InteractionNetwork(MessagePassing):
 
 
 class EncodeProcessDecode(nn.Module):
-    """Five MLPs: encoders of nodes and edges, edge and node updates, decoder of nodes.
+    """Five MLPs: encoders of nodes and edges, edge and node updates of every message-passing step, decoder of nodes.
 
-    Args:
-        node_inputs: Width of node features.
-        edge_inputs: Width of edge features.
-        outputs: Width of the decoded node quantities.
-        hidden: Width of every layer and of the encoded features.
-        hidden_layers: Hidden layers of each MLP.
-        steps: Message-passing steps, each with its own two MLPs.
-        layer_norm: Layer normalisation after every MLP but the decoder.
-        residual: Whether message passing adds to nodes and edges.
-        activation: Activation between layers.
+    Every layer and what is encoded is `hidden` wide; the layer normalisation comes after every MLP but the decoder.
 
     Shapes:
-        nodes (..., V, node_inputs), edges (..., E, edge_inputs), edge_index (2, E). Returns (..., V,
-        outputs).
+        nodes (..., V, node_inputs), edges (..., E, edge_inputs), edge_index (2, E). Returns (..., V, outputs).
     """
 
     def __init__(
@@ -328,18 +309,13 @@ class Standardiser(nn.Module):
 
     @classmethod
     def fit(cls, samples: Tensor, floor: float = 0.0, centred: bool = True) -> Standardiser:
-        """Statistics over the first dimension.
+        """Statistics over the first dimension; a quantity that never varies gets scale one.
 
         Args:
             samples: Training values [unit], shape (samples, ...).
-            floor: Smallest allowed scale as a share of the largest one; a direction in which (almost) nothing
-                happens, such as the lateral one by symmetry, keeps a small normalised value instead of being
-                blown up.
-            centred: Whether the mean is subtracted; without it zero stays zero and the scale is the root mean
-                square.
-
-        Returns:
-            The fitted standardiser; a quantity that never varies gets scale one.
+            floor: Smallest scale as a share of the largest one; a direction in which (almost) nothing happens, such as
+                the lateral one by symmetry, keeps a small normalised value instead of being blown up.
+            centred: Whether the mean is subtracted; without it zero stays zero and the scale is the root mean square.
         """
         samples = samples.double()
         if samples[0].numel() == 0:

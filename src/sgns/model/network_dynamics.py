@@ -111,14 +111,7 @@ class LatentDynamics(Dynamics):
         return fewer
 
     def forward(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Prediction:
-        """Predict one step of every window in a batch.
-
-        Args:
-            latent: The last d latent positions, oldest first [m], float64, shape (B, d, r, 3).
-            body: The d frames that end with the *next* one, the frame to be predicted; (B, d, N, ...). Where it is
-                then, and how it gets there along the free axes, is not looked at.
-            context: Numbers of the runs, shape (B, K); not needed when K is 0.
-        """
+        """Predict one step of every window in a batch; arguments as for `advance`."""
         modes, nodes = latent.shape[-2], body.position.shape[-2]
         edge_index = self.edge_index(modes, nodes, latent.device)
         graph = build_graph(
@@ -180,12 +173,9 @@ class LatentDynamics(Dynamics):
         return torch.cat([told, numbers], dim=-1)
 
     def force_contributions(self, prediction: Prediction) -> tuple[Tensor, Tensor]:
-        """Force [N] and torque [N m] that each node adds; their sums over nodes are the force and the torque.
+        """Force [N] and torque [N m] that each node adds, float64, shape (B, V, 3) each.
 
-        Every node carries 1/V of the mean, so that the sum, not the average, is the physical quantity.
-
-        Returns:
-            Two float64 tensors of shape (B, V, 3).
+        Every node carries 1/V of the mean, so that the sum over nodes, not the average, is the physical quantity.
         """
         count = prediction.force.shape[-2]
         return tuple(
@@ -194,13 +184,7 @@ class LatentDynamics(Dynamics):
         )  # type: ignore[return-value]
 
     def advance(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Step:
-        """Take one step: z+ = z + (z - z-) + a, or z + v. A predicted body of points stays rigid if it is to.
-
-        Args:
-            latent: As for `forward`.
-            body: As for `forward`.
-            context: As for `forward`.
-        """
+        """As for all `Dynamics`: z+ = z + (z - z-) + a, or z + v; a predicted body of points kept rigid if so set."""
         return self.stepped(self(latent, body, context), latent, body)
 
     def stepped(self, prediction: Prediction, latent: Tensor, body: BodyTrack) -> Step:
@@ -366,13 +350,8 @@ class PathStepper(Stepper):
         return False
 
     def decoded(self, latent: Tensor, features: Tensor, places: Tensor) -> Tensor:
-        """What the network says, shape (V, 6 or 9); overwritten by the next call.
-
-        Args:
-            latent: Shape (d, r, 3).
-            features: Of the body nodes, shape (N, any).
-            places: Of the body nodes, shape (N, 3).
-        """
+        """What the network says of latent positions (d, r, 3) and of the body nodes' features (N, any) and places
+        (N, 3), shape (V, 6 or 9); overwritten by the next call."""
         newest = latent[-1]
         torch.sub(latent[1:], latent[:-1], out=self.velocity)
         torch.div(self.velocity - self.velocity_mean, self.velocity_scale, out=self.velocity_features)
@@ -419,13 +398,14 @@ class PathStepper(Stepper):
         self.shape = None  # what follows does not depend on what was stepped before
         states = latent.new_empty((1, frames, *latent.shape[2:]), dtype=torch.float64)
         states[:, :d] = latent
+        path = states[0]
         loads = self.load_mean.new_zeros(frames, len(self.load_mean))
         with torch.inference_mode():
             for t, features, places in zip(
                 range(d, frames), *(part[1:] for part in self.windows(body)), strict=True
             ):
-                seen = states[0, t - d : t]
-                states[0, t], loads[t] = self.outcome(self.decoded(seen, features, places), seen)
+                seen = path[t - d : t]
+                path[t], loads[t] = self.outcome(self.decoded(seen, features, places), seen)
         torque = loads[:, 3:]
         if not self.dynamics.settings.torque:
             torque = self.dynamics.torque.mean.repeat(frames, 1)

@@ -112,11 +112,7 @@ class PolynomialDynamics(Dynamics):
         number = torch.cumsum(kept, 0) - 1
         held = kept[self.used]
         fewer = PolynomialDynamics(
-            self.settings,
-            num_modes,
-            self.context_keys,
-            self.predicts_body,
-            number[self.used[held]].tolist(),
+            self.settings, num_modes, self.context_keys, self.predicts_body, number[self.used[held]].tolist()
         )
         fewer.inputs = Standardiser(self.inputs.mean[kept], self.inputs.scale[kept])
         fewer.velocity = Standardiser(

@@ -56,14 +56,9 @@ class RolloutScore(NamedTuple):
 
 
 class ValidationRollouts:
-    """Runs to be rolled out side by side.
+    """Runs to be rolled out side by side; shorter ones are filled up with their last frame, which is not counted.
 
-    Args:
-        runs: Reduced runs; shorter ones are filled up with their last frame, which is not counted.
-        num_modes: r.
-        history: d.
-        body_nodes: "pose" or "points".
-        context: Keys of the scene whose numbers the dynamics are told.
+    `context` are the keys of the scene whose numbers the dynamics are told.
     """
 
     def __init__(
@@ -165,10 +160,7 @@ class RolloutValidation(L.Callback):
     It is done between steps instead of in Lightning's validation loop, so that the last step is always judged
     and saved.
 
-    Args:
-        rollouts: The validation runs.
-        output: Folder of best.ckpt and last.ckpt.
-        settings: `validate_every`, `log_every`, `max_steps`, `batch_size`.
+    `output` is the folder of best.ckpt and last.ckpt.
     """
 
     def __init__(self, rollouts: ValidationRollouts, output: Path, settings: TrainingSettings) -> None:
@@ -236,11 +228,7 @@ class RolloutValidation(L.Callback):
 
 
 class StepProgress(L.Callback):
-    """A bar over optimisation steps, only at a terminal.
-
-    Args:
-        total: Steps when complete.
-    """
+    """A bar over all optimisation steps, only at a terminal."""
 
     def __init__(self, total: int) -> None:
         self.total = total
@@ -279,16 +267,8 @@ class StepProgress(L.Callback):
 
 
 def force_figure(rollouts: ValidationRollouts, score: RolloutScore, most: int = 4) -> Figure:
-    """Force on the tool along validation runs, true and predicted.
-
-    Args:
-        rollouts: The runs with their true force.
-        score: The predicted one.
-        most: How many runs to draw.
-
-    Returns:
-        The figure; draft is -F_x, vertical F_z, in newtons over frames.
-    """
+    """Force on the tool along the first validation runs, true and predicted: draft -F_x and vertical F_z [N] over
+    frames."""
     count = min(most, len(rollouts.names))
     figure = Figure(figsize=(3.2 * count, 4.4), layout="constrained")
     axes = np.atleast_2d(figure.subplots(2, count, sharex=True, squeeze=False))

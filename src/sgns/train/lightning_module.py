@@ -36,7 +36,7 @@ from sgns.train.windows import (
     SCALES,
     Batch,
     TrainingWindows,
-    WindowDataModule,
+    WindowLoader,
     fit_normalisation,
 )
 
@@ -150,12 +150,7 @@ class TrainingSettings:
 
 
 class SurrogateTraining(L.LightningModule):
-    """One optimisation step of a surrogate.
-
-    Args:
-        surrogate: What is trained; all of it goes into the checkpoint.
-        settings: How.
-    """
+    """One optimisation step of a surrogate, all of which goes into the checkpoint."""
 
     def __init__(self, surrogate: Surrogate, settings: TrainingSettings) -> None:
         super().__init__()
@@ -322,7 +317,7 @@ def prepared(
     seed: int,
     card: dict[str, Any],
     start_from: str | Path | None,
-) -> tuple[Surrogate, WindowDataModule]:
+) -> tuple[Surrogate, WindowLoader]:
     """The untrained surrogate with its statistics, and its data."""
     runs = reduced.runs("train")
     context = tuple(varying_context(runs, model.context))
@@ -349,7 +344,7 @@ def prepared(
             )
         dynamics = given.dynamics.requires_grad_(True).train()
     surrogate = Surrogate.of(dynamics, reduced, card)
-    return surrogate, WindowDataModule(windows, settings.batch_size, noise)
+    return surrogate, WindowLoader(windows, settings.batch_size, noise)
 
 
 def require_resumable(
@@ -461,9 +456,7 @@ def quiet_lightning() -> Iterator[None]:
         logger.setLevel(before)
 
 
-def run_trainer(
-    trainer: L.Trainer, module: SurrogateTraining, data: L.LightningDataModule, last: Path | None
-) -> None:
+def run_trainer(trainer: L.Trainer, module: SurrogateTraining, data: WindowLoader, last: Path | None) -> None:
     """Run the trainer; an interruption stays one."""
     in_main_thread = threading.current_thread() is threading.main_thread()
     handler = signal.getsignal(signal.SIGINT) if in_main_thread else None
@@ -474,8 +467,9 @@ def run_trainer(
         # Lightning's own use of torch, not ours.
         warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.*")
         path = None if last is None else str(last)
+        data.trainer = trainer
         try:
-            trainer.fit(module, datamodule=data, ckpt_path=path, weights_only=True)
+            trainer.fit(module, data, ckpt_path=path, weights_only=True)
         except SystemExit as error:
             # Lightning turns Ctrl-C into an exit of its own.
             raise KeyboardInterrupt from error

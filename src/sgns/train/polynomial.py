@@ -94,14 +94,8 @@ def unfitted(
 ) -> PolynomialDynamics:
     """Polynomials with the statistics of the training windows and all coefficients zero.
 
-    They predict that nothing moves and that the force is the training runs' mean.
-
-    Args:
-        windows: The training windows.
-        settings: What to build.
-        context: Keys of the scene whose numbers the windows hold.
-        predicts_body: Whether the body's height is predicted.
-        floor: Smallest scale as a share of the quantity's largest.
+    They predict that nothing moves and that the force is the training runs' mean. `context` are the keys of the scene
+    whose numbers the windows hold; no scale is below the share `floor` of the quantity's largest.
     """
     batch = windows.windows(windows.targets)
     modes = batch.latent.shape[2]
@@ -139,14 +133,8 @@ def true_outputs(model: PolynomialDynamics, batch: Batch) -> list[Tensor]:
 def moments(
     model: PolynomialDynamics, windows: TrainingWindows, noise: float = 0.0, draws: int = 2
 ) -> Moments:
-    """Moments of a model's monomials and outputs; its coefficients do not matter.
-
-    Args:
-        model: Whose library and statistics to use.
-        windows: The training windows.
-        noise: As in `Setting`.
-        draws: How often all windows are taken, with other noise each time.
-    """
+    """Moments of a model's monomials and outputs over all windows, taken `draws` times with other noise each time (see
+    `Setting`); the model's coefficients do not matter."""
     scale = noise * model.velocity.scale.unflatten(0, (-1, 3))
     body_scale = torch.zeros(1, 3, dtype=torch.float64)
     body_scale[:, model.free] = noise * model.body_displacement.scale
@@ -155,10 +143,10 @@ def moments(
     target = torch.zeros_like(model.weights)
     for draw in range(draws):
         source, body_source = (generator(windows.seed, draw, stream) for stream in (1, 2))
-        for rows in windows.targets.split(_CHUNK):
-            shape = len(rows), windows.history
+        for targets in windows.targets.split(_CHUNK):
+            shape = len(targets), windows.history
             walks = random_walk(scale, shape, source), random_walk(body_scale, shape, body_source)
-            batch = windows.windows(rows, walks)
+            batch = windows.windows(targets, walks)
             monomials = model.monomials(batch.history, batch.shown_body, batch.context)
             gram += monomials.T @ monomials
             target += monomials.T @ normalised(outputs, true_outputs(model, batch))
@@ -182,17 +170,8 @@ def solved(gram: Tensor, target: Tensor) -> Tensor:
 
 
 def sparse(known: Moments, penalty: float, threshold: float, rounds: int = 10) -> Tensor:
-    """Ridge regression of each output, repeated without the terms that add little until none does.
-
-    Args:
-        known: Moments of the library.
-        penalty: As in `Setting`.
-        threshold: As in `Setting`.
-        rounds: Most repetitions.
-
-    Returns:
-        Coefficients, shape (m, o), most of them zero.
-    """
+    """Ridge regression of each output, repeated without the terms that add little until none does; shape (m, o), most
+    of them zero. Penalty and threshold as in `Setting`."""
     size = known.gram.diagonal().sqrt()
     weight = torch.full_like(size, penalty)
     weight[0] = 0.0
@@ -226,14 +205,8 @@ def coefficients(known: Moments, setting: Setting) -> Tensor:
 def candidates(
     known: Mapping[float, Moments], penalties: Sequence[float], threshold: float = 0.0, linear: bool = False
 ) -> dict[Setting, Tensor]:
-    """Coefficients for every penalty and noise.
-
-    Args:
-        known: Moments of one model by noise.
-        penalties: As in `Setting`.
-        threshold: As in `Setting`.
-        linear: Whether those without products of inputs are among them, too.
-    """
+    """Coefficients for every penalty and every noise that the moments of a model are known for; with `linear`
+    also those without products of inputs."""
     settings = [Setting(noise, penalty, threshold) for noise in known for penalty in penalties]
     if linear:
         settings += [setting._replace(linear=True) for setting in settings]
@@ -244,13 +217,7 @@ def select(
     model: PolynomialDynamics, found: Mapping[Setting, Tensor], rollouts: ValidationRollouts
 ) -> Selection:
     """Give a model the best coefficients: of the modes by the skill of rollouts, then of a free body by its error
-    along the rollouts of these modes, then of force and torque by the force error along those of both.
-
-    Args:
-        model: Its coefficients are replaced.
-        found: From `candidates`.
-        rollouts: Of the validation runs.
-    """
+    along the rollouts of these modes, then of force and torque by the force error along those of both."""
 
     def score(*selection: Setting) -> RolloutScore:
         take(model, *(found[setting] for setting in selection))

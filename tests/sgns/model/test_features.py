@@ -197,8 +197,6 @@ def test_the_slowest_travel_is_a_pace_not_a_stop(tmp_path) -> None:
     many = [first] * 20
     assert slowest_travel([stopping, *many]) == pytest.approx(slowest_travel(many), rel=0.05)
     still = dataclasses.replace(
-        first,
-        pose=first.pose[:1].repeat(14, axis=0),
-        body_points=first.body_points[:1].repeat(14, axis=0),
+        first, pose=first.pose[:1].repeat(14, axis=0), body_points=first.body_points[:1].repeat(14, axis=0)
     )
     assert slowest_travel([still]) == 0.0

@@ -104,8 +104,7 @@ def test_modes_are_told_apart(data) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
-    [("history", 1), ("hidden_layers", 0), ("body_nodes", "mesh"), ("activation", "step")],
+    ("key", "value"), [("history", 1), ("hidden_layers", 0), ("body_nodes", "mesh"), ("activation", "step")]
 )
 def test_wrong_settings_name_their_key(key, value) -> None:
     with pytest.raises(UserError, match=f"model.{key}"):
