@@ -241,9 +241,7 @@ def refitted(
     model: PolynomialDynamics, windows: TrainingWindows, selection: Selection, draws: int = 2
 ) -> None:
     """Give a model the coefficients of settings that `select` found on a part of these windows."""
-    known = {
-        noise: moments(model, windows, noise, draws) for noise in {setting.noise for setting in selection}
-    }
+    known = {noise: moments(model, windows, noise, draws) for noise in {of.noise for of in selection}}
     take(model, *(coefficients(known[setting.noise], setting) for setting in selection))
 
 
