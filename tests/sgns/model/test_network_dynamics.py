@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import MODEL, reduced
+from tiny import MODEL
 
 from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
@@ -19,11 +19,6 @@ from sgns.model.settings import ModelSettings
 from sgns.train.windows import TrainingWindows, fit_normalisation
 
 # --- One latent step and whole paths: forces add up, rollouts are steps, modes have identities ----------
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 def fitted(data, body_nodes: str = "pose") -> tuple[LatentDynamics, TrainingWindows]:

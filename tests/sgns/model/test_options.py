@@ -6,7 +6,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from tiny import MODEL, TRAINING, reduced
+from tiny import MODEL, TRAINING
 
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
@@ -31,11 +31,6 @@ OPTIONS = {
     "fewer modes": ({}, {"fewer_modes": 1.0}),
     "exponential": ({}, {"schedule": "exponential", "decades": 4.0}),
 }
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 def module_of(data, model=None, training=None):

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny import reduced
 
 from sgns.config import UserError
 from sgns.model.features import BodyTrack
@@ -30,11 +29,6 @@ from sgns.train.polynomial import (
 from sgns.train.windows import TrainingWindows
 
 HISTORY = 3
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 def windows_of(runs, modes: int = 4) -> TrainingWindows:

@@ -12,7 +12,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
+from tiny import MODEL, REDUCTION, TRAINING, make_dataset
 
 from sgns.config import UserError
 from sgns.model.network_dynamics import Path
@@ -21,11 +21,6 @@ from sgns.train import lightning_module as module
 from sgns.train.callbacks import ValidationRollouts
 from sgns.train.command import main, train
 from sgns.train.lightning_module import TrainingSettings
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 def run(data, output, **changes) -> float:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset, reduced
+from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset
 
 from sgns.config import UserError
 from sgns.model.checkpoint import load_surrogate
@@ -21,11 +21,6 @@ from sgns.train import command as module
 from sgns.train.callbacks import ValidationRollouts
 from sgns.train.command import train
 from sgns.train.polynomial import best_polynomial
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 def run(data, output, model=POLYNOMIAL, training=FIT, **kw) -> float:

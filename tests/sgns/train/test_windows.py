@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny import MODEL, reduced
+from tiny import MODEL
 
 from sgns.config import UserError
 from sgns.model.network_dynamics import LatentDynamics
@@ -20,11 +20,6 @@ from sgns.train.windows import (
     generator,
     random_walk,
 )
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 def windows_of(data, history: int = 3, seed: int = 0) -> TrainingWindows:
