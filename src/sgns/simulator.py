@@ -88,11 +88,11 @@ class Simulator:
         self.reset()
 
     def __copy__(self) -> Simulator:
-        twin = object.__new__(type(self))
-        twin.__dict__.update(self.__dict__)
+        copied = object.__new__(type(self))
+        copied.__dict__.update(self.__dict__)
         # All else is replaced, not written to, from step to step.
-        twin._stepper = copy.copy(self._stepper)
-        return twin
+        copied._stepper = copy.copy(self._stepper)
+        return copied
 
     @classmethod
     def load(

@@ -328,6 +328,10 @@ class Standardiser(nn.Module):
             return cls(mean, torch.ones_like(scale))
         return cls(mean, scale.clamp_min(max(floor, 1e-9) * largest))
 
+    def __getitem__(self, index: slice | Tensor) -> Standardiser:
+        """Of a part of the quantity."""
+        return Standardiser(self.mean[index], self.scale[index])
+
     @classmethod
     def cat(cls, parts: Iterable[Standardiser]) -> Standardiser:
         """Of several quantities side by side."""

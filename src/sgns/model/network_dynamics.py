@@ -103,8 +103,7 @@ class LatentDynamics(Dynamics):
         fewer._modules = dict(self._modules)
         fewer.num_modes, fewer._edges = num_modes, {}
         for name in ("position", "velocity", "change"):
-            whole = getattr(self, name)
-            setattr(fewer, name, Standardiser(whole.mean[:num_modes], whole.scale[:num_modes]))
+            setattr(fewer, name, getattr(self, name)[:num_modes])
         if self.settings.identity == "mode":
             weight = torch.cat([self.identity.weight[:num_modes], self.identity.weight[-1:]])
             fewer.identity = nn.Embedding.from_pretrained(weight, freeze=False)

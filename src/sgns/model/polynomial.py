@@ -114,16 +114,13 @@ class PolynomialDynamics(Dynamics):
         fewer = PolynomialDynamics(
             self.settings, num_modes, self.context_keys, self.predicts_body, number[self.used[held]].tolist()
         )
-        fewer.inputs = Standardiser(self.inputs.mean[kept], self.inputs.scale[kept])
-        fewer.velocity = Standardiser(
-            self.velocity.mean[: 3 * num_modes], self.velocity.scale[: 3 * num_modes]
-        )
+        fewer.inputs, fewer.velocity = self.inputs[kept], self.velocity[: 3 * num_modes]
         fewer.body_displacement, fewer.force, fewer.torque = self.body_displacement, self.force, self.torque
         fewer.bounds = self.bounds[:, held]
         fewer.lowest, fewer.highest = self.lowest, self.highest
-        rows = torch.nn.functional.pad(held, (1, 0), value=True)[self.terms].all(1)
+        monomials = torch.nn.functional.pad(held, (1, 0), value=True)[self.terms].all(1)
         columns = torch.cat([self.weights[:, : 3 * num_modes], self.weights[:, 3 * r :]], dim=1)
-        fewer.weights.copy_(columns[rows])
+        fewer.weights.copy_(columns[monomials])
         return fewer
 
     def raw_inputs(self, latent: Tensor, body: BodyTrack, context: Tensor | None) -> list[Tensor]:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # F stacked frames of all runs.
 
 # Streams of random numbers that must not be the same.
-_CHOICE, _NOISE, _BODY_NOISE = 0, 1, 2
+_SAMPLING, _NOISE, _BODY_NOISE = 0, 1, 2
 
 
 class NoiseScales(NamedTuple):
@@ -98,7 +98,7 @@ class TrainingWindows:
         num_modes: r.
         history: d.
         body_nodes: "pose" or "points".
-        seed: Of choice and noise.
+        seed: Of sampling and noise.
         horizon: h, targets of a window.
         context: Keys of the scene whose numbers go with every window.
     """
@@ -178,7 +178,7 @@ class TrainingWindows:
     def batch(self, step: int, size: int, noise: NoiseScales) -> Batch:
         """The batch of an optimisation step from 0: a function of (seed, step) and nothing else, so that resuming
         changes nothing."""
-        chance = generator(self.seed, step, _CHOICE)
+        chance = generator(self.seed, step, _SAMPLING)
         sizes = torch.tensor([float(len(group)) for group in self.groups])
         group = self.groups[int(torch.multinomial(sizes, 1, generator=chance))]
         targets = group[torch.randint(len(group), (size,), generator=chance)]
