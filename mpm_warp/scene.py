@@ -13,7 +13,7 @@ import numpy as np
 from .bed import Bed
 from .bodies import Axle, MeshBody, Tool
 from .material import Material
-from .poses import angular_velocity, rotate
+from .poses import rotate, rotation_vectors
 from .settings import Settings, build, setting, settings
 from .state import SceneError
 
@@ -170,7 +170,7 @@ class Scene(Settings):
         every = np.union1d(time, rows[(rows > time[0]) & (rows < time[-1])])
         poses = self.poses_at(every)
         way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
-        angle = np.linalg.norm(angular_velocity(poses[:-1, 3:], poses[1:, 3:], 1.0), axis=1)
+        angle = np.linalg.norm(rotation_vectors(poses[:-1, 3:], poses[1:, 3:]), axis=1)
         first = np.searchsorted(every, time[:-1])
         return np.add.reduceat(way, first), np.add.reduceat(angle, first)
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
+
+if TYPE_CHECKING:
+    from sgns.reduction.reduce import ReducedDataset
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # figures without a screen, in child processes too
 torch.set_num_threads(1)  # the tests' networks are so small that more threads only wait for each other
@@ -19,3 +23,11 @@ def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir()
     monkeypatch.chdir(folder)
     return folder
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> ReducedDataset:
+    """The tiny dataset in its basis."""
+    from tiny import reduced
+
+    return reduced(tmp_path_factory.mktemp("tiny"))

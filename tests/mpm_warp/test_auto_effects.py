@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from beds import UNDAMPED, cut
+from scipy.spatial.transform import Rotation
 from test_nonlocal_solver import compiled_source, launches
 
 from mpm_warp import (
@@ -26,7 +27,7 @@ from mpm_warp import (
     effects_for,
 )
 from mpm_warp.auto_effects import EFFECTS, expected_flow
-from mpm_warp.poses import about_y, multiply, rotate
+from mpm_warp.poses import rotate
 
 BEADS = Material(
     youngs_modulus=1e5,
@@ -67,9 +68,7 @@ def test_inertial_number_of_a_cut():
 
 def test_depth_of_a_turned_plate():
     """A plate of 0.2 x 0.044 m that leans by 30 degrees about y and by 20 about x, deepest with one corner."""
-    q = multiply(
-        about_y(np.radians(30.0)), np.array([np.sin(np.radians(10.0)), 0.0, 0.0, np.cos(np.radians(10.0))])
-    )
+    q = Rotation.from_euler("xy", [20.0, 30.0], degrees=True).as_quat()
     path = [(0.0, 0.2, 0.2, 0.05, *q), (1.0, 0.3, 0.2, 0.05, *q)]
     scene = cut(motion="path", path=path)
     deepest = rotate(q, scene.blade.outline())[:, 2].min() + 0.05

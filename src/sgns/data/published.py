@@ -14,9 +14,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from mpm_warp.inputs import open_file, read_text
-from mpm_warp.poses import fitted_poses, quaternions
+from mpm_warp.poses import fitted_poses
 from sgns.arrays import is_whole
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
@@ -367,6 +368,8 @@ def _blade_poses(points: np.ndarray) -> np.ndarray:
     _, _, axes = np.linalg.svd(first - first.mean(axis=0))
     across = axes[0] * np.sign(axes[0, 1])
     along = axes[1] * np.sign(axes[1, 2])
-    turned = quaternions(np.stack([np.cross(across, along), across, along], axis=1))
+    turned = Rotation.from_matrix(np.stack([np.cross(across, along), across, along], axis=1)).as_quat(
+        canonical=True
+    )
     middle = points[:, tip].mean(axis=1)
     return np.concatenate([middle, np.tile(turned, (len(points), 1))], axis=1)

@@ -50,8 +50,8 @@ from sgns.rollout import finite_frames, single_thread
 from sgns.simulate.scene import asked_effects, decided
 from sgns.simulator import Simulator
 from sgns.states import Rollout
-from sgns.train.command import prepared, train
-from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
+from sgns.train.command import train
+from sgns.train.lightning_module import SurrogateTraining, TrainingSettings, prepared
 
 log = logging.getLogger(__name__)
 

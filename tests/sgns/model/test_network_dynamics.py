@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import MODEL, reduced
+from tiny import MODEL
 
 from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
@@ -19,11 +19,6 @@ from sgns.model.settings import ModelSettings
 from sgns.train.windows import TrainingWindows, fit_normalisation
 
 # --- One latent step and whole paths: forces add up, rollouts are steps, modes have identities ----------
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 def fitted(data, body_nodes: str = "pose") -> tuple[LatentDynamics, TrainingWindows]:
@@ -104,8 +99,7 @@ def test_modes_are_told_apart(data) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
-    [("history", 1), ("hidden_layers", 0), ("body_nodes", "mesh"), ("activation", "step")],
+    ("key", "value"), [("history", 1), ("hidden_layers", 0), ("body_nodes", "mesh"), ("activation", "step")]
 )
 def test_wrong_settings_name_their_key(key, value) -> None:
     with pytest.raises(UserError, match=f"model.{key}"):

@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tiny import reduced
 
 from sgns.config import UserError
 from sgns.model.training_range import NOTEWORTHY, TrainingRange, components, widths
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset, reduced
+from tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset
 
 from sgns.config import UserError
 from sgns.model.checkpoint import load_surrogate
@@ -20,12 +20,7 @@ from sgns.model.settings import FitSettings, PolynomialSettings
 from sgns.train import command as module
 from sgns.train.callbacks import ValidationRollouts
 from sgns.train.command import train
-from sgns.train.polynomial import fit_polynomial
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
+from sgns.train.polynomial import best_polynomial
 
 
 def run(data, output, model=POLYNOMIAL, training=FIT, **kw) -> float:
@@ -39,7 +34,7 @@ def without_validation(data, count: int):
 
 def fitted(data, **changes):
     runs = data.runs("train")
-    return fit_polynomial(
+    return best_polynomial(
         runs,
         data.runs("validation"),
         4,
@@ -72,7 +67,7 @@ def test_what_is_written_is_what_was_fitted(data, tmp_path) -> None:
 def test_a_complete_fit_is_not_repeated(data, tmp_path, monkeypatch) -> None:
     first = run(data, tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr(module, "fit_polynomial", None)
+        patch.setitem(module.FITS, "polynomial", module.FITS["polynomial"]._replace(run=None))
         assert run(data, tmp_path) == first
     with pytest.raises(UserError, match=r"model\.degree is 2 there and 1 here"):
         run(data, tmp_path, POLYNOMIAL | {"degree": 1})
@@ -89,12 +84,12 @@ def test_without_validation_runs_a_third_chooses_and_all_are_fitted(data, tmp_pa
     assert "every third training run" in caplog.text
     runs = data.runs("train")
     settings = PolynomialSettings(**POLYNOMIAL), FitSettings.from_dict(quadratic)
-    without = fit_polynomial(runs[1:3], runs[::3], 4, *settings, predicts_body=False, seed=3)
+    without = best_polynomial(runs[1:3], runs[::3], 4, *settings, predicts_body=False, seed=3)
     assert without.score.skill == skill
     # The same noise and penalty for all runs.
-    motion = without.choice.motion
+    motion = without.selection.motion
     chosen = {"noises": [motion.noise], "penalties": [motion.penalty]}
-    everything = fit_polynomial(
+    everything = best_polynomial(
         runs,
         data.runs("test"),
         4,
