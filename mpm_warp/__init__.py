@@ -1,4 +1,4 @@
-"""A 3D material point method for granular soil, in NVIDIA Warp. Usable alone; needs warp and numpy only."""
+"""A 3D material point method for granular soil, in NVIDIA Warp. Usable alone; needs warp, numpy and pydantic only."""
 
 from .auto_effects import Decision, Tolerances, effects_for
 from .batch import frames_together
@@ -9,12 +9,15 @@ from .effects import Effects
 from .limits import substeps_per_frame
 from .material import Material
 from .scene import Scene
-from .scenes import Column, Excavation, Incline, Push, Wheel
+from .scenes import Body, Column, Excavation, Incline, Wheel
 from .solver import Frame, Solver
 from .state import SceneError, SolverStopped, State
 
+Push = Body  # its former name
+
 __all__ = [
     "Bed",
+    "Body",
     "Box",
     "Column",
     "Cylinder",

@@ -69,7 +69,7 @@ def _of_body(scene: Scene) -> Flow | None:
         return None
     poses = scene.body_poses()
     depth = -(poses[:, 2] + (_heights(poses[:, 3:]) @ body.outline().T).min(axis=1))
-    way, angle = scene.travel(scene.times())
+    way, angle = scene.displacement(scene.times())
     speed = np.maximum(way, angle * body.reach) * scene.frame_rate
     if scene.axle is None:
         speed, thickness = speed[depth[:-1] > 0.0], float(depth.max())

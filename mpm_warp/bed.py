@@ -5,24 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
-from .ranges import (
-    MOST_NODES,
-    MOST_PARTICLES,
-)
+from .settings import Settings, lengths, setting, settings
 from .state import SceneError
 
 # --- What soil may do at the floor and the walls of its bin ---------------------------------------------
 
-KINDS = ("no_slip", "slip", "periodic")
+
+def _wall(where: str, kinds: str) -> Any:
+    return setting("no_slip", where, ge=0, words=f"; allowed: {kinds} or a friction coefficient of 0 or more")
 
 
-@dataclass(frozen=True)
-class Walls:
+@settings
+class Walls(Settings):
     """Condition at each pair of walls and at the floor.
 
     - `no_slip`: soil sticks, also where it would move away.
@@ -31,27 +30,18 @@ class Walls:
     - `periodic` (x or y): no walls; what leaves at one end comes in at the other.
     """
 
-    x: str | float = "no_slip"
-    """The walls at x = 0 and x = Lx."""
-    y: str | float = "no_slip"
-    """The walls at y = 0 and y = Ly."""
-    floor: str | float = "no_slip"
-    """The floor at z = -Lz."""
+    group: ClassVar[str] = "bed.walls"
 
-    def __post_init__(self) -> None:
-        for name in ("x", "y", "floor"):
-            value = getattr(self, name)
-            kinds = KINDS if name != "floor" else KINDS[:2]
-            friction = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if friction and math.isfinite(value) and value >= 0:
-                object.__setattr__(self, name, float(value))
-            elif friction or value not in kinds:
-                raise SceneError(
-                    f"bed.walls.{name} is {value!r}; allowed: {', '.join(kinds)} or a friction coefficient of 0 or more"
-                )
+    x: Literal["no_slip", "slip", "periodic"] | float = _wall(
+        "walls at x = 0, x = Lx", "no_slip, slip, periodic"
+    )
+    y: Literal["no_slip", "slip", "periodic"] | float = _wall(
+        "walls at y = 0, y = Ly", "no_slip, slip, periodic"
+    )
+    floor: Literal["no_slip", "slip"] | float = _wall("the floor at z = -Lz", "no_slip, slip")
 
     @property
-    def kinds(self) -> tuple[str, str, str]:
+    def conditions(self) -> tuple[str, str, str]:
         """`no_slip`, `slip`, `friction` or `periodic` for x, y and the floor: what the kernels are compiled for."""
         return tuple(v if isinstance(v, str) else "friction" for v in (self.x, self.y, self.floor))
 
@@ -63,7 +53,7 @@ class Walls:
 
 # --- Where the particles of an undisturbed bed are ------------------------------------------------------
 
-ARRANGEMENTS = ("lattice", "jittered", "poisson")
+Arrangement = Literal["lattice", "jittered", "poisson"]
 # Poisson-disk radius in units of the particle spacing; with it a bed holds about 0.8 points per cube of the
 # spacing, which is the published beds' density.
 POISSON_RADIUS = 0.897
@@ -86,73 +76,67 @@ def arrange(
     Returns:
         Positions [m], shape (n, 3), float64, read-only, and the volume of one particle [m^3].
     """
-    points, volume = _arranged(kind, size, spacing, seed, mirrored)
+    if kind not in get_args(Arrangement):
+        raise SceneError(f"bed.arrangement is {kind!r}; allowed: {', '.join(get_args(Arrangement))}")
+    volume = particle_volume(kind, size, spacing)
+    if kind == "poisson":
+        points = _random_points(size, POISSON_RADIUS * spacing, seed, mirrored)
+    else:
+        counts = _lattice_counts(size, spacing)
+        axes = [(np.arange(c) + 0.5) * s for c, s in zip(counts, np.asarray(size) / counts, strict=True)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        points[:, 2] -= size[2]
+        if kind == "jittered":
+            points = points + _jitter(np.asarray(size), counts, seed, mirrored)
     points.flags.writeable = False
     return points, volume
 
 
-def _arranged(
-    kind: str, size: tuple[float, float, float], spacing: float, seed: int, mirrored: bool
-) -> tuple[np.ndarray, float]:
-    if kind == "lattice":
-        return lattice(size, spacing)
-    if kind == "jittered":
-        points, volume = lattice(size, spacing)
-        rng = np.random.default_rng(seed)
-        counts = rows_of(size, spacing)
-        moved = (np.asarray(size) / counts * rng.uniform(-0.5, 0.5, points.shape)).reshape(*counts, 3)
-        if mirrored:
-            # The far half of the rows moves as the near one does, mirrored; a row in the middle stays in the plane.
-            image = moved[:, ::-1] * [1.0, -1.0, 1.0]
-            far = np.arange(counts[1]) >= (counts[1] + 1) // 2
-            moved[:, far] = image[:, far]
-            if counts[1] % 2:
-                moved[:, counts[1] // 2, :, 1] = 0.0
-        points = points + moved.reshape(-1, 3)
-        return points, volume
-    if kind == "poisson":
-        # Sampled on a larger box and trimmed: points crowd at the edge of the box they were sampled in.
-        radius = POISSON_RADIUS * spacing
-        margin = 2.0 * radius
-        if mirrored:
-            # Points that would be too close to their own image go onto the plane.
-            lx, ly, lz = size
-            points = poisson_disk(
-                (lx + 2.0 * margin, 0.5 * ly + margin, lz + 2.0 * margin), radius, seed, snap=0.5 * radius
-            )
-            points += [-margin, 0.5 * ly, margin]
-            off_plane = points[points[:, 1] > 0.5 * ly]
-            points = np.concatenate([points, off_plane * [1.0, -1.0, 1.0] + [0.0, ly, 0.0]])
-            points = points[_reading_order(points, radius)]
-            inside = (points >= [0.0, 0.0, -lz]) & (points <= [lx, ly, 0.0])
-            return points[inside.all(axis=1)], spacing**3
-        points = poisson_disk(tuple(s + 2.0 * margin for s in size), radius, seed)
-        points += [-margin, -margin, margin]
-        inside = (points >= [0.0, 0.0, -size[2]]) & (points <= [size[0], size[1], 0.0])
-        return points[inside.all(axis=1)], spacing**3
-    raise SceneError(f"bed.arrangement is {kind!r}; allowed: {', '.join(ARRANGEMENTS)}")
+def particle_volume(kind: str, size: tuple[float, float, float], spacing: float) -> float:
+    """The volume that `arrange` gives with the particles [m^3], without making these."""
+    return (
+        spacing**3 if kind == "poisson" else float(np.prod(np.asarray(size) / _lattice_counts(size, spacing)))
+    )
 
 
-def rows_of(size: tuple[float, float, float], spacing: float) -> np.ndarray:
-    """Particles of a lattice along each side, shape (3,)."""
+def _lattice_counts(size: tuple[float, float, float], spacing: float) -> np.ndarray:
+    """Particles of a lattice along each side, whose spacing is adjusted to fit it, shape (3,)."""
     return np.maximum(1, np.round(np.asarray(size) / spacing)).astype(int)
 
 
-def particle_volume(kind: str, size: tuple[float, float, float], spacing: float) -> float:
-    """The volume that `arrange` gives with the particles [m^3], without making these."""
-    if kind == "poisson":
-        return spacing**3
-    return float(np.prod(np.asarray(size) / rows_of(size, spacing)))
+def _jitter(size: np.ndarray, counts: np.ndarray, seed: int, mirrored: bool) -> np.ndarray:
+    """By what the particles of a lattice move [m], shape (n, 3)."""
+    random = np.random.default_rng(seed).uniform(-0.5, 0.5, (np.prod(counts), 3))
+    moved = (size / counts * random).reshape(*counts, 3)
+    if mirrored:
+        # The far half moves as the near one does, mirrored; particles in the middle stay in the plane.
+        image = moved[:, ::-1] * [1.0, -1.0, 1.0]
+        far = np.arange(counts[1]) >= (counts[1] + 1) // 2
+        moved[:, far] = image[:, far]
+        if counts[1] % 2:
+            moved[:, counts[1] // 2, :, 1] = 0.0
+    return moved.reshape(-1, 3)
 
 
-def lattice(size: tuple[float, float, float], spacing: float) -> tuple[np.ndarray, float]:
-    """A regular lattice that fills the bed exactly; the spacing is adjusted to fit each side."""
-    counts = rows_of(size, spacing)
-    step = np.asarray(size) / counts
-    axes = [(np.arange(c) + 0.5) * s for c, s in zip(counts, step, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    grid[:, 2] -= size[2]
-    return grid, float(np.prod(step))
+def _random_points(size: tuple[float, float, float], radius: float, seed: int, mirrored: bool) -> np.ndarray:
+    """Points of a bed that keep `radius` apart [m], shape (n, 3).
+
+    Sampled in a larger box and trimmed: points crowd at the edge of the box they were sampled in.
+    """
+    lx, ly, lz = size
+    margin = 2.0 * radius
+    if mirrored:
+        # Points that would be too close to their own image go onto the plane.
+        half = (lx + 2.0 * margin, 0.5 * ly + margin, lz + 2.0 * margin)
+        points = poisson_disk(half, radius, seed, snap=0.5 * radius)
+        points += [-margin, 0.5 * ly, margin]
+        off_plane = points[points[:, 1] > 0.5 * ly]
+        points = np.concatenate([points, off_plane * [1.0, -1.0, 1.0] + [0.0, ly, 0.0]])
+        points = points[_reading_order(points, radius)]
+    else:
+        points = poisson_disk(tuple(s + 2.0 * margin for s in size), radius, seed)
+        points += [-margin, -margin, margin]
+    return points[((points >= [0.0, 0.0, -lz]) & (points <= [lx, ly, 0.0])).all(axis=1)]
 
 
 def poisson_disk(
@@ -211,50 +195,48 @@ def _reading_order(points: np.ndarray, radius: float) -> np.ndarray:
     return np.lexsort((points[:, 2] // radius, points[:, 1] // radius, points[:, 0] // radius))
 
 
-# --- What is to be simulated: plain data, checked, without physics --------------------------------------
+# --- The bed: its bin, grid and particles ----------------------------------------------------------------
 
 PADDING = 3
 """Grid cells outside the bin, so that the nodes around a particle at a wall exist."""
-INITIAL_STRESSES = ("geostatic", "k0", "none")
+MOST_PARTICLES = 20_000_000
+MOST_NODES = 200_000_000
+"""Of the grid; both far beyond what has been computed, and short of what ends in an error or never ends."""
 
 
-@dataclass(frozen=True)
-class Bed:
+@settings
+class Bed(Settings):
     """The soil bin and how it is filled. z = 0 is the undisturbed surface."""
 
-    size: tuple[float, float, float] = (0.80, 0.60, 0.15)
-    """Lx, Ly, Lz [m]."""
-    spacing: float = 0.8 / 60
-    """Grid spacing dx [m]."""
-    particles_per_cell: float = 1.0
-    """Particles per grid cell of a full bed."""
-    arrangement: str = "lattice"
-    """lattice | jittered | poisson (see `arrange`)."""
-    seed: int = 0
-    """Of the random arrangements."""
-    mirrored: bool = False
-    """A random arrangement is its own mirror image about y = Ly / 2, which mirror symmetry needs."""
-    initial_stress: str = "geostatic"
-    """geostatic: isotropic pressure rho g depth; k0: the horizontal stress is nu / (1 - nu) times the vertical one;
-    none: stress-free, settles in the first frames."""
-    headroom: float = 0.25
-    """Height above the surface up to which soil may be thrown or piled [m]."""
-    store_every: int = 1
-    """Particles per particle that is recorded; the solver computes all of them."""
-    walls: Walls = field(default_factory=Walls)
-    """What soil may do at walls and floor."""
+    group: ClassVar[str] = "bed"
+
+    size: tuple[float, float, float] = lengths((0.80, 0.60, 0.15), "Lx, Ly, Lz")
+    spacing: float = setting(0.0133333333, "grid spacing, at most half the bin's smallest side", "m")
+    particles_per_cell: float = setting(1.0, "particles in a grid cell of a full bed", gt=0, le=64)
+    arrangement: Arrangement = setting(
+        "lattice", "of the particles: a lattice, one with each particle moved at random, or random points"
+    )
+    seed: int = setting(0, "of the random arrangements")
+    mirrored: bool = setting(False, "a random arrangement mirrors itself about y = Ly / 2, as symmetry needs")
+    initial_stress: Literal["geostatic", "k0", "none"] = setting(
+        "geostatic",
+        "geostatic: the pressure is rho g depth, the same in all directions; k0: the horizontal stress is "
+        "nu / (1 - nu) times the vertical one; none: stress-free, settles in the first frames",
+    )
+    headroom: float = setting(0.25, "height above the surface that soil may reach", "m", gt=0)
+    store_every: int = setting(
+        1,
+        "one particle of so many is recorded; the solver computes all",
+        ge=1,
+        words="; it must be a whole number, 1 or more",
+    )
+    walls: Walls = setting(Walls, "what soil may do at walls and floor")
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "size", tuple(float(s) for s in self.size))
-        if len(self.size) != 3 or not all(math.isfinite(s) and s > 0 for s in self.size):
-            raise SceneError(f"bed.size is {self.size}; it needs three lengths above 0 m")
-        if not (math.isfinite(self.spacing) and 0 < self.spacing <= min(self.size) / 2):
+        super().__post_init__()
+        if not 0 < self.spacing <= min(self.size) / 2:
             raise SceneError(
                 f"bed.spacing is {self.spacing} m; allowed: above 0, at most half the bin's smallest side"
-            )
-        if not 0 < self.particles_per_cell <= 64:
-            raise SceneError(
-                f"bed.particles_per_cell is {self.particles_per_cell}; allowed: above 0, at most 64"
             )
         particles = math.prod(s / self.spacing for s in self.size) * self.particles_per_cell
         if not particles <= MOST_PARTICLES:
@@ -262,14 +244,6 @@ class Bed:
                 f"the bed would hold {particles:.2g} particles; at most {MOST_PARTICLES:g} are allowed: use a larger "
                 "bed.spacing, a smaller bed.size or fewer bed.particles_per_cell"
             )
-        if self.arrangement not in ARRANGEMENTS:
-            raise SceneError(f"bed.arrangement is {self.arrangement!r}; allowed: {', '.join(ARRANGEMENTS)}")
-        if self.initial_stress not in INITIAL_STRESSES:
-            raise SceneError(
-                f"bed.initial_stress is {self.initial_stress!r}; allowed: {', '.join(INITIAL_STRESSES)}"
-            )
-        if not (math.isfinite(self.headroom) and self.headroom > 0):
-            raise SceneError(f"bed.headroom is {self.headroom} m; it must be above 0")
         height, margin = self.size[2] + self.headroom, 2.0 * PADDING + 2.0
         floor = math.prod(s / self.spacing + margin for s in self.size[:2])
         nodes = floor * (height / self.spacing + margin)
@@ -280,11 +254,7 @@ class Bed:
                 f"bed.headroom is {self.headroom} m and bed.spacing {self.spacing} m: the grid would have {nodes:.3g} "
                 f"nodes; at most {MOST_NODES:g} are allowed: {key}"
             )
-        if not (self.store_every >= 1 and self.store_every == int(self.store_every)):
-            raise SceneError(f"bed.store_every is {self.store_every}; it must be a whole number, 1 or more")
-        if not isinstance(self.mirrored, bool):
-            raise SceneError(f"bed.mirrored is {self.mirrored!r}; allowed: true, false")
-        for name, kind, length in zip("xy", self.walls.kinds, self.size, strict=False):
+        for name, kind, length in zip("xy", self.walls.conditions, self.size, strict=False):
             if kind == "periodic" and abs(length / self.spacing - round(length / self.spacing)) > 1e-6:
                 raise SceneError(
                     f"bed.walls.{name} is periodic but the bin's {length} m are {length / self.spacing:.3f} grid "
@@ -322,22 +292,6 @@ class Bed:
     @property
     def _arranged(self) -> tuple[np.ndarray, float]:
         return arrange(self.arrangement, self.size, self.particle_spacing, self.seed, self.mirrored)
-
-    @cached_property
-    def stored(self) -> np.ndarray:
-        """Indices of the particles of a full bed that are recorded; see `stored_of`."""
-        return self.stored_of(len(self.filled[0]))
-
-    def stored_of(self, count: int) -> np.ndarray:
-        """Indices of those of `count` particles that are recorded, increasing: one of every `store_every` that follow
-        each other.
-
-        Which one is drawn at random, always the same way: at fixed steps a lattice would be recorded in some of
-        its layers only.
-        """
-        first = np.arange(0, count, self.store_every)
-        left = np.minimum(self.store_every, count - first)
-        return first + np.random.default_rng(0).integers(left)
 
     @property
     def arrangement_hash(self) -> str:

@@ -1,33 +1,23 @@
-"""A body whose height is free: it carries a load and rests on the soil.
-
-One thread on the device moves it once per substep with the impulse the soil gave it, so nothing waits for the host and
-the step can be part of a captured graph. Height and speed are kept in double precision whatever the solver's: in
-single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that sinks slower than one such step per
-substep would hang in the air.
-"""
+"""The rigid bodies that touch the soil: their size, friction and nodes, as plain data."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from .inputs import read_bytes
 from .mesh import checked_mesh, closed_mesh, read_mesh
+from .settings import Settings, lengths, same, setting, settings
 from .state import SceneError
 
 # --- A body whose height is free: it carries a load and rests on the soil -------------------------------
-# One thread on the device moves it once per substep with the impulse the soil gave it, so nothing waits for
-# the host and
-# the step can be part of a captured graph. Height and speed are kept in double precision whatever the solver's: in
-# single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that sinks slower than one such step per
-# substep would hang in the air.
 
 
 @dataclass(frozen=True)
@@ -43,8 +33,8 @@ class Axle:
 # --- Rigid bodies that touch the soil: their size, friction and nodes, as plain data --------------------
 
 
-class Body(ABC):
-    """What a solver asks of any body. The body frame's origin is its centre of mass."""
+class Tool(ABC):
+    """What a solver asks of any rigid body. The body frame's origin is its centre of mass."""
 
     surface: ClassVar[str]
     """Which signed distance it has: box | cylinder | mesh (kernels/signed_distance.py)."""
@@ -78,13 +68,8 @@ class Body(ABC):
         return []
 
 
-def _require(body: Any, where: str, positive: tuple[str, ...], unit: str = "m") -> None:
-    for name in positive:
-        value = getattr(body, name)
-        if not (math.isfinite(value) and value > 0):
-            raise SceneError(f"{where}.{name} is {value}; it must be above 0 {unit}")
-    if not (math.isfinite(body.friction) and body.friction >= 0):
-        raise SceneError(f"{where}.friction is {body.friction}; it must be 0 or more")
+def _length(default: float, words: str) -> Any:
+    return setting(default, words, "m", gt=0, words="; it must be above 0 m")
 
 
 def _corners(half_size: np.ndarray) -> np.ndarray:
@@ -99,26 +84,20 @@ def _box_outline(half_size: np.ndarray, count: int = 9) -> np.ndarray:
     )
 
 
-@dataclass(frozen=True)
-class Plate(Body):
+@settings
+class Plate(Settings, Tool):
     """A blade: a box centred on its centre of mass.
 
     Body frame: x through the thickness (front face at +x), y along the width, z along the length (tip at -z).
     """
 
+    group: ClassVar[str] = "blade"
     surface: ClassVar[str] = "box"
 
-    length: float = 0.305
-    """Along the blade, tip to top [m]."""
-    width: float = 0.457
-    """Across the direction of travel [m]."""
-    thickness: float = 0.028
-    """[m]; about 2 to 3 grid spacings are needed to keep the soil on its two sides apart."""
-    friction: float = 0.3
-    """Coulomb friction between soil and blade [-]."""
-
-    def __post_init__(self) -> None:
-        _require(self, "blade", ("length", "width", "thickness"))
+    length: float = _length(0.305, "along the blade, tip to top")
+    width: float = _length(0.457, "across the direction of travel")
+    thickness: float = _length(0.028, "2 to 3 grid spacings keep the soil on its two sides apart")
+    friction: float = setting(0.3, "Coulomb friction between soil and body", ge=0)
 
     @property
     def half_size(self) -> np.ndarray:
@@ -140,23 +119,16 @@ class Plate(Body):
         return _box_outline(self.half_size)
 
 
-@dataclass(frozen=True)
-class Box(Body):
+@settings
+class Box(Settings, Tool):
     """A box centred on its centre of mass; its nodes are its corners."""
 
+    group: ClassVar[str] = "tool"
     surface: ClassVar[str] = "box"
 
-    shape: str = "box"
-    size: tuple[float, float, float] = (0.05, 0.05, 0.05)
-    """Sides along the body's x, y, z [m]."""
-    friction: float = 0.3
-    """Coulomb friction [-]."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "size", tuple(float(s) for s in self.size))
-        if len(self.size) != 3 or not all(math.isfinite(s) and s > 0 for s in self.size):
-            raise SceneError(f"tool.size is {self.size}; it needs three lengths above 0 m")
-        _require(self, "tool", ())
+    shape: Literal["box"] = setting("box", "of the body")
+    size: tuple[float, float, float] = lengths((0.08, 0.20, 0.10), "sides along the body's x, y, z")
+    friction: float = same(Plate, "friction")
 
     @property
     def half_size(self) -> np.ndarray:
@@ -169,32 +141,29 @@ class Box(Body):
         return _box_outline(self.half_size)
 
 
-@dataclass(frozen=True)
-class Cylinder(Body):
+@settings
+class Cylinder(Settings, Tool):
     """A cylinder along the body's y axis, with or without grousers: straight bars along the rim."""
 
+    group: ClassVar[str] = "tool"
     surface: ClassVar[str] = "cylinder"
 
-    shape: str = "cylinder"
-    diameter: float = 0.15
-    """Of the rim, without grousers [m]."""
-    width: float = 0.083
-    """Along the axis [m]."""
-    friction: float = 0.3
-    """Coulomb friction [-]."""
-    grousers: int = 0
-    """How many, evenly spaced; the first is at the body's +x."""
-    grouser_height: float = 0.0
-    """Above the rim [m]."""
-    grouser_thickness: float = 0.0
-    """Along the rim [m]."""
+    shape: Literal["cylinder"] = setting("cylinder", "of the body")
+    diameter: float = _length(0.15, "of the rim, without grousers")
+    width: float = _length(0.083, "along the axis")
+    friction: float = same(Plate, "friction")
+    grousers: int = setting(
+        0, "bars along the rim, evenly spaced; the first is at the body's +x", ge=0, le=360
+    )
+    grouser_height: float = setting(0.0, "above the rim", "m")
+    grouser_thickness: float = setting(0.0, "along the rim", "m")
 
     def __post_init__(self) -> None:
-        _require(self, "tool", ("diameter", "width"))
-        if not 0 <= self.grousers <= 360:
-            raise SceneError(f"tool.grousers is {self.grousers}; allowed: 0 to 360")
+        super().__post_init__()
         if self.grousers:
-            _require(self, "tool", ("grouser_height", "grouser_thickness"))
+            for name in ("grouser_height", "grouser_thickness"):
+                if not getattr(self, name) > 0:
+                    raise SceneError(f"tool.{name} is {getattr(self, name)}; it must be above 0 m")
             gap = math.pi * self.diameter / self.grousers
             if self.grouser_thickness >= gap:
                 raise SceneError(
@@ -230,26 +199,25 @@ class Cylinder(Body):
         return np.concatenate([np.stack([x, np.full(count, y), z], axis=-1) for y in (-half, half)])
 
 
-@dataclass(frozen=True)
-class MeshBody(Body):
+@settings
+class MeshBody(Settings, Tool):
     """A closed triangle mesh from an STL or OBJ file. Its axes are the file's; its origin becomes the centre
     of mass of a body of uniform density.
 
     The file is read here; a body that is described together with its mesh is made by `of_mesh` and reads none.
     """
 
+    group: ClassVar[str] = "tool"
     surface: ClassVar[str] = "mesh"
     node_count: ClassVar[int] = 16
 
-    shape: str = "mesh"
-    file: str = ""
-    """STL (text or binary) or OBJ."""
-    scale: float = 1.0
-    """Metres per unit of the file, 0.001 for millimetres."""
-    friction: float = 0.3
-    """Coulomb friction [-]."""
-    digest: str = field(default="")
-    """Names the file's content; filled in when it is read, and checked if it is given."""
+    shape: Literal["mesh"] = setting("mesh", "of the body")
+    file: str = setting("", "STL (text or binary) or OBJ")
+    scale: float = setting(1.0, "metres per unit of the file, 0.001 for millimetres", gt=0)
+    friction: float = same(Plate, "friction")
+    digest: str = setting(
+        "", "names the file's content; filled in when it is read, and checked if it is given"
+    )
 
     @classmethod
     def of_mesh(cls, vertices: np.ndarray, triangles: np.ndarray, **values: Any) -> MeshBody:
@@ -269,7 +237,7 @@ class MeshBody(Body):
         return body
 
     def __post_init__(self) -> None:
-        _require(self, "tool", ("scale",), "")
+        super().__post_init__()
         if "mesh" in self.__dict__:  # from `of_mesh`
             return
         if not self.file:

@@ -6,12 +6,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from .bodies import Body
+from .bodies import Tool
 from .poses import rotate
 from .solver import Frame
 
 
-def leaked(frames: Iterable[Frame], body: Body, edge: float = 0.0) -> np.ndarray:
+def leaked(frames: Iterable[Frame], body: Tool, edge: float = 0.0) -> np.ndarray:
     """How often each particle crossed a thin body, shape (n,), int.
 
     Counted are crossings of the plane x = 0 of the body frame, half-way through a plate's thickness, where the crossing
@@ -47,7 +47,7 @@ def leaked(frames: Iterable[Frame], body: Body, edge: float = 0.0) -> np.ndarray
     return crossings
 
 
-def leakage(frames: Iterable[Frame], body: Body, edge: float = 0.0) -> float:
+def leakage(frames: Iterable[Frame], body: Tool, edge: float = 0.0) -> float:
     """Share of the soil that met a thin body and went through it [-].
 
     Soil that met it: particles that crossed it, or were in some frame within the box around it widened by its thickness

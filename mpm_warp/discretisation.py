@@ -37,7 +37,7 @@ def lay_grid(
     high = [PADDING + cells[0], PADDING + cells[1], 2**30]
     ghosts = {}
     for axis in (0, 1):
-        if bed.walls.kinds[axis] == "periodic":
+        if bed.walls.conditions[axis] == "periodic":
             ghosts[axis] = seam_pairs(PADDING, cells[axis])
             low[axis], high[axis] = -1, 2**30  # no walls
     if symmetric:

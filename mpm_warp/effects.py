@@ -2,57 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
+from typing import ClassVar
 
+from .settings import Settings, setting, settings
 from .state import SceneError
 
-_REASONS = {
-    "yielding": ("soil flows when shear exceeds friction", "purely elastic soil was asked for"),
-    "rate_dependence": (
-        "friction rises with the inertial number, mu(I)",
-        "friction is the constant mu_s (Drucker-Prager)",
-    ),
-    "fluidity": (
-        "the fluidity follows its own dynamics with the time t_0",
-        "the fluidity takes its steady value at once",
-    ),
-    "nonlocality": (
-        "flow spreads over a few grain diameters",
-        "flow depends on the stress at the same place only",
-    ),
-    "separation": ("soil below its critical density carries no stress", "soil may carry tension"),
-    "symmetry": ("half the bed is computed and mirrored", "the whole bed is computed"),
-    "torque": ("the torque on the body is recorded", "no torque is recorded"),
-}
 
-
-@dataclass(frozen=True)
-class Effects:
+@settings
+class Effects(Settings):
     """Physics that can be left out; the kernels are compiled without what is off."""
 
-    yielding: bool = True
-    """Frictional yield; off: elastic soil."""
-    rate_dependence: bool = True
-    """mu(I) instead of a constant mu_s. Needs `yielding`."""
-    fluidity: bool = False
-    """The fluidity as a field with its own dynamics. Needs `rate_dependence`."""
-    nonlocality: bool = False
-    """Cooperative flow, the Laplacian of the fluidity. Needs `rate_dependence`."""
-    separation: bool = True
-    """A stress-free state below the critical density; off: the soil can carry tension."""
-    symmetry: bool = False
-    """Half the bed is computed, the other half is its mirror image. Needs a scene that is mirror symmetric about
-    y = Ly / 2."""
-    torque: bool = True
-    """The torque on a body is added up; off: it is recorded as 0."""
+    group: ClassVar[str] = "effects"
+
+    # The help says why a run has an effect, the note why it does not, in run files too.
+    yielding: bool = setting(
+        True, "soil flows when shear exceeds friction", note="purely elastic soil was asked for"
+    )
+    rate_dependence: bool = setting(
+        True,
+        "friction rises with the inertial number, mu(I)",
+        note="friction is the constant mu_s (Drucker-Prager)",
+    )
+    fluidity: bool = setting(
+        False,
+        "the fluidity follows its own dynamics with the time t_0",
+        note="the fluidity takes its steady value at once",
+    )
+    nonlocality: bool = setting(
+        False,
+        "flow spreads over a few grain diameters",
+        note="flow depends on the stress at the same place only",
+    )
+    separation: bool = setting(
+        True, "soil below its critical density carries no stress", note="soil may carry tension"
+    )
+    symmetry: bool = setting(False, "half the bed is computed and mirrored", note="the whole bed is computed")
+    torque: bool = setting(True, "the torque on the body is recorded", note="no torque is recorded")
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.rate_dependence and not self.yielding:
             raise SceneError(
                 "effects.rate_dependence needs effects.yielding: soil that does not yield has no friction that could "
                 "depend on the rate; set effects.rate_dependence=false"
             )
-
         for name in ("fluidity", "nonlocality"):
             if getattr(self, name) and not self.rate_dependence:
                 raise SceneError(
@@ -62,10 +56,8 @@ class Effects:
 
     def described(self) -> dict[str, dict[str, bool | str]]:
         """Each effect with its state and the reason, as stored in a run file."""
+        known = {f.name: (getattr(self, f.name), f.metadata["setting"]) for f in fields(self)}
         return {
-            f.name: {
-                "on": getattr(self, f.name),
-                "reason": _REASONS[f.name][0 if getattr(self, f.name) else 1],
-            }
-            for f in fields(self)
+            name: {"on": on, "reason": effect.help if on else effect.note}
+            for name, (on, effect) in known.items()
         }

@@ -12,10 +12,14 @@ import warp as wp
 from .bed import Bed
 from .launch import find_device
 from .material import Material
-from .ranges import MOST_STEPS, MOST_SUBSTEPS
 from .rigid_body import longest_step
 from .scene import Scene
 from .state import SceneError
+
+MOST_SUBSTEPS = 1_000_000
+"""Between two frames."""
+MOST_STEPS = 1_000_000_000
+"""Substeps of a whole run."""
 
 # --- How long a step may be, and how many of them pass between two remaps -------------------------------
 
@@ -82,14 +86,14 @@ def top_body_speed(scene: Scene, step: float | None = None) -> float:
     if scene.body is None:
         return 0.0
     times = scene.times()
-    top = float(np.max(scene.ways(times), initial=0.0) * scene.frame_rate)
+    top = float(np.max(scene.largest_displacement(times), initial=0.0) * scene.frame_rate)
     rows = scene.path_times()
     if step is None or not len(rows):
         return top
     # Where a path is fastest, such a time begins or ends at one of its rows.
     begin = np.clip(np.concatenate([rows, rows - step]), 0.0, times[-1])
     every = np.unique(np.concatenate([[0.0], begin, begin + step]))
-    travelled = np.concatenate([[0.0], np.cumsum(scene.ways(every))])
+    travelled = np.concatenate([[0.0], np.cumsum(scene.largest_displacement(every))])
     way = np.interp(begin + step, every, travelled) - np.interp(begin, every, travelled)
     return max(top, float(way.max()) / step)
 
@@ -201,7 +205,7 @@ def speed_bound(scene: Scene, time_step: float) -> float:
     start = float(np.linalg.norm(scene.initial_velocities(), axis=1).max(initial=0.0))
     height = bed.size[2] + bed.headroom + abs(math.sin(math.radians(scene.tilt))) * bed.size[0]
     fall = math.sqrt(2.0 * scene.gravity * height)
-    if bed.walls.kinds[0] == "periodic" and scene.tilt:
+    if bed.walls.conditions[0] == "periodic" and scene.tilt:
         fall = max(fall, scene.gravity * scene.duration)
     return 4.0 * (start + top_body_speed(scene, time_step) + fall) + 0.5 * scene.material.wave_speed
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
-from .ranges import LEAST_PACKING, MOST_POISSONS_RATIO, YOUNGS_MODULUS
+from .settings import Settings, setting, settings
 from .state import SceneError
 
 # --- From an angle of internal friction to the cone's static friction mu_s ------------------------------
@@ -20,103 +20,64 @@ simple shear, `sin` in plane strain, `triaxial` in triaxial compression. In othe
 
 
 def static_friction(angle: float, friction_map: str = "tan") -> float:
-    """mu_s [-] of soil with friction angle `angle` [degrees].
-
-    Raises:
-        SceneError: when the map is not known or the angle not between 0 and 90 degrees.
-    """
-    if friction_map not in FRICTION_MAPS:
-        raise SceneError(
-            f"material.friction_map is {friction_map!r}; allowed: {', '.join(sorted(FRICTION_MAPS))}"
-        )
-    if isinstance(angle, bool) or not isinstance(angle, (int, float)) or not 0.0 < angle < 90.0:
-        raise SceneError(
-            f"material.friction_angle is {angle!r}; allowed: above 0 and below 90 degrees, or null for "
-            "material.static_friction"
-        )
+    """mu_s [-] of soil with friction angle `angle` [degrees], between 0 and 90."""
     return FRICTION_MAPS[friction_map](math.radians(angle))
 
 
 # --- Soil parameters ------------------------------------------------------------------------------------
 
-RATE_LAWS = ("saturating", "linear")
-FLUIDITY_AT_WALLS = ("zero", "free")
 FRICTION_RANGE = 0.2016
 """mu_2 - mu_s of the paper's sand: what the limit friction is set above a static friction that reaches it."""
 
 
-@dataclass(frozen=True)
-class Material:
+def _positive(default: float, words: str, unit: str = "") -> Any:
+    return setting(default, words, unit, gt=0, words="; it must be a number above 0")
+
+
+@settings
+class Material(Settings):
     """Dry granular soil: Hencky elasticity with rate-dependent friction mu(I) and its fluidity.
 
     The defaults are the sand of the paper's excavation runs (A. Haeri, K. Skonieczny) except for the
     stiffness: 1 MPa instead of 15 MPa, which makes the explicit step almost four times longer.
     """
 
-    youngs_modulus: float = 1.0e6
-    """Young's modulus E [Pa]. The cost of a run grows with its square root."""
-    poissons_ratio: float = 0.3
-    """Poisson's ratio [-]."""
-    grain_density: float = 2583.0
-    """Density of the grain material [kg/m^3]."""
-    packing: float = 0.67
-    """Solid volume fraction at the critical density [-]."""
-    grain_diameter: float = 3.0e-4
-    """Grain diameter d [m]."""
-    static_friction: float = 0.76
-    """mu_s: ratio of shear stress to pressure below which the soil does not flow [-]. Follows from
-    `friction_angle` where that is given."""
-    limit_friction: float = 0.9616
-    """mu_2: the ratio approached in very fast flow [-]."""
-    reference_inertial_number: float = 0.278
-    """I_0 of the rate law [-]."""
-    rate_law: str = "saturating"
-    """saturating: mu(I) = mu_s + (mu_2 - mu_s) / (1 + I_0 / I); linear: mu(I) = mu_s + (mu_2 - mu_s) I / I_0."""
-    friction_angle: float | None = None
-    """Angle of internal friction [degrees]; None: `static_friction` holds."""
-    friction_map: str = "tan"
-    """How the angle becomes mu_s: tan | sin | triaxial (see `static_friction`)."""
-    nonlocal_amplitude: float = 0.48
-    """A: reach of cooperative flow in grain diameters [-]. Used by the effect `nonlocality`."""
-    fluidity_time: float = 2.0e-4
-    """t_0 of the fluidity's own dynamics [s]. Used by the effect `fluidity`."""
-    fluidity_at_walls: str = "zero"
-    """zero: no flow at rough floor and walls; free: no gradient across them. Used by the effect `nonlocality`."""
+    group: ClassVar[str] = "material"
+
+    youngs_modulus: float = setting(1.0e6, "E; the cost grows with its square root", "Pa", ge=1e-9, le=1e12)
+    poissons_ratio: float = setting(
+        0.3, "nu", ge=0, le=0.499, note=": soil that keeps its volume has infinitely fast waves"
+    )
+    grain_density: float = _positive(2583.0, "density of the grains' material", "kg/m^3")
+    packing: float = setting(0.67, "solid volume fraction at the critical density", ge=0.05, le=1)
+    grain_diameter: float = _positive(3.0e-4, "d", "m")
+    static_friction: float = setting(0.76, "mu_s, where flow begins; friction_angle goes before it", gt=0)
+    limit_friction: float = setting(0.9616, "mu_2: the ratio approached in very fast flow")
+    reference_inertial_number: float = _positive(0.278, "I_0 of the rate law")
+    rate_law: Literal["saturating", "linear"] = setting(
+        "saturating", "saturating: mu_s + (mu_2 - mu_s) / (1 + I_0 / I); linear: mu_s + (mu_2 - mu_s) I / I_0"
+    )
+    friction_angle: float | None = setting(
+        None,
+        "angle of internal friction; None: static_friction holds",
+        "degrees",
+        gt=0,
+        lt=90,
+        words="; allowed: above 0 and below 90 degrees, or null for material.static_friction",
+    )
+    friction_map: Literal["sin", "tan", "triaxial"] = setting(
+        "tan", "mu_s of the angle: tan (simple shear), sin (plane strain) or triaxial (compression)"
+    )
+    nonlocal_amplitude: float = setting(0.48, "A: reach of cooperative flow in grain diameters", ge=0)
+    fluidity_time: float = _positive(2.0e-4, "t_0 of the fluidity's own dynamics", "s")
+    fluidity_at_walls: Literal["zero", "free"] = setting(
+        "zero",
+        "zero: no flow at rough floor and walls; free: no gradient across them; for the effect nonlocality",
+    )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         object.__setattr__(self, "_notes", tuple(self._apply_friction_angle()))
-        for name, allowed in (("rate_law", RATE_LAWS), ("fluidity_at_walls", FLUIDITY_AT_WALLS)):
-            if getattr(self, name) not in allowed:
-                raise SceneError(f"material.{name} is {getattr(self, name)!r}; allowed: {', '.join(allowed)}")
-        if not (math.isfinite(self.nonlocal_amplitude) and self.nonlocal_amplitude >= 0.0):
-            raise SceneError(
-                f"material.nonlocal_amplitude is {self.nonlocal_amplitude}; it must be 0 or more"
-            )
-        positive = (
-            "youngs_modulus",
-            "grain_density",
-            "grain_diameter",
-            "reference_inertial_number",
-            "fluidity_time",
-        )
-        for name in positive:
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
-                raise SceneError(f"material.{name} is {value}; it must be a number above 0")
-        low, high = YOUNGS_MODULUS
-        if not low <= self.youngs_modulus <= high:
-            raise SceneError(
-                f"material.youngs_modulus is {self.youngs_modulus} Pa; allowed: {low:g} to {high:g}"
-            )
-        if not 0.0 <= self.poissons_ratio <= MOST_POISSONS_RATIO:
-            raise SceneError(
-                f"material.poissons_ratio is {self.poissons_ratio}; allowed: 0 to {MOST_POISSONS_RATIO}: soil that "
-                "keeps its volume has infinitely fast waves"
-            )
-        if not LEAST_PACKING <= self.packing <= 1.0:
-            raise SceneError(f"material.packing is {self.packing}; allowed: {LEAST_PACKING} to 1")
-        if not self.static_friction > 0.0:
-            raise SceneError(f"material.static_friction is {self.static_friction}; it must be above 0")
         if not self.limit_friction > self.static_friction:
             raise SceneError(
                 f"material.limit_friction is {self.limit_friction}; it must be above material.static_friction "
@@ -125,8 +86,6 @@ class Material:
 
     def _apply_friction_angle(self) -> list[str]:
         """Set mu_s, and mu_2 where it must follow, from the angle if there is one; what to tell the user."""
-        if self.friction_map not in FRICTION_MAPS:
-            static_friction(45.0, self.friction_map)  # says what is allowed
         if self.friction_angle is None:
             return []
         found = static_friction(self.friction_angle, self.friction_map)

@@ -17,7 +17,7 @@ import warp as wp
 from .kernels.contact import HOLDING_LAYER, ContactLaw, axle_step, body_struct
 from .kernels.signed_distance import shape_data
 from .launch import Launch
-from .poses import angular_velocity
+from .poses import rotation_vectors
 from .state import SolverStopped
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ class RigidBody:
         poses = self.scene.poses_at(times)
         self._require_steady(frame, times, poses[:, :3])
         velocity = np.diff(poses[:, :3], axis=0) / self.dt
-        spin = angular_velocity(poses[:-1, 3:], poses[1:, 3:], self.dt)
+        spin = rotation_vectors(poses[:-1, 3:], poses[1:, 3:]) / self.dt
         for array, values in (
             (self.data.position, poses[:-1, :3]),
             (self.data.rotation, poses[:-1, 3:]),
@@ -200,7 +200,7 @@ class RigidBody:
 
     def _require_steady(self, frame: int, times: np.ndarray, position: np.ndarray) -> None:
         """A body that is somewhere else in the next substep does not push soil: it appears in its midst."""
-        way, angle = self.scene.travel(times)
+        way, angle = self.scene.displacement(times)
         farthest, most = way + self.scene.body.reach * angle, LONGEST_WAY * self.scene.bed.spacing
         far = ~(farthest <= most)
         if not far.any():

@@ -4,111 +4,82 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
-from types import UnionType
-from typing import Any, ClassVar, get_args, get_origin, get_type_hints
+from dataclasses import asdict
+from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 
 from .bed import Bed
-from .bodies import Axle, Body, MeshBody
+from .bodies import Axle, MeshBody, Tool
 from .material import Material
-from .poses import angular_velocity, rotate
-from .ranges import (
-    FRAME_RATE,
-    LEAST_COURANT,
-    MOST_DURATION,
-    MOST_FRAMES,
-    MOST_GRAVITY,
-)
+from .poses import rotate, rotation_vectors
+from .settings import Settings, build, setting, settings
 from .state import SceneError
 
+MOST_FRAMES = 1_000_000
 MOST_COURANT = 0.8
 """Largest `courant`. From 0.86 on a cut's forces come out too small, with nothing else to see
 (experiments/stability/step.csv)."""
 
 
-@dataclass(frozen=True)
-class Scene:
+@settings
+class Scene(Settings):
     """A soil bed, gravity, and for how long; subclasses add the body and its motion.
 
     A subclass with a `kind` of its own is a kind of scene that `from_dict` knows.
     """
 
-    kinds: ClassVar[dict[str, type[Scene]]] = {}
+    classes: ClassVar[dict[str, type[Scene]]] = {}
     """Kind → class."""
+    group: ClassVar[str] = "scene"
     bilateral: ClassVar[bool] = False
     """Whether soil in contact with the body is held, too (contact.py); a kind of scene may make it a key."""
 
-    name: str = "bed"
-    kind: str = "bed"
-    bed: Bed = field(default_factory=Bed)
-    material: Material = field(default_factory=Material)
-    gravity: float = 9.81
-    """[m/s^2], downwards."""
-    tilt: float = 0.0
-    """The bin's slope, falling towards +x [degrees]: gravity is turned by it about y."""
-    duration: float = 16.0 / 3.0
-    """[s]."""
-    frame_rate: float = 60.0
-    """Recorded frames per second [Hz]."""
-    contact_margin: float = -0.25
-    """Distance from the body's surface at which it begins to act on soil, negative inside [grid spacings]; see
-    contact.py."""
-    courant: float = 0.6
-    """Time step as a share of spacing / wave speed."""
-    elastic_damping: float = 0.1
-    """Damping ratio of elastic waves as short as the grid can carry; longer ones are damped less [-]."""
-    volume_averaging: float = 1.0
-    """Share of a particle's own volume change that the mean around it replaces [-]."""
-    remap_time: float = 4.0e-3
-    """Longest time between two remaps of the velocities [s]; see solver.py."""
-    remap_distance: float = 0.1
-    """Longest way of soil between two remaps [grid spacings]."""
-    velocity_memory: float = 0.1
-    """Time after which 63 % of the velocities that the grid does not resolve are gone [s]."""
+    name: str = setting("bed", "what reports call the scene")
+    kind: str = setting("bed", "of scene: what moves, or how the soil starts")
+    bed: Bed = setting(Bed, "the soil bin and how it is filled")
+    material: Material = setting(Material, "the soil")
+    gravity: float = setting(9.81, "downwards", "m/s^2", ge=0, le=1e5)
+    tilt: float = setting(0.0, "the bin's slope, falling towards +x", "degrees", gt=-90, lt=90)
+    duration: float = setting(5.3333333333, "one frame or more", "s", le=1e6)
+    frame_rate: float = setting(60.0, "recorded frames per second", "Hz", ge=1e-3, le=1e6)
+    contact_margin: float = setting(
+        -0.25, "where contact begins, from the body's surface outwards", "grid spacings", ge=-1, le=1
+    )
+    courant: float = setting(
+        0.6,
+        "time step as a share of spacing / wave speed",
+        ge=1e-4,
+        le=MOST_COURANT,
+        note=": with longer steps elastic waves in the soil grow",
+    )
+    elastic_damping: float = setting(0.1, "damping ratio of the grid's shortest elastic waves", ge=0, le=1)
+    volume_averaging: float = setting(1.0, "share of volume changes that a local mean replaces", ge=0, le=1)
+    remap_time: float = setting(
+        4.0e-3,
+        "longest time between two remaps of the velocities (solver.py)",
+        "s",
+        ge=0,
+        words=" s; it must be 0 (every step) or more",
+    )
+    remap_distance: float = setting(0.1, "soil's way between two remaps", "grid spacings", gt=0, le=0.5)
+    velocity_memory: float = setting(0.1, "time in which velocities below the grid fade to 37 %", "s", gt=0)
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         if "kind" in cls.__dict__:
-            Scene.kinds[cls.kind] = cls
+            Scene.classes[cls.kind] = cls
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.gravity <= MOST_GRAVITY:
-            raise SceneError(f"scene.gravity is {self.gravity} m/s^2; allowed: 0 to {MOST_GRAVITY:g}")
-        if not -90.0 < self.tilt < 90.0:
-            raise SceneError(f"scene.tilt is {self.tilt} degrees; allowed: above -90, below 90")
-        if not FRAME_RATE[0] <= self.frame_rate <= FRAME_RATE[1]:
-            raise SceneError(
-                f"scene.frame_rate is {self.frame_rate} Hz; allowed: {FRAME_RATE[0]:g} to {FRAME_RATE[1]:g}"
-            )
+        super().__post_init__()
         if not self.duration * self.frame_rate >= 1.0:
             raise SceneError(f"scene.duration is {self.duration} s; it must last at least one frame")
-        if not self.duration <= MOST_DURATION:
-            raise SceneError(f"scene.duration is {self.duration} s; allowed: at most {MOST_DURATION:g}")
         if not self.duration * self.frame_rate <= MOST_FRAMES:
             raise SceneError(
                 f"scene.duration is {self.duration} s at scene.frame_rate {self.frame_rate} Hz: "
                 f"{self.duration * self.frame_rate:.2g} frames; at most {MOST_FRAMES:g} are allowed: lower one of them"
             )
-        if not -1.0 <= self.contact_margin <= 1.0:
-            raise SceneError(f"scene.contact_margin is {self.contact_margin} grid spacings; allowed: -1 to 1")
-        if not LEAST_COURANT <= self.courant <= MOST_COURANT:
-            raise SceneError(
-                f"scene.courant is {self.courant}; allowed: {LEAST_COURANT:g} to {MOST_COURANT}: with longer steps "
-                "elastic waves in the soil grow"
-            )
-        for name in ("elastic_damping", "volume_averaging"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise SceneError(f"scene.{name} is {getattr(self, name)}; allowed: 0 to 1")
-        if not 0.0 <= self.remap_time < math.inf:
-            raise SceneError(f"scene.remap_time is {self.remap_time} s; it must be 0 (every step) or more")
-        if not 0.0 < self.remap_distance <= 0.5:
-            raise SceneError(
-                f"scene.remap_distance is {self.remap_distance} grid spacings; allowed: above 0, at most 0.5"
-            )
-        if not 0.0 < self.velocity_memory < math.inf:
-            raise SceneError(f"scene.velocity_memory is {self.velocity_memory} s; it must be above 0")
 
     # --- what a solver or a rollout asks of a scene -------------------------------------------------------
 
@@ -131,8 +102,14 @@ class Scene:
 
     @property
     def stored(self) -> np.ndarray:
-        """Indices of the particles that are recorded; see `Bed.stored_of`."""
-        return self.bed.stored_of(len(self.filled[0]))
+        """Indices of the particles that are recorded, increasing: one of every `bed.store_every` in a row.
+
+        Which one is drawn at random, always the same way: at fixed steps a lattice would be recorded in some of
+        its layers only.
+        """
+        count, every = len(self.filled[0]), self.bed.store_every
+        first = np.arange(0, count, every)
+        return first + np.random.default_rng(0).integers(np.minimum(every, count - first))
 
     @property
     def soil_volume(self) -> float:
@@ -144,7 +121,7 @@ class Scene:
         return np.zeros_like(self.filled[0])
 
     @property
-    def body(self) -> Body | None:
+    def body(self) -> Tool | None:
         """The rigid body that touches the soil, if any."""
         return None
 
@@ -182,7 +159,7 @@ class Scene:
         """Times at which a prescribed path may turn [s], increasing, shape (k,); none for a smooth motion."""
         return np.zeros(0)
 
-    def travel(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def displacement(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What the body's centre travels [m] and by what angle the body turns [rad] from each of the increasing times
         (T,) [s] to the next, both of shape (T - 1,).
 
@@ -193,14 +170,14 @@ class Scene:
         every = np.union1d(time, rows[(rows > time[0]) & (rows < time[-1])])
         poses = self.poses_at(every)
         way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
-        angle = np.linalg.norm(angular_velocity(poses[:-1, 3:], poses[1:, 3:], 1.0), axis=1)
+        angle = np.linalg.norm(rotation_vectors(poses[:-1, 3:], poses[1:, 3:]), axis=1)
         first = np.searchsorted(every, time[:-1])
         return np.add.reduceat(way, first), np.add.reduceat(angle, first)
 
-    def ways(self, time: np.ndarray) -> np.ndarray:
+    def largest_displacement(self, time: np.ndarray) -> np.ndarray:
         """The most that any point of the body travels from each of the increasing times (T,) [s] to the next [m],
         shape (T - 1,)."""
-        way, angle = self.travel(time)
+        way, angle = self.displacement(time)
         return way + self.body.reach * angle
 
     def body_points(self) -> np.ndarray:
@@ -245,15 +222,18 @@ class Scene:
             mesh: of such a tool, see `mesh`.
         """
         kind = data.get("kind", "bed")
-        if not isinstance(kind, str) or kind not in Scene.kinds:
-            raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(Scene.kinds)}")
+        if not isinstance(kind, str) or kind not in Scene.classes:
+            raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(Scene.classes)}")
         tool = data.get("tool")
         if mesh is None and isinstance(tool, dict) and tool.get("shape") == "mesh" and tool.get("digest"):
             raise SceneError(
                 "scene.tool is a mesh that was read before and does not come with these data; give it, as in "
                 "Scene.from_dict(scene.to_dict(), scene.mesh), or leave out tool.digest to read tool.file again"
             )
-        return _build(Scene.kinds[kind], data, "scene", mesh)
+        if mesh is not None and isinstance(tool, dict) and tool.get("shape") == "mesh":
+            made = build(MeshBody, tool, "scene.tool", partial(MeshBody.of_mesh, *mesh))
+            data = data | {"tool": made}
+        return build(Scene.classes[kind], data, "scene")
 
     # --- checks for scenes with a body --------------------------------------------------------------------
 
@@ -270,7 +250,7 @@ class Scene:
         """The part of the body that is below the surface must stay within the bin."""
         lx, ly, lz = self.bed.size
         # Nothing is in the way of a body at the sides of a channel, whose walls stand for more of the same soil.
-        side = math.inf if self.bed.walls.kinds[1] in ("slip", "periodic") else 0.0
+        side = math.inf if self.bed.walls.conditions[1] in ("slip", "periodic") else 0.0
         outline = self.body.outline()
         rows, times = self.path_times(), self.times()
         times = np.union1d(times, rows[(rows > 0.0) & (rows < times[-1])])
@@ -291,73 +271,4 @@ class Scene:
                     )
 
 
-Scene.kinds["bed"] = Scene
-
-
-def _build(
-    cls: type, data: dict[str, Any], where: str, mesh: tuple[np.ndarray, np.ndarray] | None = None
-) -> Any:
-    """A dataclass from nested plain data, refusing keys it does not have; `mesh` goes to a body that is one."""
-    if not isinstance(data, dict):
-        raise SceneError(f"{where} is {data!r}; it must be a group of keys")
-    hints = get_type_hints(cls)
-    allowed = {f.name: f for f in fields(cls)}
-    unknown = sorted(set(data) - set(allowed))
-    if unknown:
-        raise SceneError(f"{where} has no key {unknown[0]!r}; allowed: {', '.join(sorted(allowed))}")
-    values = {}
-    for key, value in data.items():
-        if is_dataclass(hints[key]):
-            value = _build(hints[key], value, f"{where}.{key}")
-        elif shapes := {c.shape: c for c in get_args(hints[key]) if is_dataclass(c)}:
-            value = _build(_chosen(shapes, value, f"{where}.{key}"), value, f"{where}.{key}", mesh)
-        elif hints[key] is float or (hints[key] == float | None and value is not None):
-            value = _number(value, f"{where}.{key}", float)
-        elif hints[key] is bool and not isinstance(value, bool):
-            raise SceneError(f"{where}.{key} is {value!r}; allowed: true, false")
-        elif hints[key] is int:
-            value = _number(value, f"{where}.{key}", int)
-        else:
-            value = _plain(value, hints[key], f"{where}.{key}")
-        values[key] = value
-    return cls(**values) if mesh is None or cls is not MeshBody else MeshBody.of_mesh(*mesh, **values)
-
-
-def _chosen(shapes: dict[str, type], value: Any, where: str) -> type:
-    """The class of a body given as nested data with the key `shape`."""
-    shape = value.get("shape") if isinstance(value, dict) else None
-    if not isinstance(shape, str) or shape not in shapes:
-        raise SceneError(f"{where}.shape is {shape!r}; allowed: {', '.join(shapes)}")
-    return shapes[shape]
-
-
-def _plain(value: Any, hint: Any, where: str) -> Any:
-    """A value of a type made of texts, numbers, tuples and None; other types are not looked into."""
-    parts = get_args(hint)
-    if get_origin(hint) is UnionType:
-        kinds = [part for part in parts if part is not type(None)]
-        if value is None and len(kinds) < len(parts):
-            return None
-        if str in kinds and float in kinds:  # words, or the number that one of them stands for
-            return value if isinstance(value, str) else _number(value, where, float)
-        return _plain(value, kinds[0], where)
-    if hint is str and not isinstance(value, str):
-        raise SceneError(f"{where} is {value!r}; it must be text")
-    if hint in (int, float):
-        return _number(value, where, hint)
-    if get_origin(hint) is tuple:
-        count = None if parts[-1] is ... else len(parts)
-        if not isinstance(value, (list, tuple)) or count not in (None, len(value)):
-            raise SceneError(f"{where} is {value!r}; it must be a list of {count or 'some'} values")
-        if get_origin(parts[0]) is tuple:  # the rows of a path; what reads them says which one is wrong
-            return tuple(tuple(one) if isinstance(one, list) else one for one in value)
-        return tuple(_plain(one, parts[0], f"{where}[{i}]") for i, one in enumerate(value))
-    return value
-
-
-def _number(value: Any, where: str, kind: type) -> Any:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise SceneError(f"{where} is {value!r}; it must be a finite number")
-    if kind is int and value != int(value):
-        raise SceneError(f"{where} is {value!r}; it must be a whole number")
-    return kind(value)
+Scene.classes["bed"] = Scene

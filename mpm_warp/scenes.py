@@ -5,20 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import field, replace
 from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 
-from .bodies import Axle, Body, Box, Cylinder, MeshBody, Plate
+from .bed import Bed, Walls
+from .bodies import Axle, Box, Cylinder, MeshBody, Plate, Tool
+from .material import Material
 from .poses import about_y, rotate, sampled_poses
-from .ranges import BODY_MASS
 from .scene import Scene
+from .settings import same, setting, settings
 from .state import SceneError
 
 # --- Prescribed paths of a blade's tip and of a body given by samples -----------------------------------
 
-MOTIONS = ("curved", "ramp", "rest", "path")
 CUT_LENGTH = 0.4
 """Horizontal travel of the published cuts [m]."""
 RAMP_SPEED = 0.025
@@ -58,35 +61,35 @@ def ramp(time: np.ndarray, depth: float, speed: float) -> np.ndarray:
 
 # --- A plate cuts through a bed -------------------------------------------------------------------------
 
+_PATH = "rows t [s], x, y, z [m], qx, qy, qz, qw of the body's centre of mass"
+_SHARE = ", a share of the bin's length"
 
-@dataclass(frozen=True)
+
+@settings
 class Excavation(Scene):
     """A plate cuts through the bed along x."""
 
     name: str = "excavation"
     kind: str = "excavation"
-    blade: Plate = field(default_factory=Plate)
-    depth: float = 0.05
-    """Depth the motion law reaches below the tip's starting height [m]."""
-    speed: float = 0.10
-    """Forward speed of the cut [m/s]."""
-    rake: float = 10.0
-    """Angle of the plate from vertical, tip leading [degrees]."""
-    motion: str = "curved"
-    """curved | ramp | rest | path."""
-    start: float = 0.10
-    """Where the tip starts, as a share of the bin's length."""
-    clearance: float = 0.00665
-    """Height of the tip above the surface at the start [m]; the cut is this much shallower than `depth`."""
-    path: tuple[tuple[float, ...], ...] | None = None
-    """For motion=path: rows t [s], x, y, z [m], qx, qy, qz, qw of the plate's centre of mass."""
-    body_grid: tuple[int, int] = (3, 5)
-    """Rows and columns of body nodes on the front face."""
+    bed: Bed = field(default_factory=lambda: Bed(spacing=0.02, particles_per_cell=4.0))
+    blade: Plate = setting(Plate, "the plate")
+    depth: float = setting(0.05, "the motion reaches this far below the tip's starting height", "m", ge=0)
+    speed: float = setting(0.10, "forward speed", "m/s", gt=0)
+    rake: float = setting(10.0, "angle of the plate from vertical, tip leading", "degrees", ge=-60, le=60)
+    motion: Literal["curved", "ramp", "rest", "path"] = setting("curved", "of the tip")
+    start: float = setting(0.10, "where the tip starts" + _SHARE, ge=0, le=1, note=_SHARE)
+    clearance: float = setting(0.00665, "height of the tip above the surface at the start", "m")
+    path: tuple[Any, ...] | None = setting(None, "for motion=path: " + _PATH)
+    body_grid: tuple[int, int] = setting(
+        (3, 5),
+        "rows and columns of body nodes on the front face",
+        ge=1,
+        le=100,
+        words="; it needs two counts from 1 to 100",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.motion not in MOTIONS:
-            raise SceneError(f"scene.motion is {self.motion!r}; allowed: {', '.join(MOTIONS)}")
         if self.motion == "path":
             if self.path is None:
                 raise SceneError(
@@ -97,18 +100,7 @@ class Excavation(Scene):
             raise SceneError(
                 f"scene.path is given but scene.motion is {self.motion!r}; use scene.motion=path"
             )
-        if not (math.isfinite(self.depth) and self.depth >= 0):
-            raise SceneError(f"scene.depth is {self.depth} m; it must be 0 or more")
-        if not (math.isfinite(self.speed) and self.speed > 0):
-            raise SceneError(f"scene.speed is {self.speed} m/s; it must be above 0")
-        if not -60.0 <= self.rake <= 60.0:
-            raise SceneError(f"scene.rake is {self.rake} degrees; allowed: -60 to 60")
-        if not 0.0 <= self.start <= 1.0:
-            raise SceneError(f"scene.start is {self.start}; allowed: 0 to 1, a share of the bin's length")
         self._check_thickness("blade.thickness")
-        object.__setattr__(self, "body_grid", tuple(int(c) for c in self.body_grid))
-        if len(self.body_grid) != 2 or not all(1 <= c <= 100 for c in self.body_grid):
-            raise SceneError(f"scene.body_grid is {self.body_grid}; it needs two counts from 1 to 100")
         self._check_inside("the plate", "change scene.depth, speed, start, duration or the path")
 
     @property
@@ -152,15 +144,15 @@ class Excavation(Scene):
 # --- Any body along a path ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Push(Scene):
+@settings
+class Body(Scene):
     """A box, a cylinder or a mesh moves through the bed along a path of its centre of mass."""
 
     name: str = "body"
     kind: str = "body"
-    tool: Box | Cylinder | MeshBody = field(default_factory=Box)
-    path: tuple[tuple[float, ...], ...] | None = None
-    """Rows t [s], x, y, z [m], qx, qy, qz, qw of the body's centre of mass."""
+    duration: float = 2.0
+    tool: Box | Cylinder | MeshBody = setting(Box, "the body")
+    path: tuple[Any, ...] | None = setting(None, _PATH)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -171,7 +163,7 @@ class Push(Scene):
         self._check_inside("the body", "change scene.path or scene.duration")
 
     @property
-    def body(self) -> Body:
+    def body(self) -> Tool:
         return self.tool
 
     def poses_at(self, time: np.ndarray) -> np.ndarray:
@@ -190,8 +182,25 @@ class Push(Scene):
 
 # --- A wheel drives over a bed under a load -------------------------------------------------------------
 
+LEAST_MASS, MOST_MASS = 1.0e-9, 1.0e9
+"""Of a body whose height is free [kg]."""
 
-@dataclass(frozen=True)
+
+def sinkage(scene: Mapping[str, Any], poses: np.ndarray) -> np.ndarray:
+    """Depth of a wheel's lowest point below the undisturbed surface [m], shape (T,) for poses (T, 7).
+
+    Args:
+        scene: the wheel's as plain data, such as a run file's; published ones say nothing of grousers.
+        poses: of the wheel.
+    """
+    return 0.5 * scene["diameter"] + scene.get("grouser_height", 0.0) - poses[:, 2]
+
+
+def _positive(default: float, words: str, unit: str) -> Any:
+    return setting(default, words, unit, gt=0, words=f" {unit}; a wheel needs more than 0")
+
+
+@settings
 class Wheel(Scene):
     """A wheel settles under its load, then drives along x with a given slip.
 
@@ -201,63 +210,44 @@ class Wheel(Scene):
 
     name: str = "wheel"
     kind: str = "wheel"
+    bed: Bed = field(
+        default_factory=lambda: Bed(
+            size=(0.40, 0.19, 0.06), spacing=0.01, particles_per_cell=4.0, headroom=0.10
+        )
+    )
     contact_margin: float = 0.0
-    duration: float = 1.0 + 16.0 / 3.0
-    """Settling and driving [s]."""
-    load: float = 100.0
-    """Weight that the wheel carries, its own included [N]."""
-    diameter: float = 0.15
-    """Of the rim, without grousers [m]."""
-    width: float = 0.083
-    """[m]."""
-    friction: float = 0.5
-    """Coulomb friction between soil and wheel [-]."""
-    grousers: int = 0
-    """How many bars along the rim."""
-    grouser_height: float = 0.0
-    """Above the rim [m]."""
-    grouser_thickness: float = 0.0
-    """Along the rim [m]."""
-    slip: float = 0.2
-    """1 - forward speed / rim speed [-]."""
-    rim_speed: float = 0.0195
-    """Angular speed times half the diameter [m/s]."""
-    friction_angle: float | None = None
-    """In place of material.friction_angle [degrees]; None: the material's own."""
-    settle: float = 1.0
-    """Time at rest under the load before driving [s]; recorded like the rest."""
-    damping: float = 0.0
-    """Force against the vertical velocity per mass of the wheel [1/s]."""
-    bilateral: bool = False
-    """Whether soil in contact may not leave the wheel along its normal (bilateral contact)."""
-    start: float = 0.30
-    """Where the axle starts, as a share of the bin's length."""
-    clearance: float = 0.0
-    """Height of the wheel's lowest point above the undisturbed surface at the start [m]."""
+    duration: float = 6.3333333333
+    load: float = _positive(100.0, "weight that the wheel carries, its own included", "N")
+    diameter: float = same(Cylinder, "diameter")
+    width: float = same(Cylinder, "width")
+    friction: float = same(Cylinder, "friction", default=0.5)
+    grousers: int = same(Cylinder, "grousers")
+    grouser_height: float = same(Cylinder, "grouser_height")
+    grouser_thickness: float = same(Cylinder, "grouser_thickness")
+    slip: float = setting(
+        0.2, "1 - forward speed / rim speed", ge=-1, le=1, note=" (0: rolls freely, 1: turns on the spot)"
+    )
+    rim_speed: float = _positive(0.0195, "angular speed times half the diameter", "m/s")
+    friction_angle: float | None = setting(37.0, "of the soil; None: material.friction_angle", "degrees")
+    settle: float = setting(1.0, "time at rest under the load before driving; recorded like the rest", "s")
+    damping: float = setting(5.0, "force against the vertical velocity per mass of the wheel", "1/s", ge=0)
+    bilateral: bool = setting(False, "soil in contact may not leave the wheel along its normal")
+    start: float = setting(0.30, "where the axle starts" + _SHARE, ge=0, le=1, note=_SHARE)
+    clearance: float = setting(0.0, "of the wheel's lowest point above the surface at the start", "m")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, unit in (("load", "N"), ("rim_speed", "m/s"), ("gravity", "m/s^2")):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise SceneError(f"scene.{name} is {value} {unit}; a wheel needs more than 0")
-        if not BODY_MASS[0] <= self.load / self.gravity <= BODY_MASS[1]:
+        if not self.gravity > 0:
+            raise SceneError(f"scene.gravity is {self.gravity} m/s^2; a wheel needs more than 0")
+        if not LEAST_MASS <= self.load / self.gravity <= MOST_MASS:
             raise SceneError(
                 f"scene.load is {self.load} N at scene.gravity {self.gravity} m/s^2: a wheel of "
-                f"{self.load / self.gravity:.3g} kg; allowed: {BODY_MASS[0]:g} to {BODY_MASS[1]:g} kg"
-            )
-        if not -1.0 <= self.slip <= 1.0:
-            raise SceneError(
-                f"scene.slip is {self.slip}; allowed: -1 to 1 (0: rolls freely, 1: turns on the spot)"
+                f"{self.load / self.gravity:.3g} kg; allowed: {LEAST_MASS:g} to {MOST_MASS:g} kg"
             )
         if not 0.0 <= self.settle < self.duration:
             raise SceneError(
                 f"scene.settle is {self.settle} s; allowed: 0 up to, not including, scene.duration ({self.duration} s)"
             )
-        if not (math.isfinite(self.damping) and self.damping >= 0):
-            raise SceneError(f"scene.damping is {self.damping} 1/s; it must be 0 or more")
-        if not 0.0 <= self.start <= 1.0:
-            raise SceneError(f"scene.start is {self.start}; allowed: 0 to 1, a share of the bin's length")
         try:
             _ = self.body
         except SceneError as error:
@@ -303,14 +293,14 @@ class Wheel(Scene):
         poses[:, 3:] = np.array([about_y(angle) for angle in self.angular_speed * driven])
         return poses
 
-    def travel(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def displacement(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # From the speeds: poses do not show a whole turn.
         driven = np.diff(np.maximum(time - self.settle, 0.0))
         return abs(self.speed) * driven, self.angular_speed * driven
 
     def sinkage(self, poses: np.ndarray) -> np.ndarray:
-        """Depth of the wheel's lowest point below the undisturbed surface [m], shape (T,) for poses (T, 7)."""
-        return self.body.tip_radius - poses[:, 2]
+        """See `sinkage`."""
+        return sinkage(vars(self), poses)
 
     def body_points(self) -> np.ndarray:
         return self.body.points()
@@ -353,24 +343,23 @@ class Wheel(Scene):
 
 # --- A column of soil that is let go and collapses under its own weight ---------------------------------
 
-SHAPES = ("cylinder", "slab")
 
-
-@dataclass(frozen=True)
+@settings
 class Column(Scene):
     """Soil stands in the middle of the floor and is let go at time 0; the bed's Lz is its height."""
 
     name: str = "column"
     kind: str = "column"
-    shape: str = "cylinder"
-    """cylinder, or slab: all of the bin's width, for a channel."""
-    radius: float = 0.05
-    """Of the cylinder, or half the slab's length along x [m]."""
+    bed: Bed = setting(
+        lambda: Bed(size=(0.60, 0.60, 0.08), spacing=0.01, particles_per_cell=8.0, headroom=0.05),
+        "the floor around the column; Lz is the column's height",
+    )
+    duration: float = 1.0
+    shape: Literal["cylinder", "slab"] = setting("cylinder", "slab: as wide as the bin, for a channel")
+    radius: float = setting(0.08, "of the cylinder, or half the slab's length along x", "m")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.shape not in SHAPES:
-            raise SceneError(f"scene.shape is {self.shape!r}; allowed: {', '.join(SHAPES)}")
         room = 0.5 * min(self.bed.size[: 2 if self.shape == "cylinder" else 1])
         if not 2.0 * self.bed.spacing <= self.radius <= room:
             raise SceneError(
@@ -405,19 +394,41 @@ class Column(Scene):
 # --- A layer of soil on an endless rough slope ----------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@settings
 class Incline(Scene):
     """A layer as thick as the bed, tilted; meant for a bed that is periodic in x."""
 
     name: str = "incline"
     kind: str = "incline"
-    flowing: bool = True
-    """Start in the steady flow of mu(I) down the slope (Bagnold's profile); off: start at rest."""
+    bed: Bed = setting(
+        lambda: Bed(
+            size=(0.006, 0.006, 0.030),
+            spacing=0.0015,
+            particles_per_cell=8.0,
+            headroom=0.006,
+            walls=Walls("periodic", "periodic"),
+        ),
+        "the layer, periodic in x and y",
+    )
+    material: Material = setting(
+        lambda: Material(
+            youngs_modulus=1.0e5,
+            grain_density=2450.0,
+            packing=0.60,
+            grain_diameter=0.003,
+            static_friction=0.3819,
+            limit_friction=0.6435,
+        ),
+        "the soil: glass beads of 3 mm",
+    )
+    tilt: float = 26.0
+    duration: float = 2.0
+    flowing: bool = setting(
+        True, "start in the steady flow of mu(I) down the slope (Bagnold's profile); off: start at rest"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.flowing, bool):
-            raise SceneError(f"scene.flowing is {self.flowing!r}; allowed: true, false")
         if self.flowing and not self._flows:
             low, high = self._flowing_angles
             raise SceneError(

@@ -248,7 +248,7 @@ class Solver:
         """What runs at a remap and in every step, in order."""
         real, grid, soil, body = self._real, self._grid, self._soil, self._body
         kernels = transfer(real, self.effects, body.law if body else None, atomic=self.device.is_cuda)
-        node = grid_step(real, self.scene.bed.walls.kinds)
+        node = grid_step(real, self.scene.bed.walls.conditions)
         ghost = Images(real, self.device, grid, ghosts, mirrored=self._half is not None)
         x, home, v, felt, c, e, ln_j = (
             self._x, self._home, self._v, self._felt, self._c, self._e, self._ln_j
@@ -363,7 +363,7 @@ class Solver:
         """Bring particles that left a periodic bin back in."""
         self._turns: dict[int, wp.array] = {}
         launches = []
-        for axis, kind in enumerate(self.scene.bed.walls.kinds):
+        for axis, kind in enumerate(self.scene.bed.walls.conditions):
             if kind == "periodic":
                 self._turns[axis] = turns = wp.zeros(n, dtype=int, device=self.device)
                 wrap = images(self._real).wrap

@@ -42,3 +42,11 @@ def trained_briefly(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     data = reduced(folder / "data")
     train(data, num_modes=4, model=MODEL, training=BRIEF, output=folder / "out")
     return Trained(data, folder / "out")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> ReducedDataset:
+    """The tiny dataset in its basis."""
+    from sgns_testing.tiny import reduced
+
+    return reduced(tmp_path_factory.mktemp("tiny"))

@@ -27,12 +27,11 @@ from sgns.data.dataset import Dataset
 from sgns.data.published import PARTICLES, published_dataset
 from sgns.model.checkpoint import load_surrogate
 from sgns.model.dynamics import Dynamics
-from sgns.model.features import varying_context
+from sgns.model.features import moves_freely, varying_context
 from sgns.model.settings import FitSettings, PolynomialSettings
 from sgns.reduction.reduce import ReducedRun, reduce_dataset
 from sgns.train.callbacks import RolloutScore, ValidationRollouts
-from sgns.train.command import moves_freely
-from sgns.train.polynomial import candidates, choose, fit_polynomial, moments, unfitted
+from sgns.train.polynomial import best_polynomial, candidates, moments, select, unfitted
 from sgns.train.windows import TrainingWindows
 
 HERE = Path(__file__).parent
@@ -123,7 +122,7 @@ def scores(
         shared = time.perf_counter() - began
         for threshold in thresholds:
             began = time.perf_counter()
-            motion, _, force = choose(model, candidates(known, settings.penalties, threshold), others[0])
+            motion, _, force = select(model, candidates(known, settings.penalties, threshold), others[0])
             about = {
                 "model": NAMES[degree] + (", sparse" if threshold else " ridge"),
                 "threshold": threshold,
@@ -179,7 +178,7 @@ def fold_scores(
     for degree in degrees:
         model = PolynomialSettings(HISTORY, degree, context)
         began = time.perf_counter()
-        fitted = fit_polynomial(known, known[::3], PUBLISHED_MODES, model, settings, wheel)
+        fitted = best_polynomial(known, known[::3], PUBLISHED_MODES, model, settings, wheel)
         about = {
             "model": f"{NAMES[degree]} ridge",
             "library": len(fitted.dynamics.terms),

@@ -31,8 +31,9 @@ from omegaconf import OmegaConf
 from sgns.data.dataset import Dataset
 from sgns.model.checkpoint import load_surrogate
 from sgns.reduction.reduce import ReducedDataset, ReducedRun, reduce_dataset
-from sgns.train import command as learning
+from sgns.train import lightning_module as learning
 from sgns.train.callbacks import RolloutScore, ValidationRollouts
+from sgns.train.command import train
 from sgns.train.lightning_module import SurrogateTraining
 from sgns.train.windows import Batch
 
@@ -162,7 +163,7 @@ def trained(config: dict[str, Any], reduced: ReducedDataset, seed: int, where: P
         try:
             if "work" in config:
                 learning.SurrogateTraining = type("Work", (WorkTraining,), {"weight": config["work"]})
-            learning.train(
+            train(
                 reduced,
                 num_modes=config["reduction"]["num_modes"],
                 model=config["model"],

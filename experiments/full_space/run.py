@@ -28,19 +28,19 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
+from torch import Tensor
 
 from sgns.data.dataset import Dataset
 from sgns.data.run import Run
+from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
 from sgns.evaluate.metrics import VectorErrors, mean_prediction, skill
 from sgns.model.features import BodyTrack
-from sgns.model.full_space import FullSpaceDynamics, box_surface
-from sgns.model.network_dynamics import ModelSettings
+from sgns.model.network import Standardiser
+from sgns.model.settings import ModelSettings
 from sgns.reduction.reduce import reduce_dataset
 from sgns.simulator import Simulator
-from sgns.train.command import prepared
 from sgns.train.command import train as train_subspace
-from sgns.train.full_space import FullSpaceRun, FullSpaceWindows, fit_normalisation, train
-from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
+from sgns.train.lightning_module import SurrogateTraining, TrainingSettings, prepared
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -79,6 +79,74 @@ def full_space(path: Path, model: dict[str, Any], split: str) -> tuple[FullSpace
     nodes = box_surface(np.array([blade["thickness"], blade["width"], blade["length"]]) / 2, SPACING)
     runs = [FullSpaceRun(file, nodes) for file in paths]
     return FullSpaceDynamics(ModelSettings(**model), RADIUS, runs[0].bin_size), runs
+
+
+def fit_normalisation(
+    dynamics: FullSpaceDynamics, windows: FullSpaceWindows, noise: float, floor: float, samples: int = 64
+) -> Tensor:
+    """Give the dynamics the statistics of windows spread evenly over the training runs.
+
+    All particles share one scale per axis: what a particle does must not depend on its number.
+
+    Args:
+        dynamics: Filled in place.
+        windows: The training windows.
+        noise: Deviation of the velocity noise as a share of the velocity's scale.
+        floor: Smallest scale as a share of the quantity's largest.
+        samples: How many windows to read.
+
+    Returns:
+        Deviation of the velocity noise [m], shape (3,).
+    """
+    chosen = torch.linspace(0, len(windows) - 1, min(samples, len(windows))).long().unique().tolist()
+    read = [windows.window(index) for index in chosen]
+    dynamics.velocity = Standardiser.fit(
+        torch.cat([(w.position[0, -1] - w.position[0, -2]) for w in read]), floor, centred=False
+    )
+    noise_scale = noise * dynamics.velocity.scale
+    clean = Standardiser.fit(torch.cat([w.acceleration[0] for w in read]), floor, centred=False)
+    # The target contains the correction of the velocity's noise.
+    dynamics.acceleration = Standardiser(clean.mean, (clean.scale.square() + noise_scale.square()).sqrt())
+    motion = torch.cat([run.track.motion[1:].flatten(0, 1) for run in windows.runs])
+    dynamics.body_motion = Standardiser.fit(motion, floor, centred=False)
+    dynamics.force = Standardiser.fit(torch.cat([run.force[1:] for run in windows.runs]), floor)
+    return noise_scale
+
+
+def train(
+    dynamics: FullSpaceDynamics, windows: FullSpaceWindows, settings: TrainingSettings, noise_scale: Tensor
+) -> list[tuple[float, float]]:
+    """Optimise for `settings.max_steps` steps with AdamW, the schedule and the clipping of `settings`.
+
+    Args:
+        dynamics: With its statistics; trained in place.
+        windows: To draw from.
+        settings: As for the latent dynamics; there is no torque here and no validation on the way.
+        noise_scale: Of the history's noise [m], shape (3,), as `fit_normalisation` returns it.
+
+    Returns:
+        Losses of acceleration and force of every step [1].
+    """
+    optimiser = torch.optim.AdamW(
+        dynamics.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+    )
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, settings.rate)
+    record = []
+    for step in range(settings.max_steps):
+        acceleration, force = losses(dynamics, windows.batch(step, settings.batch_size, noise_scale))
+        loss = settings.loss["change"] * acceleration + settings.loss["force"] * force
+        if not bool(torch.isfinite(loss)):
+            raise ValueError(
+                f"the loss is {float(loss.detach())} at step {step}; lower training.learning_rate"
+            )
+        optimiser.zero_grad()
+        loss.backward()
+        if settings.gradient_clip is not None:
+            torch.nn.utils.clip_grad_norm_(dynamics.parameters(), settings.gradient_clip)
+        optimiser.step()
+        schedule.step()
+        record.append((float(acceleration.detach()), float(force.detach())))
+    return record
 
 
 def timed(action: Callable[[], object], repeats: int) -> list[float]:
@@ -238,7 +306,7 @@ def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) ->
     last = max(1, steps // 10)
     logging.warning(
         "%s: %d steps; mean loss of the last tenth: acceleration %.3f, force %.3f",
-        name, steps, statistics.fmean(record.acceleration[-last:]), statistics.fmean(record.force[-last:]),
+        name, steps, *map(statistics.fmean, zip(*record[-last:], strict=True)),
     )  # fmt: skip
     _, predicted = full_space(path, plain["model"], "test")
     by_path = {run.path: run for run in predicted}

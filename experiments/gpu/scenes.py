@@ -49,6 +49,7 @@ BEADS = Material(
     nonlocal_amplitude=0.48,
 )
 BED = Bed(size=(0.48, 0.4, 0.16), spacing=0.02, headroom=0.12)
+UNDAMPED = {"friction_angle": None, "damping": 0.0}  # wheels fall freely
 DYNAMIC = Effects(fluidity=True, nonlocality=True)
 
 
@@ -166,7 +167,7 @@ def _cuts() -> list[Case]:
 
 
 def _other_bodies(folder: Path) -> list[Case]:
-    wheel = Wheel(bed=BED, duration=0.1, settle=0.03, load=60.0)
+    wheel = Wheel(bed=BED, duration=0.1, settle=0.03, load=60.0, **UNDAMPED)
     bars = {"grousers": 12, "grouser_height": 0.02, "grouser_thickness": 0.01}
     rows = [(0.0, 0.2, 0.03), (0.05, 0.21, -0.01), (0.1, 0.23, -0.02)]
     path = tuple((t, x, 0.2, z, 0.0, 0.0, 0.0, 1.0) for t, x, z in rows)
@@ -214,7 +215,7 @@ def _together() -> list[Case]:
         Bed(size=(length, 0.06, 0.05), spacing=0.01, headroom=0.02, walls=Walls("periodic", "periodic"))
         for length in (0.06, 0.1)
     ]
-    slopes = tuple(Incline(bed=bed, tilt=40.0, duration=0.1) for bed in layers)
+    slopes = tuple(Incline(bed=bed, material=Material(), tilt=40.0, duration=0.1) for bed in layers)
     halves = tuple(_early(bed=_wide(width), material=COARSE, duration=0.05) for width in (0.375, 0.4))
     return [
         Case(
@@ -227,7 +228,9 @@ def _together() -> list[Case]:
         ),
         Case(
             "two wheels together",
-            tuple(Wheel(bed=BED, duration=0.08, settle=0.02, load=load) for load in (60.0, 100.0)),
+            tuple(
+                Wheel(bed=BED, duration=0.08, settle=0.02, load=load, **UNDAMPED) for load in (60.0, 100.0)
+            ),
         ),
         Case(
             "half cuts together, fluidity and nonlocality",

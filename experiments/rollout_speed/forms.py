@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from sgns.model import algebra as affine
-from sgns.model.algebra import IndexedPairs, Pairs, pairs_of
+from sgns.model.algebra import Adjacency, IndexedAdjacency, adjacency_of
 from sgns.model.network import EncodeProcessDecode
 
 __all__ = ["Form", "forms_of", "multiplications", "onednn"]
@@ -20,7 +20,7 @@ Form = Callable[[Tensor, Tensor], Tensor]
 
 def forms_of(network: EncodeProcessDecode, edge_index: Tensor, node_count: int) -> dict[str, Form]:
     """Functions of node and edge features (B, V, ...), (B, E, ...); each name says what is new in it."""
-    indexed, broadcast = IndexedPairs(edge_index, node_count), pairs_of(edge_index, node_count)
+    indexed, broadcast = IndexedAdjacency(edge_index, node_count), adjacency_of(edge_index, node_count)
     return {
         "plain": lambda nodes, edges: network.plain(nodes, edges, edge_index),
         "first layer split": lambda *x: rearranged(network, *x, indexed, commuted=False, merged=False),
@@ -31,7 +31,12 @@ def forms_of(network: EncodeProcessDecode, edge_index: Tensor, node_count: int) 
 
 
 def rearranged(
-    network: EncodeProcessDecode, nodes: Tensor, edges: Tensor, pairs: Pairs, commuted: bool, merged: bool
+    network: EncodeProcessDecode,
+    nodes: Tensor,
+    edges: Tensor,
+    adjacency: Adjacency,
+    commuted: bool,
+    merged: bool,
 ) -> Tensor:
     """One message-passing step with some of the algebra of `sgns.model.network`."""
     step = network.process[0]
@@ -40,9 +45,9 @@ def rearranged(
     nodes = network.encode_nodes(nodes)
     encoded = network.encode_edges.ending(network.encode_edges.hidden(edges))
     own = encoded.into(own_weight, first.bias) if merged else linear(encoded.value(), own_weight, first.bias)
-    spread = pairs.spread(own, linear(nodes, receiver_weight), linear(nodes, sender_weight))
+    spread = adjacency.spread(own, linear(nodes, receiver_weight), linear(nodes, sender_weight))
     updated = step.edge_mlp.ending(step.edge_mlp.hidden_after_first(spread))
-    summed = updated.gathered(pairs) if commuted else pairs.gather(updated.value())
+    summed = updated.gathered(adjacency) if commuted else adjacency.gather(updated.value())
     return network.decode(step.node_mlp(torch.cat([nodes, summed], -1)))
 
 

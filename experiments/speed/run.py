@@ -75,7 +75,7 @@ def main() -> None:
         folder = Path(temporary)
         simulator = make_simulator(config, folder)
         rollout_scene(simulator, scene, folder / "warm.h5")
-        solver, stepping, complete, rates = [], [], [], []
+        solver, inference, complete, rates = [], [], [], []
         for _ in range(options.repeats):
             timing = simulate_scene(scene, folder / "truth.h5", effects=effects)
             solver.append(timing.per_simulated_second)
@@ -83,14 +83,14 @@ def main() -> None:
             # Three rollouts for each solver run: they are short, and their median is what counts.
             for _ in range(3):
                 rollout = rollout_scene(simulator, scene, folder / "rollout.h5")
-                stepping.append(rollout.stepping_rate)
+                inference.append(rollout.inference_rate)
                 complete.append(rollout.complete_rate)
     reference = statistics.median(solver)
     rows = []
     for what, included, values in (
         ("solver", "all substeps, frames written", solver),
         ("surrogate with soil", "steps with force, every frame decoded and written", complete),
-        ("surrogate", "steps with force and torque", stepping),
+        ("surrogate", "steps with force and torque", inference),
     ):
         median = statistics.median(values)
         rows.append(

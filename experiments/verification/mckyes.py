@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mpm_warp import Bed, Effects, Material, MeshBody, Plate, Scene, Solver, Walls
-from mpm_warp.bodies import Body
+from mpm_warp.bodies import Tool
 from mpm_warp.poses import about_y, rotate
 
 ANGLE = math.degrees(math.atan(0.76))  # of friction, of the paper's sand [degrees]
@@ -32,7 +32,7 @@ class BuriedBlade(Scene):
     """A raked blade whose lower front edge is at `depth`, with an open trench behind it, moves along x."""
 
     kind: str = "buried_blade"
-    blade: Body = field(default_factory=Plate)
+    blade: Tool = field(default_factory=Plate)
     rake: float = 0.0
     """Of the front from vertical, tip leading [degrees]."""
     depth: float = 0.08
@@ -41,7 +41,7 @@ class BuriedBlade(Scene):
     """[m/s]"""
 
     @property
-    def body(self) -> Body:
+    def body(self) -> Tool:
         return self.blade
 
     @property
@@ -113,7 +113,7 @@ def level_blade(file: Path, rake: float, size: tuple[float, float, float], frict
     return MeshBody(file=str(file), friction=friction)
 
 
-def blade_of(end: str, rake: float, width: float) -> Body:
+def blade_of(end: str, rake: float, width: float) -> Tool:
     """A blade with a level end, or the plate, the back edge of whose square end is lower than the front edge."""
     friction = math.tan(WALL_ANGLE)
     if end == "square":

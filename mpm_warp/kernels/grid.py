@@ -52,7 +52,7 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
     - `step`: velocity from the step's impulse and gravity, walls and floor; counts the step.
 
     Both clear what they have used for the next sum. `walls` are the kinds of x walls, y walls and floor
-    (`Walls.kinds`); the kernels hold no code of other kinds.
+    (`Walls.conditions`); the kernels hold no code of other kinds.
     """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     Grid = grid_struct(real)

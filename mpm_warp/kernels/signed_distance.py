@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from ..bodies import Body
+from ..bodies import Tool
 
 OUT_OF_REACH = 1.0e6  # [m], for points that cannot touch
 
@@ -45,7 +45,7 @@ def shape_struct(real: type, shape: str) -> type:
     return MeshSize
 
 
-def shape_data(body: Body, real: type, margin: float, device: wp.Device) -> tuple[object, wp.Mesh | None]:
+def shape_data(body: Tool, real: type, margin: float, device: wp.Device) -> tuple[object, wp.Mesh | None]:
     """The filled struct of a body, and the mesh that has to be kept alive with it.
 
     Args:

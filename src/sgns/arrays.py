@@ -77,12 +77,7 @@ def real_array(values: Any, what: str, needs: str) -> np.ndarray:
 
 
 def finite_array(values: Any, what: str, shape: Sequence[int | str]) -> np.ndarray:
-    """A float64 copy of finite numbers in a shape.
-
-    Args:
-        values: As for `real_array`.
-        what: How to call them in an error.
-        shape: Sizes; a letter or word stands for any size but 0.
+    """A float64 copy of finite numbers in a shape, in which a letter or word stands for any size but 0.
 
     Raises:
         UserError: As `real_array`, another shape, or a value that is not finite.
@@ -100,24 +95,11 @@ def finite_array(values: Any, what: str, shape: Sequence[int | str]) -> np.ndarr
     return found
 
 
-# --- Poses of a body: rotations, points carried along, and the check of what a person gives -------------
-# A pose is the position of the centre of mass [m] and a unit quaternion x, y, z, w, body -> world.
-# Shapes: T frames, M body points.
+# --- Poses that a person gives ------------------------------------------------------------------------------
 
 
 def check_pose(pose: np.ndarray, what: str = "tool pose") -> np.ndarray:
-    """One pose as float64 with an exactly unit quaternion.
-
-    Args:
-        pose: Centre of mass [m] and quaternion x, y, z, w, shape (7,).
-        what: How to call it in an error.
-
-    Returns:
-        Shape (7,), a copy.
-
-    Raises:
-        UserError: As `check_poses`; several poses are refused, too.
-    """
+    """As `check_poses`, of one pose, shape (7,); several are refused, too."""
     return require_poses(pose_rows(pose, what, "x, y, z, qx, qy, qz, qw, shape (7,)", 1), what, "")[0]
 
 
@@ -127,14 +109,8 @@ def first_pose(poses: np.ndarray, what: str = "first pose") -> np.ndarray:
 
 
 def check_poses(poses: np.ndarray, what: str = "tool path") -> np.ndarray:
-    """Poses as float64 with exactly unit quaternions.
-
-    Args:
-        poses: Centre of mass [m] and quaternion x, y, z, w, shape (T, 7) or (7,).
-        what: How to call them in an error.
-
-    Returns:
-        Shape (T, 7), a copy.
+    """A float64 copy (T, 7) of poses, centre of mass [m] and quaternion x, y, z, w, shape (T, 7) or (7,), with exactly
+    unit quaternions.
 
     Raises:
         UserError: No real numbers, wrong shape, a value that is not finite, or a quaternion off unit length by more
@@ -144,10 +120,7 @@ def check_poses(poses: np.ndarray, what: str = "tool path") -> np.ndarray:
 
 
 def pose_rows(
-    poses: np.ndarray,
-    what: str,
-    needs: str = "rows x, y, z, qx, qy, qz, qw, shape (T, 7)",
-    most: int = 2,
+    poses: np.ndarray, what: str, needs: str = "rows x, y, z, qx, qy, qz, qw, shape (T, 7)", most: int = 2
 ) -> np.ndarray:
     """A float64 copy of what has the shape of poses, (T, 7) or (7,), of at most so many axes; shape (T, 7)."""
     poses = real_array(poses, what, needs)

@@ -36,23 +36,23 @@ class RolloutTiming:
 
     Attributes:
         simulated: time simulated [s].
-        stepping: wall time of the network's steps with force and torque [s].
+        inference: wall time of the network's steps with force and torque [s].
         writing: wall time of decoding every frame and writing the run file [s].
     """
 
     simulated: float
-    stepping: float
+    inference: float
     writing: float
 
     @property
-    def stepping_rate(self) -> float:
+    def inference_rate(self) -> float:
         """Wall seconds per simulated second: steps with force, no particles decoded."""
-        return self.stepping / self.simulated
+        return self.inference / self.simulated
 
     @property
     def complete_rate(self) -> float:
         """Wall seconds per simulated second: steps, decoding and writing every frame."""
-        return (self.stepping + self.writing) / self.simulated
+        return (self.inference + self.writing) / self.simulated
 
 
 @contextmanager
@@ -286,8 +286,8 @@ def main(cfg: DictConfig) -> float:
         require_space(output.parent, run_cost(scene).size)
         timing = rollout_scene(simulator, scene, output, seed=cfg.seed, checkpoint=cfg.checkpoint)
     log.info("rolled out %d frames (%.3g s) into %s", scene.frame_count, timing.simulated, output)
-    log.info("wall seconds per simulated second: %.3g stepping with force", timing.stepping_rate)
+    log.info("wall seconds per simulated second: %.3g stepping with force", timing.inference_rate)
     log.info(
         "wall seconds per simulated second: %.3g with decoding and writing every frame", timing.complete_rate
     )
-    return timing.stepping_rate
+    return timing.inference_rate

@@ -25,11 +25,11 @@ from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step
-from sgns.model.features import BodyTrack, Travel, body_track, context_of, markers, stepped_frames
+from sgns.model.features import BodyTrack, ToolMotion, body_track, context_of, markers, step_frames
 from sgns.model.training_range import Excess, TrainingRange
 from sgns.states import Rollout, Rollouts, State
 
-# Soil follows the clock for so long after the tool has moved at the pace of the training runs, then its travel [s].
+# Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
 _SETTLING = 0.5
 
 
@@ -44,8 +44,8 @@ class Simulator:
         surrogate: Network, basis and start.
         device: "cpu" or "cuda".
         num_modes: Of the soil, the first of those it was trained with; None: all.
-        rate_independent: Whether the soil follows the travel of a prescribed tool, not the clock, where the tool is
-            slower than in all training runs (see `sgns.model.features`).
+        rate_independent: Whether the soil follows a prescribed tool, not the clock, where the tool is slower than in
+            all training runs (see `sgns.model.features`).
 
     Attributes:
         start_positions: Of all particles at rest [m], shape (n, 3).
@@ -79,7 +79,7 @@ class Simulator:
         self._dynamics, self.basis = surrogate.dynamics, surrogate.basis
         if num_modes is not None:
             self._dynamics, self.basis = self._dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
-        self._follows_travel = rate_independent and not self._dynamics.predicts_body
+        self._rate_independent = rate_independent and not self._dynamics.predicts_body
         self._pace = surrogate.slowest_travel, math.ceil(_SETTLING * surrogate.frame_rate)
         # Copies: what a tensor shares with an array is freed when the tensor is sent to another process.
         self.start_positions = surrogate.start_positions.cpu().numpy().copy()
@@ -88,11 +88,11 @@ class Simulator:
         self.reset()
 
     def __copy__(self) -> Simulator:
-        twin = object.__new__(type(self))
-        twin.__dict__.update(self.__dict__)
+        copied = object.__new__(type(self))
+        copied.__dict__.update(self.__dict__)
         # All else is replaced, not written to, from step to step.
-        twin._stepper = copy.copy(self._stepper)
-        return twin
+        copied._stepper = copy.copy(self._stepper)
+        return copied
 
     @classmethod
     def load(
@@ -207,7 +207,7 @@ class Simulator:
         self._frame, self._points, self._numbers, self._stepper = 0, points, numbers, stepper
         self._poses, self._latent = poses, latent.clone()[None].to(self.device)
         self._load = np.zeros(3), np.zeros(3)
-        self._travel: Travel | None = None
+        self._motion: ToolMotion | None = None
         # The last two frames; what the network sees may be further apart.
         last = poses[-2:] or [np.full(7, np.nan)]
         self._shown = list(zip(last, latent[-len(last) :].numpy().copy(), strict=True))
@@ -230,13 +230,13 @@ class Simulator:
         poses, shown = self._poses, self._shown[-1]
         if not poses:
             poses, shown = [pose] * self.history, (pose, shown[1])
-        before = self._travel or Travel.along(self._markers(poses), *self._pace)
-        travel = before.moved(self._markers([pose])[0])
+        before = self._motion or ToolMotion.along(self._markers(poses), *self._pace)
+        motion = before.moved(self._markers([pose])[0])
         latent, load = self._latent, self._load
-        if travel.steps or not self._follows_travel:
+        if motion.steps or not self._rate_independent:
             pose, latent, load = self._step_soil(poses, pose)
             poses = [*poses[1:], pose]
-        self._poses, self._travel, self._latent, self._load = poses, travel, latent, load
+        self._poses, self._motion, self._latent, self._load = poses, motion, latent, load
         self._shown = [shown, (pose, latent[0, -1].cpu().numpy().copy())]
         self._frame += 1
         return self._state()
@@ -289,45 +289,29 @@ class Simulator:
         Raises:
             UserError: What is given is not of the shape and kind above, or the path is shorter than the history.
         """
-        poses = check_poses(poses)
-        points = self._checked_points(body_points)
-        d = self.history
-        loads = {"force history": force_history, "torque history": torque_history}
-        given_loads = [
-            None if load is None else finite_array(load, what, (d, 3)) for what, load in loads.items()
+        poses, points, d = check_poses(poses), self._checked_points(body_points), self.history
+        loads = [
+            None if load is None else finite_array(load, what, (d, 3))
+            for what, load in (("force history", force_history), ("torque history", torque_history))
         ]
         if latent_history is None:
-            padding, given, latent = d - 1, 1, self._start_latent.expand(d, -1, -1)
-            if any(load is not None for load in given_loads):
+            given, latent = 1, self._start_latent.expand(d, -1, -1)
+            if any(load is not None for load in loads):
                 raise UserError(
                     "a force or torque history needs the latent history of the same frames; give it, too"
                 )
         else:
-            padding, given, latent = 0, d, self._checked_history(latent_history)
+            given, latent = d, self._checked_history(latent_history)
             if len(poses) < d:
                 raise UserError(
                     f"the path has {len(poses)} frames; with a given history it needs at least {d}"
                 )
-        world = in_world_frame(poses, points)
         numbers = self._numbers_of(values)
         context = self._told(numbers)
         began = time.perf_counter()
-        frames, newest = self._steps_of(poses, world, given)
-        track = self._track(pad_start(poses[frames], padding), pad_start(world[frames], padding))
-        with torch.inference_mode():
-            path = self._dynamics.unroll(latent[None].to(self.device), track, context)
-            states, force, torque = (
-                part[0, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque)
-            )
+        found = self._unrolled(poses[None], points, context, latent, given, loads)
         wall_time = elapsed(began, time.perf_counter())
-        for part, load in zip((force, torque), given_loads, strict=True):
-            if load is not None:
-                part[:d] = load
-        states, force, torque = states[newest], force[newest], torque[newest]
-        if self.predicts_body:
-            nodes = path.body.position[0, padding:].cpu().numpy()
-            poses = self._predicted_poses(poses, nodes, points)
-            world = nodes if self._dynamics.settings.body_nodes == "points" else in_world_frame(poses, points)
+        states, force, torque, poses, world = (part[0] for part in found)
         excess = self._excess(poses, points, states, numbers)
         return Rollout(states, force, torque, poses, world, wall_time, excess)
 
@@ -359,49 +343,70 @@ class Simulator:
             raise UserError(f"paths_at_once is {paths_at_once!r}; it must be a whole number, at least 1")
         points, context = self._checked_points(body_points), self._told(self._numbers_of(values))
         poses = np.stack([check_poses(path, f"path {i}") for i, path in enumerate(poses)])
+        start = self._start_latent.expand(self.history, -1, -1)
         began = time.perf_counter()
-        with torch.inference_mode():
-            parts = [
-                self._from_rest(poses[first : first + paths_at_once], points, context)
-                for first in range(0, len(poses), paths_at_once)
-            ]
+        parts = [
+            self._unrolled(poses[first : first + paths_at_once], points, context, start)[:4]
+            for first in range(0, len(poses), paths_at_once)
+        ]
         latent, force, torque, poses = (np.concatenate(part) for part in zip(*parts, strict=True))
         return Rollouts(latent, force, torque, poses, elapsed(began, time.perf_counter()))
 
-    def _from_rest(
-        self, poses: np.ndarray, points: np.ndarray, context: Tensor
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Latent positions, force, torque and poses of some paths (B, T, 7) that begin with the bed at rest."""
-        padding = self.history - 1
-        worlds = [in_world_frame(path, points) for path in poses]
-        steps = [self._steps_of(*path, 1) for path in zip(poses, worlds, strict=True)]
-        # Side by side all take as many steps: those that are done rest.
-        longest = max(len(frames) for frames, _ in steps)
-        tracks = [
-            self._track(pad_start(path[shown], padding), pad_start(world[shown], padding))
-            for path, world, (frames, _) in zip(poses, worlds, steps, strict=True)
-            for shown in [np.pad(frames, (0, longest - len(frames)), mode="edge")]
-        ]
-        track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
-        latent = self._start_latent.to(self.device).expand(len(poses), self.history, -1, -1)
-        path = self._dynamics.unroll(latent, track, context.expand(len(poses), -1))
-        found = (
-            np.stack([part[newest] for part, (_, newest) in zip(parts.cpu().numpy(), steps, strict=True)])
-            for parts in (path.latent[:, padding:], path.force[:, padding:], path.torque[:, padding:])
+    def _unrolled(
+        self,
+        poses: np.ndarray,
+        points: np.ndarray,
+        context: Tensor,
+        latent: Tensor,
+        given: int = 1,
+        loads: Sequence[np.ndarray | None] = (None, None),
+    ) -> tuple[np.ndarray, ...]:
+        """Latent positions, force, torque, poses and body points in the world frame along some paths.
+
+        Args:
+            poses: Shape (B, T, 7).
+            points: Shape (M, 3).
+            context: Shape (1, K).
+            latent: The first d positions, shape (d, r, 3); of a bed at rest d times the same.
+            given: Frames of the paths that these are: 1 for a bed at rest, or d.
+            loads: Force and torque of these frames.
+        """
+        count, padding = len(poses), self.history - given
+        worlds = np.stack([in_world_frame(path, points) for path in poses])
+        frames, newest = zip(
+            *(self._steps_of(*path, given) for path in zip(poses, worlds, strict=True)), strict=True
         )
-        if self.predicts_body:
-            nodes = path.body.position[:, padding:].cpu().numpy()
-            poses = np.stack(
-                [self._predicted_poses(*pair, points) for pair in zip(poses, nodes, strict=True)]
+        # Before its first frame a bed is at rest. Side by side all take as many steps: those that are done rest.
+        longest = max(map(len, frames))
+        shown = [np.pad(each, (padding, longest - len(each)), mode="edge") for each in frames]
+        tracks = [self._track(poses[i, index], worlds[i, index]) for i, index in enumerate(shown)]
+        track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
+        with torch.inference_mode():
+            path = self._dynamics.unroll(
+                latent.to(self.device).expand(count, -1, -1, -1), track, context.expand(count, -1)
             )
-        return (*found, poses)  # type: ignore[return-value]
+            parts = [part[:, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque)]
+            nodes = path.body.position[:, padding:].cpu().numpy()
+        for part, load in zip(parts[1:], loads, strict=True):
+            if load is not None:
+                part[:, :given] = load
+        parts = [part[np.arange(count)[:, None], np.stack(newest)] for part in parts]
+        if self.predicts_body:
+            found = [self._predicted_poses(*pair, points) for pair in zip(poses, nodes, strict=True)]
+            poses = np.stack(found)
+            worlds = (
+                nodes
+                if self._dynamics.settings.body_nodes == "points"
+                else np.stack([in_world_frame(path, points) for path in poses])
+            )
+        return *parts, poses, worlds
 
     def _steps_of(self, poses: np.ndarray, world: np.ndarray, given: int) -> tuple[np.ndarray, np.ndarray]:
         """Frames that the soil takes a step into, the given ones first, and for each frame of the path which of them
         is the newest; poses (T, 7) and body points (T, M, 3)."""
-        if not self._follows_travel:
+        if not self._rate_independent:
             return np.arange(len(poses)), np.arange(len(poses))
-        frames = stepped_frames(markers(poses, world), given, *self._pace)
+        frames = step_frames(markers(poses, world), given, *self._pace)
         return frames, np.searchsorted(frames, np.arange(len(poses)), side="right") - 1
 
     def _predicted_poses(self, poses: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -492,19 +497,14 @@ class Simulator:
 
 
 def excess_of(
-    known: TrainingRange | None,
+    known: TrainingRange,
     poses: np.ndarray,
     points: np.ndarray,
     latent: np.ndarray,
     context: Mapping[str, float],
 ) -> Excess | None:
     """How far frames are outside a training range; body points (M, 3) in the body frame [m], else as
-    `TrainingRange.excess`. None where nobody knows, or the tool is nowhere yet."""
-    if known is None or not np.isfinite(poses).all():
+    `TrainingRange.excess`. None where the tool is nowhere yet."""
+    if not np.isfinite(poses).all():
         return None
     return known.excess(poses, in_world_frame(poses, points), latent, context)
-
-
-def pad_start(values: np.ndarray, count: int) -> np.ndarray:
-    """`count` copies of the first frame put before all frames."""
-    return np.concatenate([values[:1].repeat(count, 0), values])

@@ -39,7 +39,7 @@ class State:
     def outside(self) -> float:
         """How far this frame is from all that the training runs covered [1]: the distance of the worst of the tool's
         pose and motion, the soil's modes and their velocity, and the context from its training range, in widths of
-        that range. 0: inside every range; above 0.05 the answer is a guess; NaN: the checkpoint does not know."""
+        that range. 0: inside every range; above 0.05 the answer is a guess; NaN: the tool is nowhere yet."""
         found = self._excess()
         return np.nan if found is None else float(found.amount[-1])
 
@@ -71,8 +71,8 @@ class Rollout:
 
     @cached_property
     def excess(self) -> Excess | None:
-        """How far every frame is outside the training runs' range, see `State.outside`, and in what; None: the
-        checkpoint does not know."""
+        """How far every frame is outside the training runs' range, see `State.outside`, and in what; None: a
+        predicted tool is nowhere."""
         return self._excess()
 
 

@@ -13,14 +13,25 @@ from pathlib import Path
 import torch
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig
 
 from sgns.cli.commands import main
 from sgns.simulate.scene import scene_from_config
 from sgns_testing.tiny import make_dataset
 
 __all__ = [
-    "REDUCED", "SHORT", "SMALL", "TRAIN",
-    "call", "environment", "files", "refused", "sgns", "small_dataset",
+    "REDUCED",
+    "SHORT",
+    "SMALL",
+    "TRAIN",
+    "call",
+    "composed",
+    "environment",
+    "files",
+    "refusal",
+    "refused",
+    "sgns",
+    "small_dataset",
 ]  # fmt: skip
 
 SMALL = [
@@ -75,6 +86,21 @@ def sgns(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         return call(*arguments)
     finally:
         os.chdir(before)
+
+
+def refusal(folder: Path, *arguments: str) -> str:
+    """The line with which a command refuses in a folder where nothing is written."""
+    before = sorted(folder.iterdir())
+    done = sgns(folder, *arguments)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert sorted(folder.iterdir()) == before
+    return done.stderr
+
+
+def composed(*overrides: str) -> DictConfig:
+    """The settings of `sgns simulate <overrides>`."""
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        return compose("simulate", list(overrides))
 
 
 def environment() -> dict[str, str]:

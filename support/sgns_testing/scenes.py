@@ -29,6 +29,10 @@ def block(gravity: float = 0.0, duration: float = 0.05, frame_rate: float = 200.
     return Scene(bed=bed, gravity=gravity, duration=duration, frame_rate=frame_rate, **kw)
 
 
+UNDAMPED = {"friction_angle": None, "damping": 0.0}
+"""Of a wheel that falls freely, on soil with the material's own friction."""
+
+
 def cut(**kw) -> Excavation:
     """A small, fast excavation: 4 800 particles on a 2 cm grid."""
     values = {

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mpm_warp import (
     Bed,
@@ -24,8 +25,8 @@ from mpm_warp import (
     effects_for,
 )
 from mpm_warp.auto_effects import EFFECTS, expected_flow
-from mpm_warp.poses import about_y, multiply, rotate
-from sgns_testing.scenes import cut
+from mpm_warp.poses import rotate
+from sgns_testing.scenes import UNDAMPED, cut
 from sgns_testing.solvers import compiled_source, launches
 
 BEADS = Material(
@@ -38,7 +39,11 @@ BEADS = Material(
 )
 SLOPE = Bed(size=(0.006, 0.006, 0.03), spacing=0.0015, headroom=0.006, walls=Walls("periodic", "periodic"))
 WHEEL = Wheel(
-    bed=Bed(size=(0.4, 0.2, 0.08), spacing=0.02, headroom=0.1), duration=0.3, settle=0.1, rim_speed=0.06
+    bed=Bed(size=(0.4, 0.2, 0.08), spacing=0.02, headroom=0.1),
+    duration=0.3,
+    settle=0.1,
+    rim_speed=0.06,
+    **UNDAMPED,
 )
 COLUMN = Column(bed=Bed(size=(0.3, 0.3, 0.06), spacing=0.015, headroom=0.03), radius=0.06, duration=0.3)
 FINE_COLUMN = replace(COLUMN, material=replace(COLUMN.material, grain_diameter=2e-4))
@@ -63,9 +68,7 @@ def test_inertial_number_of_a_cut():
 
 def test_depth_of_a_turned_plate():
     """A plate of 0.2 x 0.044 m that leans by 30 degrees about y and by 20 about x, deepest with one corner."""
-    q = multiply(
-        about_y(np.radians(30.0)), np.array([np.sin(np.radians(10.0)), 0.0, 0.0, np.cos(np.radians(10.0))])
-    )
+    q = Rotation.from_euler("xy", [20.0, 30.0], degrees=True).as_quat()
     path = [(0.0, 0.2, 0.2, 0.05, *q), (1.0, 0.3, 0.2, 0.05, *q)]
     scene = cut(motion="path", path=path)
     deepest = rotate(q, scene.blade.outline())[:, 2].min() + 0.05

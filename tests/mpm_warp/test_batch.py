@@ -26,7 +26,7 @@ from mpm_warp import (
 from mpm_warp import launch as work_module
 from mpm_warp.batch import all_together
 from mpm_warp.launch import Launch, Program, Together, Work
-from sgns_testing.scenes import block, cut
+from sgns_testing.scenes import UNDAMPED, block, cut
 
 needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
 
@@ -44,8 +44,8 @@ def different_scenes():
         cut(duration=0.15),
         cut(duration=0.12, rake=30.0, gravity=1.62, material=Material(youngs_modulus=2.0e6)),
         cut(duration=0.12, bed=Bed(size=(0.5, 0.3, 0.1), spacing=0.025, headroom=0.12)),
-        Wheel(bed=cut().bed, duration=0.08, settle=0.02),
-        Wheel(bed=cut().bed, duration=0.1, settle=0.02, load=60.0),
+        Wheel(bed=cut().bed, duration=0.08, settle=0.02, **UNDAMPED),
+        Wheel(bed=cut().bed, duration=0.1, settle=0.02, load=60.0, **UNDAMPED),
     ]
 
 
@@ -98,6 +98,7 @@ def test_periodic_bins_keep_their_own_length():
     scenes = [
         Incline(
             bed=Bed(size=(length, 0.06, 0.05), spacing=0.01, walls=Walls(x="periodic", y="periodic")),
+            material=Material(),
             tilt=40.0,
             flowing=True,
             duration=0.05,
@@ -135,7 +136,7 @@ def test_captured_graphs_are_the_launches(effects):
     """What a GPU replays, here captured and replayed by Warp on the CPU: the same bits, alone and together, though the
     numbers of steps differ from scene to scene and from remap to remap."""
     scenes = [cut(duration=0.06, speed=speed, depth=0.03, remap_time=4e-3) for speed in (0.1, 0.25)]
-    scenes.append(Wheel(bed=cut().bed, duration=0.06, settle=0.02, load=60.0))
+    scenes.append(Wheel(bed=cut().bed, duration=0.06, settle=0.02, load=60.0, **UNDAMPED))
 
     def computed():
         alone = [list(Solver(scene, effects).frames()) for scene in scenes]

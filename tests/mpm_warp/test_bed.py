@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 from scipy.spatial import cKDTree
 
-from mpm_warp import Bed, Effects, Incline, Scene, SceneError, Solver, Walls, arrange
+from mpm_warp import Bed, Effects, Incline, Material, Scene, SceneError, Solver, Walls, arrange
 from mpm_warp.bed import POISSON_RADIUS
 from mpm_warp.kernels.grid import grid_step
 from sgns_testing.scenes import BlockBed, block, cut
@@ -137,7 +137,7 @@ def test_a_period_is_a_whole_number_of_cells():
 def test_walls_survive_plain_data():
     scene = cut(bed=Bed(size=(0.48, 0.4, 0.16), spacing=0.02, walls=Walls("slip", 0.3, 0.5)))
     assert Scene.from_dict(scene.to_dict()) == scene
-    assert scene.bed.walls.kinds == ("slip", "friction", "friction")
+    assert scene.bed.walls.conditions == ("slip", "friction", "friction")
 
 
 def test_no_two_kinds_of_walls_share_a_kernel():
@@ -155,7 +155,9 @@ def test_slippery_walls_hold_no_flow_whatever_ran_before():
     slowest = []
     for y in ("no_slip", "slip"):
         bed = Bed(size=(0.06, 0.06, 0.05), spacing=0.01, walls=Walls("periodic", y))
-        *_, frame = Solver(Incline(bed=bed, tilt=40.0, flowing=True, duration=0.05)).frames()
+        *_, frame = Solver(
+            Incline(bed=bed, material=Material(), tilt=40.0, flowing=True, duration=0.05)
+        ).frames()
         at_top = np.isclose(frame.position[:, 2], frame.position[:, 2].max(), atol=0.002)
         slowest.append(frame.velocity[at_top, 0].min() / frame.velocity[at_top, 0].max())
     assert slowest[0] < 0.8

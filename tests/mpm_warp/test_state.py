@@ -11,12 +11,12 @@ import pytest
 from mpm_warp import Bed, Effects, Incline, Material, SceneError, Solver, SolverStopped, State, Walls, Wheel
 from mpm_warp.batch import all_together
 from mpm_warp.limits import Guard
-from sgns_testing.scenes import block, cut
+from sgns_testing.scenes import UNDAMPED, block, cut
 
 
 def wheel() -> Wheel:
     bed = Bed(size=(0.4, 0.24, 0.08), spacing=0.02, headroom=0.1)
-    return Wheel(bed=bed, duration=0.1, settle=0.05, load=20.0)
+    return Wheel(bed=bed, duration=0.1, settle=0.05, load=20.0, **UNDAMPED)
 
 
 def slope(**kw) -> Incline:

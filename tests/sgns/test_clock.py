@@ -43,13 +43,13 @@ def test_a_run_is_made_and_said_to_have_been_quick(tmp_path, odd_clock):
 def test_the_time_left_is_some_time(tmp_path, odd_clock):
     c = campaign(tmp_path, runs=6)
     costs = {name: run_cost(scene) for name, scene in c.scenes.items()}
-    production = campaign_runs._Production(c, costs, "cpu", 4)
+    workers = campaign_runs._Workers(c, costs, "cpu", 4)
     try:
         last = time.monotonic()
-        production._see(1e6, elapsed(last, time.monotonic()), busy=4)
-        assert production._left() == "1 s"
+        workers._see(1e6, elapsed(last, time.monotonic()), busy=4)
+        assert workers._left() == "1 s"
     finally:
-        production._pool.shutdown()
+        workers._pool.shutdown()
 
 
 def test_a_trial_ends_and_takes_some_time(tmp_path, odd_clock, monkeypatch):

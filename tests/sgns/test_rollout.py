@@ -57,7 +57,7 @@ def test_file_is_a_complete_run_with_decoded_soil(simulator, tmp_path):
         assert run.force == pytest.approx(simulator.known[0][2], rel=1e-5, abs=1e-5)
         assert run.pose == pytest.approx(scene.poses)
     assert timing.simulated == pytest.approx((len(scene.poses) - 1) / 60.0)
-    assert timing.complete_rate > timing.stepping_rate > 0.0
+    assert timing.complete_rate > timing.inference_rate > 0.0
 
 
 def test_velocities_are_differences_of_positions(simulator, tmp_path, monkeypatch):
@@ -144,8 +144,8 @@ def test_a_path_unlike_the_training_runs_is_told_and_recorded(simulator, tmp_pat
 
 
 def test_rates_are_per_simulated_second():
-    timing = RolloutTiming(simulated=4.0, stepping=2.0, writing=6.0)
-    assert timing.stepping_rate == 0.5
+    timing = RolloutTiming(simulated=4.0, inference=2.0, writing=6.0)
+    assert timing.inference_rate == 0.5
     assert timing.complete_rate == 2.0
 
 

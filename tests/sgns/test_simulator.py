@@ -163,11 +163,7 @@ def test_bad_input_is_named(trained) -> None:
 def test_bad_checkpoints_are_named(trained, tmp_path) -> None:
     _, folder = trained
     whole = (folder / "pose" / "best.ckpt").read_bytes()
-    for name, content in (
-        ("truncated", whole[: len(whole) // 2]),
-        ("empty", b""),
-        ("text", b"hello"),
-    ):
+    for name, content in (("truncated", whole[: len(whole) // 2]), ("empty", b""), ("text", b"hello")):
         path = tmp_path / f"{name}.ckpt"
         path.write_bytes(content)
         with pytest.raises(UserError, match=f"{name}.ckpt"):
@@ -309,19 +305,20 @@ def test_the_given_force_stays_until_a_step_is_taken(trained) -> None:
     np.testing.assert_array_equal(rollout.force[2:], run.force[2:3].repeat(8, axis=0))
 
 
-def test_a_checkpoint_from_before_holds_soil_at_rest_only(trained, tmp_path) -> None:
-    data, folder = trained
-    content = torch.load(folder / "pose" / "best.ckpt", weights_only=True)
-    known = Simulator.load(folder / "pose" / "best.ckpt")
-    path = along_x(known, data.runs("test")[0].pose[0], [0.01] * 5 + [0.0] * 40)
-    assert not np.diff(known.rollout(path).latent, axis=0).any()
-    del content["hyper_parameters"]["slowest_travel"]
-    torch.save(content, tmp_path / "old.ckpt")
-    moved = np.diff(Simulator.load(tmp_path / "old.ckpt").rollout(path).latent, axis=0).any(axis=(1, 2))
-    assert moved[:34].all() and not moved[34:].any()
-    content["hyper_parameters"]["slowest_travel"] = float("nan")
+@pytest.mark.parametrize(
+    ("key", "value", "line"),
+    [
+        ("slowest_travel", float("nan"), "the slowest travel is nan"),
+        ("slowest_travel", None, "fit together"),
+        ("training_range", None, "fit together"),
+        ("training_range", {"low": {}, "high": {}}, "fit together"),
+    ],
+)
+def test_a_card_that_does_not_say_what_was_trained_is_refused(trained, tmp_path, key, value, line) -> None:
+    content = torch.load(trained[1] / "pose" / "best.ckpt", weights_only=True)
+    content["hyper_parameters"][key] = value
     torch.save(content, tmp_path / "bad.ckpt")
-    with pytest.raises(UserError, match="slowest travel"):
+    with pytest.raises(UserError, match=line):
         Simulator.load(tmp_path / "bad.ckpt")
 
 
@@ -354,16 +351,6 @@ def test_it_says_how_far_a_path_is_outside(trained, kind) -> None:
     simulator.reset(path)
     told = [0.0] + [simulator.step(pose).outside for pose in path[1:]]
     np.testing.assert_allclose(told, rollout.excess.amount, rtol=1e-12)
-
-
-def test_a_checkpoint_from_before_cannot_say_it(trained, tmp_path) -> None:
-    data, folder = trained
-    content = torch.load(folder / "pose" / "best.ckpt", weights_only=True)
-    del content["hyper_parameters"]["training_range"]
-    torch.save(content, tmp_path / "old.ckpt")
-    simulator = Simulator.load(tmp_path / "old.ckpt")
-    assert simulator.rollout(data.runs("test")[0].pose).excess is None
-    assert np.isnan(simulator.reset(data.runs("test")[0].pose).outside)
 
 
 def test_a_checkpoint_that_is_not_finite_is_refused(trained, tmp_path) -> None:

@@ -163,7 +163,7 @@ def test_a_clock_that_is_set(days, tmp_path, monkeypatch) -> None:
 
     run(tmp_path / "whole")
     with monkeypatch.context() as patch, pytest.raises(Interrupted):
-        patch.setattr("sgns.train.command.StepProgress.on_train_batch_end", stop)
+        patch.setattr("sgns.train.callbacks.StepProgress.on_train_batch_end", stop)
         run(tmp_path / "parts")
     now = time.time
     monkeypatch.setattr(time, "time", lambda: now() + 86400.0 * days)
@@ -176,7 +176,7 @@ def test_a_clock_that_is_set(days, tmp_path, monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("collected", [True, False])
-def test_leftovers_of_a_killed_process_do_not_stay(collected, tmp_path) -> None:
+def test_hidden_files_of_a_killed_process_do_not_stay(collected, tmp_path) -> None:
     """Also not while its number is still taken because nobody has asked for its status."""
     if not collected and not Path("/proc/self/stat").exists():
         pytest.skip("this system does not show the states of processes as files")

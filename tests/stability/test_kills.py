@@ -14,7 +14,7 @@ import yaml
 from kills import COMMANDS, broken, same
 
 from sgns.config import UserError
-from sgns.data.files import claimed
+from sgns.data.files import file_lock
 from sgns.simulate.workers import simulate_campaign
 from sgns_testing.campaigns import campaign
 from sgns_testing.commands import environment
@@ -56,13 +56,13 @@ def test_killed_commands_go_on_and_end_as_if_nothing_had_happened(tmp_path):
 # --- two processes, one campaign --------------------------------------------------------------------------
 
 NOBODY = 65534
-CLAIM = """
+LOCK = """
 import sys
 from pathlib import Path
 from sgns_testing.permissions import become_ordinary
-from sgns.data.files import claimed
+from sgns.data.files import file_lock
 become_ordinary()
-with claimed(Path(sys.argv[1])) as ours:
+with file_lock(Path(sys.argv[1])) as ours:
     print(ours)
 """
 DRAW = {"depth": [0.02, 0.03, 0.04, 0.05], "duration": [0.5]}
@@ -140,31 +140,31 @@ def test_of_two_campaigns_with_other_settings_the_second_is_refused(tmp_path) ->
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])
-def test_another_user_sees_a_claim_whatever_the_umask(tmp_path, umask) -> None:
+def test_another_user_sees_a_lock_whatever_the_umask(tmp_path, umask) -> None:
     before = os.umask(umask)
     try:
-        with claimed(tmp_path / "a.h5") as ours:
+        with file_lock(tmp_path / "a.h5") as ours:
             assert ours
             (lock,) = tmp_path.iterdir()
             if os.geteuid() == 0:
                 os.chown(lock, NOBODY, NOBODY)  # as if the other one had made it
             assert lock.stat().st_mode & 0o006 == 0o006
-            assert begin(CLAIM, str(tmp_path / "a.h5")).communicate(timeout=100)[:2] == ("False\n", "")
+            assert begin(LOCK, str(tmp_path / "a.h5")).communicate(timeout=100)[:2] == ("False\n", "")
     finally:
         os.umask(before)
 
 
-def test_a_claim_left_by_another_user_in_a_shared_folder_is_taken_over(tmp_path) -> None:
+def test_a_lock_left_by_another_user_in_a_shared_folder_is_taken_over(tmp_path) -> None:
     if os.geteuid() != 0:
         pytest.skip("needs files of another user")
-    with claimed(tmp_path / "a.h5"):
+    with file_lock(tmp_path / "a.h5"):
         (lock,) = tmp_path.iterdir()
         lock.rename(tmp_path / "kept")
     (tmp_path / "kept").rename(lock)  # as after a kill
     os.chown(lock, NOBODY, NOBODY)
     os.chown(tmp_path, NOBODY, NOBODY)
     tmp_path.chmod(0o1777)  # sticky: nobody may remove another user's file
-    assert begin(CLAIM, str(tmp_path / "a.h5")).communicate(timeout=100)[:2] == ("True\n", "")
+    assert begin(LOCK, str(tmp_path / "a.h5")).communicate(timeout=100)[:2] == ("True\n", "")
 
 
 def test_a_folder_of_another_user_is_named(tmp_path, monkeypatch) -> None:

@@ -66,7 +66,15 @@ def light_wheel() -> tuple[float, str]:
     """A wheel of 10 g, lighter than the soil it touches: the step must shrink, and it must come to rest."""
     bed = replace(WHEEL_BED, particles_per_cell=1.0)
     scene = Wheel(
-        bed=bed, load=0.1, diameter=0.05, clearance=0.003, duration=0.7, settle=0.69, damping=5.0, slip=0.0
+        bed=bed,
+        load=0.1,
+        diameter=0.05,
+        clearance=0.003,
+        duration=0.7,
+        settle=0.69,
+        damping=5.0,
+        slip=0.0,
+        friction_angle=None,
     )
     solver = Solver(scene, Effects(symmetry=True))
     frames = list(solver.frames())

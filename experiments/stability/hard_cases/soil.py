@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from mpm_warp import Bed, Box, Column, Effects, Excavation, Incline, Push, Scene, Solver, Walls
+from mpm_warp import Bed, Box, Column, Effects, Excavation, Incline, Material, Push, Scene, Solver, Walls
 from mpm_warp.diagnostics import leakage
 from sgns_testing.scenes import BlockBed, block, cut
 
@@ -282,7 +282,7 @@ def steep_slope() -> tuple[float, str]:
     Its base cannot hold it: friction there is at most mu_2, at least mu_s.
     """
     bed = Bed(size=(0.08, 0.08, 0.08), spacing=0.02, headroom=0.08, walls=Walls("periodic", "periodic"))
-    scene = Incline(bed=bed, flowing=False, tilt=60.0, duration=0.5, gravity=9.81)
+    scene = Incline(bed=bed, material=Material(), flowing=False, tilt=60.0, duration=0.5, gravity=9.81)
     last = frames_of(scene, every=10**6)[-1]
     speed = float(last.velocity[:, 0].mean())
     low, high = (

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import h5py
 import numpy as np
 from omegaconf import OmegaConf
+from scipy.spatial import cKDTree
 
 from mpm_warp.poses import rotation_matrices
 from sgns.config import UserError, parse_yaml
@@ -29,8 +30,7 @@ from sgns.data.layout import (
     scene_problems,
     structure_problems,
 )
-from sgns.data.vtkhdf import view_problems
-from sgns.data.writer import ContentHash
+from sgns.data.writer import VIEW_ATTRIBUTES, ContentHash, view_arrays
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-# --- Checking a run file: every problem, in words -------------------------------------------------------
+# --- Every problem of a run file, in words --------------------------------------------------------------
 # Letters: T frames, n soil particles, M body points.
 
 RIGID_TOLERANCE = 1e-4
@@ -113,19 +113,13 @@ def _check_attributes(file: h5py.File) -> list[str]:
             except ValueError as error:
                 problems.append(f"root attribute 'scene': {one_line(error)}")
         elif name == "effects":
-            problems += [
-                f"effect {key!r} does not say whether it is on and why"
-                for key, effect in data.items()
-                if not _says_why(effect)
-            ]
+            for key, effect in data.items():
+                if not (isinstance(effect, dict) and type(effect.get("on")) is bool and effect.get("reason")):
+                    problems.append(f"effect {key!r} does not say whether it is on and why")
     producer = values.get("producer")
     if isinstance(producer, str) and producer not in PRODUCERS:
         problems.append(f"producer is {producer!r}; allowed: {', '.join(PRODUCERS)}")
     return problems
-
-
-def _says_why(effect: object) -> bool:
-    return isinstance(effect, dict) and isinstance(effect.get("on"), bool) and bool(effect.get("reason"))
 
 
 def _check_stopped(file: h5py.File) -> list[str]:
@@ -201,19 +195,48 @@ def _check_mesh(file: h5py.File) -> list[str]:
         return []
     pose, points = (file[f"{ELEMENTS[name].path}/value"][0].astype(float) for name in ("pose", "body_points"))
     nodes = (points - pose[:3]) @ rotation_matrices(pose[None, 3:])[0]
-    for number, node in enumerate(nodes):
-        away = float(np.linalg.norm(mesh[0] - node, axis=1).min())
-        if not away <= RIGID_TOLERANCE:
-            return [
-                f"body point {number} is {away:.3g} m from the nearest vertex of the tool's mesh (allowed "
-                f"{RIGID_TOLERANCE:g} m): the mesh is of another tool"
-            ]
-    return []
+    away, _ = cKDTree(mesh[0]).query(nodes)
+    number = _first(~(away <= RIGID_TOLERANCE))
+    if number is None:
+        return []
+    return [
+        f"body point {number} is {away[number]:.3g} m from the nearest vertex of the tool's mesh (allowed "
+        f"{RIGID_TOLERANCE:g} m): the mesh is of another tool"
+    ]
 
 
 def _check_view(file: h5py.File) -> list[str]:
+    """Where /VTKHDF does not fit the H5MD arrays; the values behind it are compared by `_check_frames`."""
+    group = own_object(file, "VTKHDF")
+    if not isinstance(group, h5py.Group):
+        return ["group /VTKHDF is missing: ParaView cannot open the file"]
+    problems = []
+    for name, value in VIEW_ATTRIBUTES.items():
+        if not np.array_equal(group.attrs.get(name), value):
+            wanted = value.decode() if isinstance(value, bytes) else tuple(value.tolist())
+            problems.append(f"attribute {name} of /VTKHDF is not {wanted}")
     frames, particles, _ = file[f"{ELEMENTS['position'].path}/value"].shape
-    return view_problems(file, frames, particles)
+    times = file[f"{ELEMENTS['position'].path}/time"][...]
+    for name, values in (view_arrays(frames, particles) | {"Steps/Values": times}).items():
+        try:
+            found = own_dataset(group, name)
+        except KeyError:
+            problems.append(f"dataset /VTKHDF/{name} is missing")
+            continue
+        if found.shape != values.shape or not np.array_equal(found[...], values):
+            problems.append(f"dataset /VTKHDF/{name} does not fit {frames} frames of {particles} particles")
+    for name in ("Points", "PointData/velocity"):
+        found = own_object(group, name)
+        if not isinstance(found, h5py.Dataset):
+            problems.append(f"dataset /VTKHDF/{name} is missing")
+        elif found.shape != (frames * particles, 3):
+            expected = (frames * particles, 3)
+            problems.append(f"dataset /VTKHDF/{name} has shape {found.shape}, expected {expected}")
+        elif not found.is_virtual:
+            problems.append(f"dataset /VTKHDF/{name} is a copy, not a view")
+        else:
+            require_own_view(found)
+    return problems
 
 
 def _check_frames(file: h5py.File) -> list[str]:
@@ -221,10 +244,7 @@ def _check_frames(file: h5py.File) -> list[str]:
     values = {name: file[f"{element.path}/value"] for name, element in ELEMENTS.items()}
     small = {name: values[name][...] for name in values if name not in ("position", "velocity")}
     small["time"] = file[f"{ELEMENTS['position'].path}/time"][...]
-    views = {
-        "position": _view(file, "VTKHDF/Points"),
-        "velocity": _view(file, "VTKHDF/PointData/velocity"),
-    }
+    views = {"position": _view(file, "VTKHDF/Points"), "velocity": _view(file, "VTKHDF/PointData/velocity")}
     frames, particles, _ = values["position"].shape
     found: dict[str, str] = {}  # the first problem of each kind
     content = ContentHash()
@@ -306,11 +326,7 @@ def main(cfg: DictConfig) -> float:
     files = run_files(named)
     bad = 0
     for path in files:
-        try:
-            problems = check_run(path)
-        except UserError as error:
-            problems = [str(error)]
-        if problems:
+        if problems := check_run(path):
             bad += 1
             for problem in problems:
                 log.info("%s", problem if str(path) in problem else f"{path}: {problem}")

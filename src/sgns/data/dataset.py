@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sgns.config import UserError, flattened, parse_yaml
-from sgns.data.small_files import read_text
+from sgns.data.files import read_text
 
 SPLITS = ("train", "validation", "test")
 _MOST_BYTES = 1 << 26
@@ -42,7 +42,7 @@ class Dataset:
             raise UserError(
                 f"no dataset in {path}: dataset.yaml is missing; make one: sgns simulate dataset=<name>"
             )
-        content = _read(file)
+        content = read_description(file)
         split = content.get("split") if isinstance(content, dict) else None
         if not isinstance(split, dict) or not all(_are_names(split.get(s)) for s in SPLITS):
             raise UserError(f"{file} has no split into {', '.join(SPLITS)}; it was not made by sgns simulate")
@@ -101,7 +101,8 @@ def _same(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-def _read(file: Path) -> Any:
+def read_description(file: Path) -> Any:
+    """Content of a dataset.yaml."""
     advice = "repair it, or make the dataset in another folder"
     text = read_text(file, "no dataset", advice, _MOST_BYTES)
     try:

@@ -1,35 +1,41 @@
-"""Files that are whole or not there, made by one process at a time."""
+"""Files that are whole or not there, made by one process at a time; and small files, read within bounds."""
 
 from __future__ import annotations
 
-import contextlib
+import csv
+import errno
+import io
+import json
 import logging
 import os
 import socket
 import stat
-import time
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, TypeVar
+from typing import Any, BinaryIO, TypeVar
 from uuid import uuid4
 
 import h5py
+import numpy as np
+from filelock import FileLock, Timeout
 
-from mpm_warp.inputs import open_file
+from mpm_warp import inputs
 from sgns.config import UserError
-
-log = logging.getLogger(__name__)
-
-
-# --- Hidden files that become the real ones when they are complete, and what killed processes leave of them
+from sgns.data.layout import one_line
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
-_SUFFIX = ".partial"
-_KINDS = {
+
+log = logging.getLogger(__name__)
+
+
+# --- Names that a file may take -------------------------------------------------------------------------
+
+_FILE_TYPES = {
     stat.S_IFLNK: "a symbolic link; give the name of the file itself",
     stat.S_IFDIR: "a folder; give the name of a file in it, or another name",
     stat.S_IFIFO: "a pipe; give the name of a file",
@@ -41,11 +47,6 @@ _KINDS = {
 plain file."""
 
 
-def hidden_beside(path: Path) -> Path:
-    """A name in the same folder that says which process of which machine writes `path`."""
-    return path.with_name(f"{_start(path)}{os.getpid()}-{uuid4().hex[:8]}{_SUFFIX}")
-
-
 def require_replaceable(*paths: Path) -> None:
     """Refuse names that stand for something else than a plain file, or nothing yet: a file that takes such a name would
     destroy a device, a pipe or a link.
@@ -54,29 +55,17 @@ def require_replaceable(*paths: Path) -> None:
         UserError: says what it is.
     """
     for path in paths:
-        kind = _kind(path)
-        if kind not in (None, stat.S_IFREG):
-            what = _KINDS.get(kind, "no plain file; give the name of a file")
+        if not is_replaceable(path):
+            what = _FILE_TYPES.get(_file_type(path), "no plain file; give the name of a file")
             raise UserError(f"cannot write {path}: it is {what}")
 
 
 def is_replaceable(path: Path) -> bool:
     """Whether a file of ours may be there, or be put there: see `require_replaceable`."""
-    return _kind(path) in (None, stat.S_IFREG)
+    return _file_type(path) in (None, stat.S_IFREG)
 
 
-def give_name(temporary: Path, path: Path) -> None:
-    """Let a complete file take its name, and the place of a plain file that had it.
-
-    Raises:
-        UserError: By now the name stands for something else.
-        OSError: The system refuses.
-    """
-    require_replaceable(path)
-    os.replace(temporary, path)
-
-
-def _kind(path: Path) -> int | None:
+def _file_type(path: Path) -> int | None:
     """What the name itself stands for, as in `stat`; None for nothing, or where that cannot be asked."""
     try:
         return stat.S_IFMT(os.lstat(path).st_mode)
@@ -84,68 +73,14 @@ def _kind(path: Path) -> int | None:
         return None
 
 
-def hold(file: IO[bytes]) -> None:
-    """Show other processes, also those that cannot see this one's number, that the file is being written."""
-    if fcntl is not None:
-        with contextlib.suppress(OSError):  # some file systems have no locks
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def remove_leftovers(path: Path) -> None:
-    """Delete what killed processes of this machine left of `path`."""
-    if fcntl is None:
-        return
-    start = _start(path)
-    for found in path.parent.iterdir():
-        if not (found.name.startswith(start) and found.name.endswith(_SUFFIX)):
-            continue
-        pid = found.name[len(start) :].split("-")[0]
-        if not pid.isdecimal() or _alive(int(pid)):
-            continue
-        if _kind(found) != stat.S_IFREG:  # none of ours; opening a pipe may never end
-            continue
-        # A live process in a container may have a number that we cannot see; its lock shows that it is there.
-        with contextlib.suppress(OSError, ValueError), open_file(found, 1 << 62) as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            found.unlink()
-            log.info("removed %s, left by a process that was killed", found)
-
-
-def _start(path: Path) -> str:
-    return f".{path.name}.{socket.gethostname()}-"
-
-
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:
-        return True
-    return not _ended(pid)
-
-
-def _ended(pid: int) -> bool:
-    """Whether only the number of a process is left until its parent asks for its status, which may be never."""
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0]
-    except (OSError, IndexError):  # another system, or gone by now
-        return False
-    return state in ("Z", "X")
-
-
 # --- One process makes a file, however many were asked to -----------------------------------------------
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-_INTERVAL = 0.05  # seconds between two looks at a claim that is waited for
+_NO_LOCKS = {errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK}  # file systems that know none
 
 
 @contextmanager
 def only_here(path: Path) -> Iterator[None]:
-    """Claims the making of what a person asks for, before anything is computed.
+    """Locks the making of what a person asks for, before anything is computed.
 
     Args:
         path: the file; of a folder of results one of its files stands for all.
@@ -157,137 +92,236 @@ def only_here(path: Path) -> Iterator[None]:
     require_replaceable(path)
     with ExitStack() as stack:
         try:
-            ours = stack.enter_context(claimed(path))
+            ours = stack.enter_context(file_lock(path))
         except OSError as error:
             reason = f"{error.filename or path}: {error.strerror}"
             raise UserError(f"cannot write {path}: {reason}; choose another output") from error
         if not ours:
             raise UserError(
-                f"{path} is being made by {_holder(_lock_of(path))}; wait until that ends, or choose another output"
+                f"{path} is being made by {_holder(_lock_file(path))}; wait until that ends, or choose another output"
             )
         yield
 
 
 @contextmanager
-def claimed_in_turn(path: Path) -> Iterator[None]:
-    """Claims a file for a moment, after whoever has it."""
-    while True:
-        with claimed(path) as ours:
-            if ours:
-                yield
-                return
-        time.sleep(_INTERVAL)
+def file_lock(path: Path, wait: bool = False) -> Iterator[bool]:
+    """Locks the making of a file; gives False when another process has the lock, or waits for it.
 
-
-@contextmanager
-def claimed(path: Path) -> Iterator[bool]:
-    """Claims the making of a file; gives False when another process has claimed it.
-
-    A claim is a lock on a hidden file beside `path`, so it ends with the process that holds it, even if that is killed.
-    Where the file system knows no locks, every claim is granted.
+    The lock is one on a hidden file beside `path`, so it ends with the process that holds it, even if that is killed.
+    Where the file system knows no locks, everybody is given one.
 
     Raises:
-        UserError: the lock file's name stands for something else.
+        UserError: the name of the hidden file stands for something else.
         OSError: the folder cannot be made or written.
     """
-    if fcntl is None:
-        yield True
-        return
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock = _lock_of(path)
-    file = _locked(lock)
+    hidden = _lock_file(path)
+    require_replaceable(hidden)
+    lock = FileLock(
+        hidden,
+        timeout=-1 if wait else 0,
+        mode=0o666,  # other users may lock it, too, whatever the umask
+        thread_local=False,
+        fallback_to_soft=False,  # a soft lock outlives its process
+        on_acquired=_sign,
+    )
+    ours = True
     try:
-        yield file is not None
+        lock.acquire()
+    except Timeout:
+        ours = False
+    except OSError as error:
+        # filelock does not trust the free lock of another user in a sticky folder, such as one who was killed.
+        distrusted = isinstance(error, PermissionError) and os.access(hidden, os.W_OK)
+        if error.errno not in _NO_LOCKS and not distrusted:
+            raise
+    try:
+        yield ours
     finally:
-        if file is not None:
+        if ours:
             with suppress(OSError):  # in some shared folders nobody may remove another user's file
-                lock.unlink()  # before the lock is given up: who opened it meanwhile sees that it is gone
-            os.close(file)
+                hidden.unlink()  # before the lock is given up: who opened it meanwhile sees that it is gone
+            lock.release()
 
 
-def _lock_of(path: Path) -> Path:
+def _lock_file(path: Path) -> Path:
     return path.with_name(f".{path.name}.lock")
 
 
-def _holder(lock: Path) -> str:
-    """Who has a claim, in words."""
-    with suppress(OSError, ValueError, UserError):
-        with open(lock, "rb", opener=_opened_safely) as file:
-            pid, host = file.read(1000).decode("ascii").split()
+def _holder(hidden: Path) -> str:
+    """Who has a lock, in words."""
+    with suppress(OSError, ValueError), inputs.open_file(hidden) as file:
+        pid, host = file.read(1000).decode("ascii").split()
         return f"process {int(pid)}" + (f" on {host}" if host != socket.gethostname() else "")
     return "another process"
 
 
-def _sign(file: int) -> None:
-    """Say in the lock file who has the claim; a full disk is no reason not to have it."""
+def _sign(descriptor: int) -> None:
+    """Say in the lock file who has the lock; a full disk is no reason not to have it."""
     with suppress(OSError):
-        os.ftruncate(file, 0)
-        os.pwrite(file, f"{os.getpid()} {socket.gethostname()}\n".encode("ascii", "replace"), 0)
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode("ascii", "replace"))
 
 
-def _locked(lock: Path) -> int | None:
-    """Descriptor of the lock file, locked; None when another process holds it."""
+# --- Small files that anybody may have written, read whole within bounds --------------------------------
+# What cannot be read is a `UserError` of one line with the file, what is wrong and what to do. Pipes and devices are
+# refused without waiting for them, larger files than asked for before they are read.
+
+MOST_BYTES = 1 << 22
+"""Of text; a thousand times what this package writes of most."""
+MOST_OF_ARRAYS = 1 << 27
+"""Of an NPZ file, also after unpacking."""
+
+
+def read_text(path: Path, wrong: str, advice: str, most: int = MOST_BYTES) -> str:
+    """Content of a text file in UTF-8.
+
+    Args:
+        path: the file.
+        wrong: what it is where it is damaged, as in "no table of points"; for the message.
+        advice: what a person can do then, the end of the message.
+        most: largest size [bytes].
+
+    Raises:
+        UserError: it cannot be read, is larger, or is a pipe or device.
+    """
+    with _readable(path, wrong, advice):
+        return inputs.read_text(path, most)
+
+
+def read_json(path: Path, wrong: str, advice: str, most: int = MOST_BYTES) -> Any:
+    """Data of a JSON file; arguments and errors as `read_text`."""
+    with _readable(path, wrong, advice):
+        return parse_json(inputs.read_text(path, most))
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Data of JSON text.
+
+    Raises:
+        ValueError: it is none, or nested deeper than Python can follow.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deep") from error
+
+
+def read_table(path: Path, wrong: str, advice: str, most: int = 1 << 24) -> list[dict[str, str]]:
+    """Lines of a CSV file by the names in its first line; arguments and errors as `read_text`."""
+    with _readable(path, wrong, advice):
+        lines = csv.reader(io.StringIO(inputs.read_text(path, most), newline=""))
+        columns = next(lines, [])
+        if len(set(columns)) < len(columns) or not columns:
+            raise ValueError("its first line does not name columns, each once")
+        table = []
+        for values in filter(None, lines):
+            if len(values) != len(columns):
+                raise ValueError(
+                    f"line {lines.line_num} has {len(values)} values, the first line {len(columns)}"
+                )
+            table.append(dict(zip(columns, values, strict=True)))
+        return table
+
+
+def read_arrays(path: Path, wrong: str, advice: str, most: int = MOST_OF_ARRAYS) -> dict[str, np.ndarray]:
+    """Arrays of an NPZ file by name, without Python objects; arguments and errors as `read_text`.
+
+    What compressed parts unfold to counts as the size of the file does.
+    """
+    with _readable(path, wrong, advice):
+        packed = io.BytesIO(inputs.read_bytes(path, most))
+        with zipfile.ZipFile(packed) as archive:
+            if sum(part.file_size for part in archive.infolist()) > most:
+                raise ValueError(f"it unfolds to more than {most / 1e6:.0f} MB")
+        packed.seek(0)
+        with np.load(packed, allow_pickle=False) as content:
+            return dict(content)
+
+
+@contextmanager
+def _readable(path: Path, wrong: str, advice: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # numpy, zipfile and csv raise almost anything on damaged bytes
+        if isinstance(error, OSError) and error.strerror:
+            raise UserError(f"cannot read {path}: {error.strerror}; {advice}") from error
+        raise UserError(f"{path} is {wrong} ({one_line(error)}); {advice}") from error
+
+
+# --- Hidden files that take their name when they are complete, and what killed processes leave of them --
+
+_SUFFIX = ".partial"
+
+
+def _hidden_beside(path: Path) -> Path:
+    """A name in the same folder that says which process of which machine writes `path`."""
+    return path.with_name(f"{_start(path)}{os.getpid()}-{uuid4().hex[:8]}{_SUFFIX}")
+
+
+def _start(path: Path) -> str:
+    return f".{path.name}.{socket.gethostname()}-"
+
+
+def _open_hidden(temporary: Path) -> BinaryIO:
+    """A new file, open, with a lock that shows other processes that it is being written."""
     while True:
-        file = _opened(lock)
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(file)
-            return None
-        except OSError:  # no locks here
+        file = open(temporary, "xb+", buffering=0)
+        if fcntl is not None:
+            with suppress(OSError):  # some file systems have no locks
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if temporary.exists():
             return file
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file), lock.stat()):
-                _sign(file)
-                return file
-        os.close(file)  # the process that held it removed it between our opening and locking it
+        file.close()  # before it was locked another process took it for abandoned
 
 
-def _opened(lock: Path) -> int:
-    """Descriptor of the lock file, which other users may open, too, whatever the umask."""
-    while True:
-        require_replaceable(lock)
-        try:
-            file = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        except FileExistsError:
-            with suppress(FileNotFoundError):  # removed in between
-                # Network file systems lock only what may be written.
-                return _opened_safely(str(lock), os.O_RDWR)
-        else:
-            with suppress(OSError):  # some file systems have no permissions to set
-                os.fchmod(file, 0o666)
-            return file
+def _give_name(file: BinaryIO, temporary: Path, path: Path) -> None:
+    """Let a complete file take its name, and the place of a plain file that had it, once the disk has everything.
+
+    Raises:
+        UserError: By now the name stands for something else.
+        OSError: The system refuses.
+    """
+    os.fsync(file.fileno())
+    if fcntl is None:
+        file.close()  # Windows gives names to closed files only; elsewhere the lock lasts until it has its name
+    require_replaceable(path)
+    os.replace(temporary, path)
+    file.close()
 
 
-def _opened_safely(path: str, flags: int) -> int:
-    """Descriptor of a plain file: no link is followed and no pipe waited for."""
-    file = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
-    if not stat.S_ISREG(os.fstat(file).st_mode):
-        os.close(file)
-        raise UserError(f"cannot lock {path}: it is no plain file; remove it or choose another output")
-    return file
-
-
-# --- Small files that appear complete or not at all; for runs, which may fill the disk, see `sgns.runs.newf
+def remove_abandoned(path: Path) -> None:
+    """Delete the hidden files that killed processes of this machine left of `path`: the ones without a lock."""
+    if fcntl is None:
+        return
+    start = _start(path)
+    for found in path.parent.iterdir():
+        if not (found.name.startswith(start) and found.name.endswith(_SUFFIX)):
+            continue
+        if _file_type(found) == stat.S_IFREG:  # others are none of ours; opening a pipe may never end
+            with suppress(OSError, ValueError), inputs.open_file(found, 1 << 62) as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                found.unlink()
+                log.info("removed %s, left by a process that was killed", found)
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A hidden path beside `path` to write to; it gets its name at the end, or is removed after an exception.
 
+    For small files; for runs, which may fill the disk, see `NewFile`.
+
     Raises:
         UserError: `path` is a device, pipe, link or folder.
         OSError: The disk does not take it; the error names `path`.
     """
     require_replaceable(path)
-    temporary = hidden_beside(path)
+    temporary = _hidden_beside(path)
     try:
-        remove_leftovers(path)
-        with temporary.open("xb") as held:
-            hold(held)
+        remove_abandoned(path)
+        with _open_hidden(temporary) as file:
             yield temporary
-            os.fsync(held.fileno())
-        give_name(temporary, path)
+            _give_name(file, temporary, path)
     except OSError as error:
         if error.filename in (None, str(temporary)):  # a full disk is reported without a name
             error.filename = str(path)
@@ -310,7 +344,7 @@ def write_whole(path: Path, text: str) -> None:
 T = TypeVar("T")
 
 
-class NewFile:
+class NewFile(io.RawIOBase):
     """A hidden file beside `path`, for `h5py.File(NewFile(path), "w")`; `complete` gives it its name.
 
     Until then an existing file of that name stays as it is. Hidden files that killed processes of this
@@ -327,14 +361,13 @@ class NewFile:
         require_replaceable(path)
         self.path = path
         self._error: BaseException | None = None
-        self._temp = hidden_beside(path)
+        self._temporary = _hidden_beside(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            remove_leftovers(path)
-            self._file = open(self._temp, "xb+", buffering=0)
+            remove_abandoned(path)
+            self._file = _open_hidden(self._temporary)
         except OSError as error:
             raise _cannot_write(path, error) from error
-        hold(self._file)
 
     def check(self) -> None:
         """Raise what a read or write since the last check ran into."""
@@ -354,12 +387,10 @@ class NewFile:
         """
         try:
             self.check()
-            os.fsync(self._file.fileno())
-            self._file.close()
-            give_name(self._temp, path or self.path)
-            # Again: when this file was begun, a process just killed may still have been seen.
-            with contextlib.suppress(OSError):
-                remove_leftovers(self.path)
+            _give_name(self._file, self._temporary, path or self.path)
+            # Again: when this file was begun, a process just killed may still have had its lock.
+            with suppress(OSError):
+                remove_abandoned(self.path)
         except OSError as error:
             self.discard()
             raise _cannot_write(self.path, error) from error
@@ -367,7 +398,7 @@ class NewFile:
             self.discard()
             raise
         if os.name == "posix":
-            with contextlib.suppress(OSError):  # the file is complete; some file systems cannot sync a folder
+            with suppress(OSError):  # the file is complete; some file systems cannot sync a folder
                 descriptor = os.open(self.path.parent, os.O_RDONLY)
                 try:
                     os.fsync(descriptor)
@@ -376,24 +407,15 @@ class NewFile:
 
     def discard(self) -> None:
         """Remove the hidden file; does nothing the second time."""
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             self._file.close()
-        with contextlib.suppress(OSError):
-            self._temp.unlink(missing_ok=True)
+        with suppress(OSError):
+            self._temporary.unlink(missing_ok=True)
 
-    # --- what h5py asks of a file: nothing of this may raise ----------------------------------------------
+    # --- what h5py asks of a file, as in `io.RawIOBase`: nothing of this may raise ------------------------
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move; see io.IOBase."""
         return self._kept(lambda: self._file.seek(offset, whence), 0)
-
-    def tell(self) -> int:
-        """Where we are; see io.IOBase."""
-        return self._kept(self._file.tell, 0)
-
-    def read(self, size: int = -1) -> bytes:
-        """Read; see io.RawIOBase."""
-        return self._kept(lambda: self._file.read(size), b"") or b""
 
     def readinto(self, buffer: memoryview) -> int:
         """Fill the buffer, with zeros where nothing can be read."""
@@ -416,11 +438,7 @@ class NewFile:
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
-        """Set the length; see io.IOBase."""
         return self._kept(lambda: self._file.truncate(size), 0)
-
-    def flush(self) -> None:
-        """Nothing is buffered here."""
 
     def _kept(self, action: Callable[[], T], otherwise: T) -> T:
         try:

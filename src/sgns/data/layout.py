@@ -1,8 +1,4 @@
-"""Parts of an HDF5 file that anybody may have written.
-
-HDF5 can point out of a file: links, virtual datasets and raw data may lie in any other file that the reader may
-open. And a file of a few kilobytes can claim arrays of any size. This package writes neither, and refuses both.
-"""
+"""What a run file holds and where, and HDF5 files that anybody may have written."""
 
 from __future__ import annotations
 
@@ -12,7 +8,6 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +17,7 @@ import numpy as np
 from mpm_warp import SceneError
 from mpm_warp.inputs import MOST_BYTES, open_file
 from mpm_warp.mesh import checked_mesh
+from sgns import __version__
 from sgns.config import UserError
 
 # --- Parts of an HDF5 file that anybody may have written ------------------------------------------------
@@ -142,36 +138,26 @@ FORMAT_VERSION = 1
 """Root attribute `format_version`: raised when an older program could no longer read the file."""
 PRODUCERS = ("mpm", "rollout")
 """Who may have made a run: the material point solver, or a trained network."""
-ATTRIBUTES = (
-    "format",
-    "format_version",
-    "package_version",
-    "producer",
-    "seed",
-    "frame_rate",
-    "wall_time_s",
-    "arrangement_hash",
-    "content_hash",
-    "scene",
-    "effects",
-    "extra",
-)
-"""Root attributes; `scene`, `effects` and `extra` are YAML text in UTF-8."""
+_WHOLE, _REAL = (int, np.integer), (float, np.floating)
+ATTRIBUTES: dict[str, type | tuple[type, ...]] = {
+    "format": str,
+    "format_version": _WHOLE,
+    "package_version": str,
+    "producer": str,
+    "seed": _WHOLE,
+    "frame_rate": _REAL,
+    "wall_time_s": _REAL,
+    "arrangement_hash": str,
+    "content_hash": str,
+    "scene": str,
+    "effects": str,
+    "extra": str,
+}
+"""Root attributes and their types; `scene`, `effects` and `extra` are YAML text in UTF-8."""
 OPTIONAL = ("stopped",)
 """Root attributes that only some files have: why a run ended before its time."""
-_SCENE_NUMBERS = (
-    "depth",
-    "speed",
-    "rake",
-    "diameter",
-    "width",
-    "grouser_height",
-    "load",
-    "slip",
-    "friction_angle",
-    "gravity",
-)
-_SCENE_GROUPS = {"blade": ("thickness", "width", "length")}
+_SCENE_NUMBERS = "depth speed rake diameter width grouser_height load slip friction_angle gravity".split()
+_BLADE_NUMBERS = ("thickness", "width", "length")
 MESH = {"vertices": ("parameters/tool/vertices", "<f8"), "triangles": ("parameters/tool/triangles", "<i4")}
 """Path and type of the datasets that a run has whose tool is a mesh, shape (V, 3) [m] and (F, 3)."""
 
@@ -217,17 +203,9 @@ ELEMENTS = {
 }
 
 
-def package_version() -> str:
-    """Version of the installed sgns, or 0+unknown when it runs from a bare source tree."""
-    try:
-        return metadata.version("sgns")
-    except metadata.PackageNotFoundError:
-        return "0+unknown"
-
-
 def read_attributes(file: h5py.File) -> dict[str, Any]:
     """The root attributes, those that only some files have too; text as str."""
-    return {name: own_attribute(file, name) for name in ATTRIBUTES + OPTIONAL if name in file.attrs}
+    return {name: own_attribute(file, name) for name in (*ATTRIBUTES, *OPTIONAL) if name in file.attrs}
 
 
 def write_text(owner: h5py.Group | h5py.Dataset, name: str, text: str) -> None:
@@ -255,11 +233,10 @@ def open_run(path: str | os.PathLike[str]) -> h5py.File:
         raise UserError(f"no such run file: {path}; check the path, or make one with `sgns simulate`")
     if path.is_dir():
         raise UserError(f"{path} is a folder, not a run file; give one of the .h5 files in it")
-    if not path.is_file():
-        raise UserError(f"{path} is a pipe or device, not a run file")
     try:
-        with path.open("rb") as file:
-            file.read(1)
+        open_file(path, _ANY_SIZE).close()
+    except ValueError:
+        raise UserError(f"{path} is a pipe or device, not a run file") from None
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}; check its permissions") from error
     if not h5py.is_hdf5(path):
@@ -304,7 +281,7 @@ def _require_ours(file: h5py.File, path: Path) -> None:
         raise UserError(f"{path} has no whole number as root attribute `format_version`; repeat the run")
     if version > FORMAT_VERSION:
         raise UserError(
-            f"{path} has run format {version}, but sgns {package_version()} reads up to {FORMAT_VERSION}; "
+            f"{path} has run format {version}, but sgns {__version__} reads up to {FORMAT_VERSION}; "
             "upgrade sgns"
         )
 
@@ -314,8 +291,7 @@ def structure_problems(file: h5py.File) -> list[str]:
 
     A file without such problems can be read by `Run` without surprises.
     """
-    problems = [f"root attribute {name!r} is missing" for name in ATTRIBUTES if name not in file.attrs]
-    problems += _attribute_problems(file)
+    problems = _attribute_problems(file)
     counts: dict[str, int] = {}
     for element in ELEMENTS.values():
         problems += _element_problems(file, element, counts)
@@ -351,51 +327,34 @@ def require_mesh_was_read(scene: object) -> None:
 
 
 def _mesh_problems(file: h5py.File) -> list[str]:
-    found = {}
-    problems = []
-    for name, (path, dtype) in MESH.items():
+    missing, problems = [], []
+    for path, dtype in MESH.values():
         try:
-            if own_object(file, path) is not None:
-                found[name] = own_dataset(file, path)
+            if own_object(file, path) is None:
+                missing.append(f"dataset /{path} is missing")
+                continue
+            found = own_dataset(file, path)
         except (KeyError, ValueError) as error:
             problems.append(one_line(error).strip("'"))
             continue
-        if name in found and (found[name].ndim != 2 or found[name].shape[1] != 3 or not len(found[name])):
-            problems.append(f"dataset /{path} has shape {found[name].shape}, expected (at least 1, 3)")
-        elif name in found and found[name].dtype != np.dtype(dtype):
-            problems.append(f"dataset /{path} has the wrong type {found[name].dtype}")
-        elif name in found and found[name].size * found[name].dtype.itemsize > MOST_BYTES:
+        if found.ndim != 2 or found.shape[1] != 3 or not len(found):
+            problems.append(f"dataset /{path} has shape {found.shape}, expected (at least 1, 3)")
+        elif found.dtype != np.dtype(dtype):
+            problems.append(f"dataset /{path} has the wrong type {found.dtype}")
+        elif found.size * found.dtype.itemsize > MOST_BYTES:
             problems.append(f"dataset /{path} is larger than {MOST_BYTES / 1e6:.0f} MB")
-    if not problems and len(found) == 1:
-        (there,) = found
-        missing = next(path for name, (path, _) in MESH.items() if name != there)
-        problems.append(f"dataset /{missing} is missing")
-    return problems
+    return problems or (missing if len(missing) == 1 else [])  # without both there is no mesh
 
 
 def _attribute_problems(file: h5py.File) -> list[str]:
-    problems = []
+    problems = [f"root attribute {name!r} is missing" for name in ATTRIBUTES if name not in file.attrs]
     values = read_attributes(file)
-    kinds = {
-        "producer": str,
-        "seed": (int, np.integer),
-        "frame_rate": (float, np.floating),
-        "wall_time_s": (float, np.floating),
-        "package_version": str,
-        "arrangement_hash": str,
-        "content_hash": str,
-        "scene": str,
-        "effects": str,
-        "extra": str,
-    }
-    for name, kind in kinds.items():
+    for name, kind in ATTRIBUTES.items():
         if name in values and not isinstance(values[name], kind):
             problems.append(f"root attribute {name!r} has the wrong type ({type(values[name]).__name__})")
     for name, allowed in (("frame_rate", "above 0 Hz"), ("wall_time_s", "0 s or more")):
         value = values.get(name)
-        if isinstance(value, (float, np.floating)) and not (
-            math.isfinite(value) and (value > 0 if name == "frame_rate" else value >= 0)
-        ):
+        if isinstance(value, _REAL) and not (0 <= value < math.inf and (value > 0 or name == "wall_time_s")):
             problems.append(f"{name} is {value}; it must be {allowed}")
     digest = values.get("content_hash")  # it becomes the name of a file
     if isinstance(digest, str) and not re.fullmatch("[0-9a-f]{32}", digest):
@@ -406,13 +365,11 @@ def _attribute_problems(file: h5py.File) -> list[str]:
 def scene_problems(scene: Mapping[str, Any]) -> list[str]:
     """Values of a scene that are not the numbers which others calculate with, in words; what is not there is none."""
     found = [(key, scene[key]) for key in _SCENE_NUMBERS if scene.get(key) is not None]
-    for group, keys in _SCENE_GROUPS.items():
-        part = scene.get(group)
-        if part is None:
-            continue
-        if not isinstance(part, Mapping):
-            return [f"scene.{group} is {part!r:.40}, not a group of keys"]
-        found += [(f"{group}.{key}", part.get(key)) for key in keys]
+    blade = scene.get("blade")
+    if blade is not None:
+        if not isinstance(blade, Mapping):
+            return [f"scene.blade is {blade!r:.40}, not a group of keys"]
+        found += [(f"blade.{key}", blade.get(key)) for key in _BLADE_NUMBERS]
     return [
         f"scene.{key} is {value!r:.40}, not a finite number"
         for key, value in found

@@ -14,19 +14,21 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from mpm_warp.inputs import open_file, read_text
-from mpm_warp.poses import fitted_poses, quaternions
+from mpm_warp.poses import fitted_poses
+from sgns.arrays import is_whole
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
-from sgns.data.small_files import parse_json
+from sgns.data.files import parse_json
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, ReducedRun
 
 log = logging.getLogger(__name__)
 
 
-# --- Reader of the reduced runs published by the paper's authors ----------------------------------------
+# --- Their files ----------------------------------------------------------------------------------------
 # The files are TFRecords of protobuf `SequenceExample`s, the format of "Learning to Simulate" (Sanchez-Gonzalez
 # et al. 2020); both are simple enough to be read here without TensorFlow. Numbers are mapped to this package's
 # axes and signs: x forward, z up, forces by the soil on the body.
@@ -44,11 +46,8 @@ SPEEDS = (0.01, 0.04, 0.08, 0.10, 0.15)  # [m/s]
 RAKES = (0.0, 3.8, 10.0, 30.8, 45.0)  # [degrees]
 MOTIONS = ("ramp", "curved")
 GRAVITIES = (1.62, 3.72, 9.81)  # [m/s^2]
-SLIPS = (
-    0.2,
-    5.0 / 13.0,
-    0.7,
-)  # forward speeds 15.60, 12.00, 5.85 mm/s at a rim speed of 19.5; named 20, 40, 70 %
+# Forward speeds 15.60, 12.00, 5.85 mm/s at a rim speed of 19.5; named 20, 40, 70 %.
+SLIPS = (0.2, 5.0 / 13.0, 0.7)
 LOADS = (100.0, 164.0, 225.0)  # [N]
 DIAMETERS = (0.05, 0.15, 0.30)  # [m]
 WIDTHS = {0.05: 0.25 / 3, 0.15: 0.25 / 3, 0.30: 0.125}  # of each diameter [m]
@@ -74,21 +73,24 @@ class PublishedRun:
     shape (T, 0)."""
 
 
+def _case(kind: str, case: int, **values: tuple[Any, ...]) -> dict[str, Any]:
+    """The combination of values that has this number, counted from 1, the last one changing fastest."""
+    grid = list(product(*values.values()))
+    if not 1 <= case <= len(grid):
+        raise UserError(f"published {kind} case {case}: allowed are 1 to {len(grid)}")
+    return dict(zip(values, grid[case - 1], strict=True))
+
+
 def excavation_case(case: int) -> dict[str, float | str]:
     """Depth [m], speed [m/s], rake [degrees] and motion of a published excavation run, numbered from 1."""
-    grid = list(product(DEPTHS, SPEEDS, RAKES, MOTIONS))
-    if not 1 <= case <= len(grid):
-        raise UserError(f"published excavation case {case}: allowed are 1 to {len(grid)}")
-    return dict(zip(("depth", "speed", "rake", "motion"), grid[case - 1], strict=True))
+    return _case("excavation", case, depth=DEPTHS, speed=SPEEDS, rake=RAKES, motion=MOTIONS)
 
 
 def wheel_case(case: int) -> dict[str, float]:
     """Gravity [m/s^2], slip, load [N], diameter [m], friction angle [degrees] and width [m] of a published wheel run,
     numbered from 1. The 5 cm wheel carries a ninth of the loads."""
-    grid = list(product(GRAVITIES, SLIPS, LOADS, DIAMETERS, ANGLES))
-    if not 1 <= case <= len(grid):
-        raise UserError(f"published wheel case {case}: allowed are 1 to {len(grid)}")
-    found = dict(zip(("gravity", "slip", "load", "diameter", "friction_angle"), grid[case - 1], strict=True))
+    values = {"gravity": GRAVITIES, "slip": SLIPS, "load": LOADS, "diameter": DIAMETERS}
+    found = _case("wheel", case, **values, friction_angle=ANGLES)
     if found["diameter"] == DIAMETERS[0]:
         found["load"] /= 9.0
     return found | {"width": WIDTHS[found["diameter"]]}
@@ -157,14 +159,7 @@ def _run(case: int | None, record: bytes, bin_size: tuple[float, float, float] |
     lx, _, lz = bin_size or _BINS[kind]
     x, y, z = np.moveaxis(nodes[:, ~soil], -1, 0)
     body = np.stack([_MARGIN + lx - x, z - _MARGIN, y - _MARGIN - lz], axis=-1)
-    return PublishedRun(
-        kind,
-        case,
-        body,
-        nodes[:, soil],
-        force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0],
-        context,
-    )
+    return PublishedRun(kind, case, body, nodes[:, soil], force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0], context)
 
 
 def _series(frames: Sequence[bytes], values: int) -> np.ndarray:
@@ -275,10 +270,8 @@ def published_dataset(settings: Mapping[str, Any], num_modes: int | str) -> Redu
         for name, found in runs.items():
             split[_SPLIT.get(name, "test")] += found
     else:
-        everything = [run for found in runs.values() for run in found]
-        if folds is None:
-            split["train"] = everything
-        else:
+        split["train"] = everything = [run for found in runs.values() for run in found]
+        if folds is not None:
             _check_fold(folds, fold, len(everything))
             split["test"] = everything[fold::folds]
             split["train"] = [run for i, run in enumerate(everything) if i % folds != fold]
@@ -323,9 +316,9 @@ def fingerprint(run: ReducedRun) -> str:
 
 
 def _check_fold(folds: Any, fold: Any, count: int) -> None:
-    if not isinstance(folds, int) or isinstance(folds, bool) or not 2 <= folds <= count:
+    if not is_whole(folds) or not 2 <= folds <= count:
         raise UserError(f"dataset.folds is {folds!r}; allowed: 2 to {count}, the number of runs, or null")
-    if not isinstance(fold, int) or isinstance(fold, bool) or not 0 <= fold < folds:
+    if not is_whole(fold) or not 0 <= fold < folds:
         raise UserError(f"dataset.fold is {fold!r}; allowed: 0 to {folds - 1}")
 
 
@@ -375,6 +368,8 @@ def _blade_poses(points: np.ndarray) -> np.ndarray:
     _, _, axes = np.linalg.svd(first - first.mean(axis=0))
     across = axes[0] * np.sign(axes[0, 1])
     along = axes[1] * np.sign(axes[1, 2])
-    turned = quaternions(np.stack([np.cross(across, along), across, along], axis=1))
+    turned = Rotation.from_matrix(np.stack([np.cross(across, along), across, along], axis=1)).as_quat(
+        canonical=True
+    )
     middle = points[:, tip].mean(axis=1)
     return np.concatenate([middle, np.tile(turned, (len(points), 1))], axis=1)

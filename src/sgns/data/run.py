@@ -31,8 +31,7 @@ from sgns.data.layout import (
 
 # --- Reading or decoding a run a few frames at a time, so that memory does not grow with its length -----
 
-# Positions held at one time [bytes, float64].
-CHUNK_BYTES = 32e6
+CHUNK_BYTES = 32e6  # positions held at one time, float64
 
 
 def frame_chunks(particle_count: int, stop: int, start: int = 0) -> Iterator[slice]:
@@ -42,7 +41,7 @@ def frame_chunks(particle_count: int, stop: int, start: int = 0) -> Iterator[sli
         yield slice(first, min(first + size, stop))
 
 
-# --- Reading a run, whether the solver or a network made it ---------------------------------------------
+# --- A run file -----------------------------------------------------------------------------------------
 # Letters: T frames, n soil particles, M body points.
 
 
@@ -65,7 +64,7 @@ class Run:
         try:
             try:
                 problems = structure_problems(self._file)
-                self._attributes = read_attributes(self._file) if not problems else {}
+                self._attributes = read_attributes(self._file)
             except BROKEN as error:
                 problems = [one_line(error)]
             if problems:
@@ -92,7 +91,7 @@ class Run:
     @property
     def mesh(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Of a tool that is a mesh: vertices (V, 3) about its centre of mass [m], float64, and triangles (F, 3), both
-        read-only; None for other tools, and in runs from before it was kept."""
+        read-only; None for other tools."""
         if "mesh" not in self._cache:
             try:
                 self._cache["mesh"] = read_mesh(self._file)
@@ -268,7 +267,7 @@ def stopped_path(path: Path) -> Path:
 
 
 def require_run_place(path: Path) -> None:
-    """Refuse a run's name if the run, or its frames if it stops, would destroy something else than a run of before.
+    """Refuse a run's name if the run, or its frames if it stops, would destroy something else than an earlier run.
 
     Raises:
         UserError: says what is there.

@@ -18,15 +18,68 @@ import numpy as np
 import yaml
 
 from mpm_warp import State
+from sgns import __version__
 from sgns.config import UserError
 from sgns.data.files import NewFile
-from sgns.data.layout import ELEMENTS, FORMAT, FORMAT_VERSION, MESH, PRODUCERS, package_version, write_text
+from sgns.data.layout import ELEMENTS, FORMAT, FORMAT_VERSION, MESH, PRODUCERS, write_text
 from sgns.data.run import remove_stopped, require_run_place, stopped_path, write_state
-from sgns.data.vtkhdf import write_view
 
 log = logging.getLogger(__name__)
 
 _STREAMED = ("position", "velocity")
+
+
+# --- A view of the soil for ParaView and VTK ------------------------------------------------------------
+# The group /VTKHDF describes a point cloud that changes with time (VTKHDF 2.0, PolyData with one vertex per particle).
+# `Points` and `PointData/velocity` are HDF5 virtual datasets: they show the H5MD arrays, reshaped from (T, n, 3) to
+# (T n, 3), and hold no copy. Format: docs.vtk.org, "VTKHDF file format".
+
+VIEW_ATTRIBUTES = {
+    "Version": np.array((2, 0), dtype="<i8"),  # the first with PolyData in time; newer readers take every 2.x
+    "Type": np.bytes_("PolyData"),  # the reader wants ASCII of fixed length
+}
+
+
+def view_arrays(frames: int, particles: int) -> dict[str, np.ndarray]:
+    """Path → numbers of what is in /VTKHDF besides the soil and the times."""
+    # Sizes and cells are the same in every frame, so one part is described and every frame points at it. (One
+    # entry per frame would also be good VTKHDF, but VTK 9.3 then looks for the cells in the wrong place.)
+    arrays: dict[str, Any] = {"NumberOfPoints": [particles]}
+    for name, count in (("Vertices", particles), ("Lines", 0), ("Polygons", 0), ("Strips", 0)):
+        arrays |= {
+            f"{name}/NumberOfCells": [count],
+            f"{name}/NumberOfConnectivityIds": [count],
+            f"{name}/Offsets": np.arange(count + 1),
+            f"{name}/Connectivity": np.arange(count),
+        }
+    arrays |= {
+        "Steps/PartOffsets": np.zeros(frames),
+        "Steps/NumberOfParts": np.ones(frames),
+        "Steps/PointOffsets": np.arange(frames) * particles,
+        "Steps/CellOffsets": np.zeros((frames, 4)),
+        "Steps/ConnectivityIdOffsets": np.zeros((frames, 4)),
+        "Steps/PointDataOffsets/velocity": np.arange(frames) * particles,
+    }
+    return {path: np.asarray(values, dtype="<i8") for path, values in arrays.items()}
+
+
+def _write_view(file: h5py.File, position: h5py.Dataset, velocity: h5py.Dataset, time: h5py.Dataset) -> None:
+    frames, particles, axes = position.shape
+    group = file.create_group("VTKHDF")
+    for name, value in VIEW_ATTRIBUTES.items():
+        group.attrs[name] = value
+    for name, source in (("Points", position), ("PointData/velocity", velocity)):
+        layout = h5py.VirtualLayout(shape=(frames * particles, axes), dtype=source.dtype)
+        # "." is HDF5's name for the file that holds the virtual dataset, whatever it is called later.
+        layout[...] = h5py.VirtualSource(".", source.name, shape=source.shape, dtype=source.dtype)
+        group.create_virtual_dataset(name, layout)
+    for name, values in view_arrays(frames, particles).items():
+        group[name] = values
+    group["Steps/Values"] = time  # a hard link
+    group["Steps"].attrs["NSteps"] = np.int64(frames)
+
+
+# --- The run --------------------------------------------------------------------------------------------
 
 
 class ContentHash:
@@ -103,7 +156,7 @@ class RunWriter:
         attributes = {  # in the order of a reader's interest
             "format": FORMAT,
             "format_version": np.int64(FORMAT_VERSION),
-            "package_version": package_version(),
+            "package_version": __version__,
             "producer": producer,
             "seed": np.int64(seed),
             "frame_rate": np.float64(frame_rate),
@@ -150,8 +203,7 @@ class RunWriter:
             force: by the soil on the body [N], world frame, mean since the frame before, shape (3,).
             torque: likewise about the centre of mass [N m], shape (3,).
         """
-        if self._file is None:
-            raise ValueError("the run is already finished or discarded; make a new RunWriter")
+        file = self._open_file()
         index = self.frame_count
         frame = {
             "time": np.asarray(time, dtype="<f8"),
@@ -183,7 +235,7 @@ class RunWriter:
         if index and not frame["time"] > self._small["time"][-1]:
             raise ValueError(f"frame {index}: time {time} s is not after {self._small['time'][-1]} s")
         for name in _STREAMED:
-            dataset = self._file[f"{ELEMENTS[name].path}/value"]
+            dataset = file[f"{ELEMENTS[name].path}/value"]
             dataset.resize(index + 1, axis=0)
             # A frame is a chunk, so it needs neither HDF5's cache nor its conversions.
             dataset.id.write_direct_chunk((index, 0, 0), frame[name])
@@ -193,45 +245,41 @@ class RunWriter:
         self._hash.update(frame)
 
     def finish(self, wall_time_s: float) -> None:
-        """Complete the file and give it its name.
-
-        Args:
-            wall_time_s: time it took to compute the run [s].
-        """
-        if self._file is None:
-            raise ValueError("the run is already finished or discarded; make a new RunWriter")
+        """Complete the file and give it its name; `wall_time_s` is what it took to compute the run [s]."""
+        self._open_file()
         if self.frame_count == 0:
             raise ValueError("no frame was appended")
         self._complete(wall_time_s, self.path)
         remove_stopped(self.path)
 
     def stop(self, wall_time_s: float, reason: str, state: State | None = None) -> Path:
-        """Complete the file with the frames so far, as a stopped run beside the one it was to be (run.py).
+        """Complete the file with the frames so far, as a stopped run beside the one it was to be.
 
         Args:
             wall_time_s: time it took so far [s].
             reason: why there are no more frames.
             state: at the last of them, to go on from; a rollout has none.
-
-        Returns:
-            The file's path.
         """
-        if self._file is None:
-            raise ValueError("the run is already finished or discarded; make a new RunWriter")
-        write_text(self._file, "stopped", reason)
+        file = self._open_file()
+        write_text(file, "stopped", reason)
         if state is not None:
-            write_state(self._file, state)
+            write_state(file, state)
         path = stopped_path(self.path)
         self._complete(wall_time_s, path)
         return path
 
+    def _open_file(self) -> h5py.File:
+        if self._file is None:
+            raise ValueError("the run is already finished or discarded; make a new RunWriter")
+        return self._file
+
     def _complete(self, wall_time_s: float, path: Path) -> None:
-        assert self._file is not None
+        file = self._open_file()
         try:
-            self._write_series()
-            self._file.attrs["wall_time_s"] = np.float64(wall_time_s)
-            write_text(self._file, "content_hash", self._hash.hexdigest())
-            self._file.close()
+            self._write_series(file)
+            file.attrs["wall_time_s"] = np.float64(wall_time_s)
+            write_text(file, "content_hash", self._hash.hexdigest())
+            file.close()
             self._disk.complete(path)
         except BaseException:
             self._discard()
@@ -276,10 +324,8 @@ class RunWriter:
             )
             _describe(dataset, name)
 
-    def _write_series(self) -> None:
+    def _write_series(self, file: h5py.File) -> None:
         """Time, everything of the body, and the view for VTK."""
-        file = self._file
-        assert file is not None
         first = file[ELEMENTS["position"].path]
         first["step"] = np.arange(self.frame_count, dtype="<i8")
         first["time"] = np.array(self._small["time"], dtype="<f8")
@@ -291,7 +337,7 @@ class RunWriter:
             if name != "position":  # hard links: H5MD's way to say "sampled at the same times"
                 file[f"{element.path}/step"] = first["step"]
                 file[f"{element.path}/time"] = first["time"]
-        write_view(file, first["value"], file[ELEMENTS["velocity"].path]["value"], first["time"])
+        _write_view(file, first["value"], file[ELEMENTS["velocity"].path]["value"], first["time"])
 
     def _discard(self) -> None:
         """Close and remove the hidden file, whatever state it is in."""
@@ -324,7 +370,7 @@ def _write_h5md(file: h5py.File, author: str) -> None:
     write_text(h5md.create_group("author"), "name", author or "unknown")
     creator = h5md.create_group("creator")
     write_text(creator, "name", "sgns")
-    write_text(creator, "version", package_version())
+    write_text(creator, "version", __version__)
 
 
 def _yaml_text(data: dict[str, Any]) -> str:

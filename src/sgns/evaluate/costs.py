@@ -20,12 +20,11 @@ import torch
 from sgns import __version__
 from sgns.clock import elapsed
 from sgns.data.run import Run
+from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
 from sgns.evaluate.results import Costs, FullSpaceCost
 from sgns.model.checkpoint import SUMMARY, load_surrogate, read_summary
-from sgns.model.full_space import FullSpaceDynamics, box_surface
 from sgns.model.settings import ModelSettings
 from sgns.rollout import single_thread
-from sgns.train.full_space import FullSpaceRun, FullSpaceWindows, losses
 
 if TYPE_CHECKING:
     from sgns.simulator import Simulator

@@ -23,6 +23,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mpm_warp.inputs import open_file
+from mpm_warp.scenes import sinkage
 from sgns.config import UserError
 from sgns.data.run import Run, frame_chunks
 from sgns.evaluate.metrics import (
@@ -33,7 +34,6 @@ from sgns.evaluate.metrics import (
     forward_force,
     height_map,
     is_wheel,
-    sinkage,
 )
 from sgns.reduction.basis import Basis
 

@@ -17,18 +17,13 @@ from sgns.data.run import frame_chunks
 
 
 def is_wheel(scene: Mapping[str, Any]) -> bool:
-    """Whether the body is a wheel."""
-    return "diameter" in scene
+    """Whether the body is a wheel, the only one whose height the soil decides (`mpm_warp.Scene.axle`)."""
+    return scene.get("kind") == "wheel"
 
 
 def forward_force(scene: Mapping[str, Any]) -> tuple[str, float]:
     """Name of the forward force and the sign that F_x is reported with."""
     return ("drawbar pull Fx", 1.0) if is_wheel(scene) else ("draft −Fx", -1.0)
-
-
-def sinkage(scene: Mapping[str, Any], poses: np.ndarray) -> np.ndarray:
-    """Depth of a wheel's lowest point below the undisturbed surface [m], shape (T,) for poses (T, 7)."""
-    return 0.5 * float(scene["diameter"]) + float(scene.get("grouser_height", 0.0)) - poses[:, 2]
 
 
 # --- The free surface of a bed of particles as a height map on a regular horizontal grid ----------------

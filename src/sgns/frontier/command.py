@@ -11,7 +11,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from sgns.config import UserError
-from sgns.data.files import claimed_in_turn, require_replaceable, write_whole
+from sgns.data.files import file_lock, require_replaceable, write_whole
 from sgns.evaluate.report import PAGES, ReportFigure, write_figures
 from sgns.frontier.figures import known, reduction_figure, scene_figure, through_time_figure, training_figure
 from sgns.frontier.observation import Observation, compare, errors
@@ -36,7 +36,7 @@ def main(cfg: DictConfig) -> None:
         *(file for file in measured if not file.is_file()),  # those that are there are read only
     )
     if axes:
-        with claimed_in_turn(folder / "study.yaml"):  # what it says is read and added to
+        with file_lock(folder / "study.yaml", wait=True):  # what it says is read and added to
             study.record()
         from sgns.frontier import measure  # training takes seconds to import
 
@@ -51,7 +51,7 @@ def main(cfg: DictConfig) -> None:
             # Another process is still at it; what was measured here is kept.
             log.info("no reference is there yet, so nothing can be judged; later: sgns frontier axis=none")
             return
-    with claimed_in_turn(folder / PAGE):  # of several that gather at once the last sees all points
+    with file_lock(folder / PAGE, wait=True):  # of several that gather at once the last sees all points
         page = write_study(study, points_with_errors(study))
     log.info("%s and the table and figures beside it", page)
 

@@ -23,9 +23,8 @@ from sgns.arrays import is_whole
 from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
-from sgns.data.files import claimed, write_whole
+from sgns.data.files import file_lock, read_json, read_table, write_whole
 from sgns.data.run import Run
-from sgns.data.small_files import read_json, read_table
 from sgns.evaluate.command import roll_out, training_means
 from sgns.evaluate.costs import network_costs
 from sgns.evaluate.metrics import body_errors, position_errors, surface_grid
@@ -51,8 +50,8 @@ from sgns.rollout import finite_frames, single_thread
 from sgns.simulate.scene import asked_effects, decided
 from sgns.simulator import Simulator
 from sgns.states import Rollout
-from sgns.train.command import prepared, train
-from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
+from sgns.train.command import train
+from sgns.train.lightning_module import SurrogateTraining, TrainingSettings, prepared
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +84,7 @@ def measure_if_missing(
 ) -> None:
     """Measure and keep a point that is not there and that no other process is at."""
     file = study.store.file(scene.name, kind, entry.label)
-    with claimed(file) as ours:
+    with file_lock(file) as ours:
         if ours and not file.exists():
             watch = stopwatch()
             study.store.save(*measure(study, scene, entry, *more))
@@ -179,7 +178,7 @@ def measure_reduction(study: Study) -> None:
                 p for p in reduction_points(scene) if not study.store.has(scene.name, "reduction", p.label)
             ]
             if missing:
-                with claimed(study.store.file(scene.name, "reduction", "all")) as ours:
+                with file_lock(study.store.file(scene.name, "reduction", "all")) as ours:
                     if ours:
                         measure_reductions_of(study, scene, missing)
 

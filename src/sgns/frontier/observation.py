@@ -17,8 +17,7 @@ from scipy.sparse import csr_array
 from mpm_warp import Scene
 from sgns.arrays import require_shapes
 from sgns.config import UserError
-from sgns.data.files import whole_file
-from sgns.data.small_files import read_arrays
+from sgns.data.files import read_arrays, whole_file
 from sgns.evaluate.metrics import SurfaceGrid, VectorErrors, height_error, height_map, rms_mm
 
 # --- What is kept of a run ------------------------------------------------------------------------------

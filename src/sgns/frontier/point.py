@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sgns.config import UserError
-from sgns.data.files import whole_file
-from sgns.data.small_files import read_table
+from sgns.data.files import read_table, whole_file
 
 SHARED = 1.1  # wall time over processor time from which a core counts as shared
 KINDS = ("solver", "reduction", "surrogate", "full space")

@@ -4,42 +4,31 @@ from __future__ import annotations
 
 import io
 import math
-import pickle
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
+from mpm_warp.poses import in_body_frame
 from sgns.config import UserError
-from sgns.data.files import whole_file
+from sgns.data.files import read_json, whole_file
 from sgns.data.layout import require_mesh_was_read
-from sgns.data.small_files import read_json
 from sgns.model.dynamics import Dynamics
+from sgns.model.features import slowest_travel
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.polynomial import PolynomialDynamics
-from sgns.model.settings import ModelSettings, PolynomialSettings
 from sgns.model.training_range import TrainingRange
 from sgns.reduction.basis import Basis
 
-# --- Which kind of latent dynamics a `model` describes: a network or polynomials. Everywhere else they are
+if TYPE_CHECKING:
+    from sgns.reduction.reduce import ReducedDataset
 
+DYNAMICS: dict[str, type[Dynamics]] = {"network": LatentDynamics, "polynomial": PolynomialDynamics}
+"""Every kind of latent dynamics, by `model.kind`."""
 
-def dynamics_of(card: Mapping[str, Any]) -> Dynamics:
-    """The dynamics that a card describes (see `Dynamics.card`), to be filled from a state dict."""
-    model, num_modes = card["model"], int(card["num_modes"])
-    told = tuple(map(str, card["context"])), bool(card["predicts_body"])
-    # Networks of earlier versions do not say that they are one.
-    if model.get("kind", "network") == "polynomial":
-        return PolynomialDynamics(PolynomialSettings(**model), num_modes, *told, card["used"])
-    return LatentDynamics(ModelSettings(**model), num_modes, *told)
-
-
-# --- What a checkpoint holds: the latent dynamics with all that is needed to step a bed, and nothing to loo
-# elsewhere.
-#
 # A checkpoint is laid out as Lightning's `.ckpt` and loaded with `weights_only`: tensors in its state dict (weights,
 # normalisation, basis, common start, body points) and plain Python values, the card, as its hyperparameters. A
 # network's is written by Lightning and also holds what is needed to go on training.
@@ -53,22 +42,6 @@ _MOST_TEXT = 1 << 24  # characters of a card
 # How far the soil's modes may leave the range of the training runs, in widths of that range. Held-out runs leave it by
 # up to 0.57 (of four training runs), rollouts five times as deep as trained by 0.45.
 _MARGIN = 0.75
-# Whatever the bytes are, reading them as a checkpoint may fail in any of these ways.
-_UNREADABLE = (
-    pickle.UnpicklingError,
-    RuntimeError,
-    EOFError,
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    IndexError,
-    ImportError,
-    MemoryError,
-    ArithmeticError,
-    NotImplementedError,
-)
 
 
 class Surrogate(nn.Module):
@@ -83,8 +56,8 @@ class Surrogate(nn.Module):
             `sgns.model.features`), and any provenance.
 
     Attributes:
-        training_range: What the training runs covered; None in a checkpoint from before it was kept.
-        slowest_travel: Of the training runs' tools in a frame [m]; 0 in a checkpoint from before it was kept.
+        training_range: What the training runs covered.
+        slowest_travel: Of the training runs' tools in a frame [m].
     """
 
     basis_mean: Tensor
@@ -114,15 +87,12 @@ class Surrogate(nn.Module):
             self.register_buffer(f"basis_{name}", state.pop(name))
         self.register_buffer("start_positions", start_positions.double())
         self.register_buffer("body_points", body_points.double())
-        known = card.get("training_range")
-        self.training_range = None if known is None else TrainingRange.from_plain(known)
-        if self.training_range is not None:
-            low, high = self.training_range.soil(_MARGIN)
-            dynamics.lowest, dynamics.highest = (
-                torch.as_tensor(bound.reshape(dynamics.num_modes, 3)).to(dynamics.lowest)
-                for bound in (low, high)
-            )
-        self.slowest_travel = float(card.get("slowest_travel", 0.0))
+        self.training_range = TrainingRange.from_plain(card["training_range"])
+        dynamics.lowest, dynamics.highest = (
+            torch.as_tensor(bound.reshape(dynamics.num_modes, 3)).to(dynamics.lowest)
+            for bound in self.training_range.soil(_MARGIN)
+        )
+        self.slowest_travel = float(card["slowest_travel"])
         if not 0.0 <= self.slowest_travel < math.inf:
             raise ValueError(f"the slowest travel is {self.slowest_travel}")
         self.card = dict(card) | {
@@ -131,6 +101,21 @@ class Surrogate(nn.Module):
             **dynamics.card(),
             "basis": state,
         }
+
+    @classmethod
+    def of(cls, dynamics: Dynamics, reduced: ReducedDataset, card: Mapping[str, Any]) -> Surrogate:
+        """Dynamics with the basis, the start and the body points of the dataset that they are trained on."""
+        runs = reduced.runs("train")
+        points = in_body_frame(runs[0].pose[0], runs[0].body_points[0])
+        sees_points = dynamics.settings.body_nodes == "points"
+        known = TrainingRange.of(runs, dynamics.num_modes, dynamics.context_keys, sees_points)
+        return cls(
+            dynamics,
+            reduced.basis.sliced(dynamics.num_modes),
+            torch.as_tensor(reduced.start_positions),
+            torch.as_tensor(points),
+            {**card, "training_range": known.plain(), "slowest_travel": slowest_travel(runs)},
+        )
 
     @property
     def frame_rate(self) -> float:
@@ -141,11 +126,6 @@ class Surrogate(nn.Module):
         """Write a checkpoint without anything to go on training from."""
         state = {f"{_PREFIX}{name}": value for name, value in self.state_dict().items()}
         write_checkpoint({"state_dict": state, "hyper_parameters": self.card}, path)
-
-    @property
-    def start_latent(self) -> Tensor:
-        """The common start in the basis [m], shape (r, 3), float64."""
-        return self.basis.transform(self.start_positions.cpu())
 
 
 def write_checkpoint(content: dict[str, Any], path: Path) -> None:
@@ -175,7 +155,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     try:
         _require_plain_archive(path)
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except _UNREADABLE as error:
+    except Exception as error:  # whatever the bytes are, reading them may fail in any way
         raise UserError(
             f"{path} cannot be read as a checkpoint; it is truncated or something else; train again"
         ) from error
@@ -212,10 +192,18 @@ def load_surrogate(path: str | Path) -> Surrogate:
             if key.startswith(_PREFIX)
         }
         _require_own_values(state)
-        _require_described(state, card)
+        if not isinstance(scene := card["scene"], dict) or not isinstance(scene.get("bed", {}), dict):
+            raise ValueError("its card does not say what the scene is")
+        require_mesh_was_read(scene)
+        held = {
+            name.removeprefix("dynamics."): value
+            for name, value in state.items()
+            if name.startswith("dynamics.")
+        }
+        dynamics = DYNAMICS[card["model"]["kind"]].from_card(card, held)
         tensors = {name: state[f"basis_{name}"] for name in ("mean", "modes", "eigenvalues")}
         basis = Basis.from_state(card["basis"] | tensors, where=str(path))
-        surrogate = Surrogate(dynamics_of(card), basis, state["start_positions"], state["body_points"], card)
+        surrogate = Surrogate(dynamics, basis, state["start_positions"], state["body_points"], card)
         surrogate.load_state_dict(state)
         if not 0.0 < surrogate.frame_rate < math.inf:
             raise ValueError(f"the frame rate is {surrogate.frame_rate} Hz")
@@ -223,7 +211,7 @@ def load_surrogate(path: str | Path) -> Surrogate:
             raise ValueError("it holds numbers that are not finite")
     except UserError as error:
         raise UserError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-    except _UNREADABLE as error:
+    except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(
             f"{path} is a checkpoint whose parts do not fit together ({reason}); train again"
@@ -232,8 +220,7 @@ def load_surrogate(path: str | Path) -> Surrogate:
 
 
 def _require_plain_archive(path: Path) -> None:
-    """Refuses what `torch.save` does not write: archives with compressed parts, whose size nobody knows before, and
-    the formats of before them."""
+    """Refuses what `torch.save` does not write by default, such as compressed parts, whose size nobody knows before."""
     try:
         with zipfile.ZipFile(path) as archive:
             parts = archive.infolist()
@@ -294,31 +281,6 @@ def _require_own_values(state: dict[str, Any]) -> None:
             raise ValueError(f"{name} claims more values than there are")
 
 
-def _require_described(state: dict[str, Any], card: dict[str, Any]) -> None:
-    """Refuses a card that describes more than there is in the file, before it is built."""
-    model, scene = card["model"], card["scene"]
-    if not isinstance(scene, dict) or not isinstance(scene.get("bed", {}), dict):
-        raise ValueError("its card does not say what the scene is")
-    require_mesh_was_read(scene)
-    if model.get("kind", "network") == "polynomial":
-        inputs, terms = len(card["used"]), state["dynamics.weights"].shape[0]
-        groups = len(state["dynamics.inputs.mean"]) // (3 * int(card["num_modes"]))
-        if (
-            model["history"] > groups
-            or (inputs * (inputs + 1) // 2 if model["degree"] == 2 else inputs) > terms
-        ):
-            raise ValueError("its card describes other polynomials")
-        return
-    for key in ("hidden_layers", "message_passing_steps"):
-        if model[key] > len(state):
-            raise ValueError(f"model.{key} is {model[key]}, but there are {len(state)} tensors")
-    with torch.device("meta"):  # shapes without memory
-        described = dynamics_of(card).state_dict()
-    for name, value in described.items():
-        if state[f"dynamics.{name}"].shape != value.shape:
-            raise ValueError(f"{name} has not the shape {tuple(value.shape)} that its card says")
-
-
 # --- `training.json`, the numbers of a complete training, beside its checkpoint -------------------------
 
 SUMMARY = "training.json"
@@ -334,13 +296,13 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """
     file = folder / SUMMARY
     summary = read_json(file, _WRONG, _ADVICE)
-    kinds = {"seconds": (int, float), "skill": (int, float), "steps": int}
+    types = {"seconds": (int, float), "skill": (int, float), "steps": int}
     if not isinstance(summary, dict):
         raise UserError(f"{file} is {_WRONG} (no group of keys); {_ADVICE}")
-    for key, kind in kinds.items():
+    for key, type_ in types.items():
         value = summary.get(key, 1 if key == "steps" else None)  # polynomials are fitted without any
         # The skill is no number where nothing moves; no other may be none.
-        good = isinstance(value, kind) and not isinstance(value, bool)
+        good = isinstance(value, type_) and not isinstance(value, bool)
         if not good or (key != "skill" and not (key == "steps") <= value < math.inf):
             raise UserError(f"{file} is {_WRONG} ({key} is {value!r:.40}); {_ADVICE}")
     return summary

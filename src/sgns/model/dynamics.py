@@ -1,11 +1,14 @@
-"""The interface of both kinds of latent dynamics, the network's and the polynomials': steps, and paths of them."""
+"""The interface of all latent dynamics, the network's and the polynomials': steps, and paths of them.
+
+Shapes: B batch, d history positions, r modes, N body nodes, V = r + N nodes, K context numbers, T frames.
+"""
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,8 +19,9 @@ from sgns.model.features import BodyTrack
 from sgns.model.network import Standardiser
 from sgns.model.settings import ModelSettings, PolynomialSettings
 
-# --- What the dynamics say of one step and of a whole path ----------------------------------------------
-# Shapes: B batch, r modes, N body nodes, V = r + N nodes, T frames.
+# No latent position goes further than this from its mean, in deviations; training runs stay within about half of it. It
+# keeps a rollout finite that has left everything the dynamics know.
+_REACH = 10.0
 
 
 class Prediction(NamedTuple):
@@ -68,25 +72,27 @@ class Path(NamedTuple):
     body: BodyTrack
 
 
-# --- The interface that both kinds of latent dynamics have, the network's and the polynomials': steps, and
-# Shapes: B batch, d history positions, r modes, N body nodes, K context numbers, T frames.
+class Stepper:
+    """Takes the steps of one path without gradients.
 
-# No latent position goes further than this from its mean, in deviations; training runs stay within about half of it. It
-# keeps a rollout finite that has left everything the dynamics know.
-_REACH = 10.0
-
-
-class Stepper(Protocol):
-    """Takes the steps of one path, whose context it knows.
+    Args:
+        dynamics: Whose.
+        context: Numbers of the run, shape (1, K); not needed when K is 0.
 
     Attributes:
         memory: All that a step depends on of those before it, besides what it is given; put back, it undoes them.
     """
 
-    memory: Any
+    memory: Any = None
+
+    def __init__(self, dynamics: Dynamics, context: Tensor | None) -> None:
+        self.dynamics = dynamics
+        self.context = context
 
     def advance(self, latent: Tensor, body: BodyTrack) -> Step:
         """One step; latent (1, d, r, 3) and body (1, d, N, ...) as for `Dynamics.advance`."""
+        with torch.inference_mode():
+            return self.dynamics.advance(latent, body, self.context)
 
 
 class Dynamics(nn.Module):
@@ -139,6 +145,16 @@ class Dynamics(nn.Module):
             "predicts_body": self.predicts_body,
         }
 
+    @classmethod
+    @abstractmethod
+    def from_card(cls, card: Mapping[str, Any], state: Mapping[str, Tensor]) -> Dynamics:
+        """What a card describes (see `card`), to be filled from a state dict.
+
+        Raises:
+            KeyError, TypeError, ValueError, UserError: It is no such card, or describes more than the state holds; this
+                is found out before anything is built.
+        """
+
     @abstractmethod
     def with_modes(self, num_modes: int) -> Dynamics:
         """The same dynamics of the first modes only.
@@ -177,7 +193,7 @@ class Dynamics(nn.Module):
             body_points: M.
             context: Numbers of the run, shape (1, K); not needed when K is 0.
         """
-        return OwnStepper(self, context)
+        return Stepper(self, context)
 
     def unroll(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Path:
         """Follow whole tool paths from a given history, feeding predictions back.
@@ -188,10 +204,7 @@ class Dynamics(nn.Module):
             context: As for `advance`.
         """
         return unrolled(
-            lambda history, window: self.advance(history, window, context),
-            latent,
-            body,
-            self.predicts_body,
+            lambda history, window: self.advance(history, window, context), latent, body, self.predicts_body
         )
 
     def check_modes(self, num_modes: int) -> None:
@@ -211,38 +224,13 @@ class Dynamics(nn.Module):
         return context
 
 
-class OwnStepper:
-    """`Dynamics.advance` for one path.
-
-    Args:
-        dynamics: Whose.
-        context: Numbers of the run, shape (1, K).
-    """
-
-    def __init__(self, dynamics: Dynamics, context: Tensor | None) -> None:
-        self.memory = None
-        self.dynamics = dynamics
-        self.context = context
-
-    def advance(self, latent: Tensor, body: BodyTrack) -> Step:
-        """See `Stepper`."""
-        with torch.inference_mode():
-            return self.dynamics.advance(latent, body, self.context)
-
-
 def unrolled(
-    advance: Callable[[Tensor, BodyTrack], Step],
-    latent: Tensor,
-    body: BodyTrack,
-    predicts_body: bool,
+    advance: Callable[[Tensor, BodyTrack], Step], latent: Tensor, body: BodyTrack, predicts_body: bool
 ) -> Path:
     """Whole paths by steps that see what the steps before said.
 
-    Args:
-        advance: Takes a step from d latent positions (B, d, r, 3) and the body (B, d, N, ...).
-        latent: As for `Dynamics.unroll`.
-        body: As for `Dynamics.unroll`.
-        predicts_body: Whether the body goes where the steps say.
+    `advance` takes a step from d latent positions (B, d, r, 3) and the body (B, d, N, ...), which goes where the steps
+    say if it is predicted; the others as for `Dynamics.unroll`.
     """
     d, frames = latent.shape[1], body.position.shape[1]
     states = latent.new_empty((latent.shape[0], frames, *latent.shape[2:]), dtype=torch.float64)

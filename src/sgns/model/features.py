@@ -1,4 +1,4 @@
-"""What the network is told: the graph, the body, the scene's constants, the tool's travel."""
+"""What the network is told: the graph, the body, the scene's constants, the steps under a slow tool."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mpm_warp.poses import rotation_matrices, rotation_vectors
+from mpm_warp.poses import fitted_rotations, rotation_matrices, rotation_vectors
 from sgns.config import UserError
 
 if TYPE_CHECKING:
@@ -45,17 +45,10 @@ def edge_indices(
     self_loops: bool = False,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """The edges between modes, which come first, and body nodes, receivers ascending.
+    """The edges between modes, which come first, and body nodes: senders in row 0 and receivers, ascending, in row 1
+    (PyG's order), shape (2, E).
 
-    Args:
-        modes: r.
-        body_nodes: N.
-        edges: "complete", every ordered pair of different nodes; "star", only those with one mode and one body node.
-        self_loops: Whether every node has an edge to itself.
-        device: Where the indices live.
-
-    Returns:
-        Senders in row 0 and receivers in row 1 (PyG's order), int64, shape (2, E).
+    "complete" is every ordered pair of different nodes; "star" only those with one mode and one body node.
     """
     index = torch.arange(modes + body_nodes, device=device)
     receiver, sender = torch.meshgrid(index, index, indexing="ij")
@@ -78,14 +71,11 @@ def build_graph(
     relative to the receiver's, and its length.
 
     Args:
-        mode_features: Of the modes [1], shape (B, r, any).
-        body_features: Of the body nodes [1], shape (B, N, any).
+        mode_features: [1], shape (B, r, any).
+        body_features: [1], shape (B, N, any).
         position: Of all nodes, modes first, in the unit of edges [1], shape (B, V, 3).
         edge_index: Senders and receivers, shape (2, E).
         edge_length: Whether edges hold their length.
-
-    Returns:
-        The graph with modes first and body nodes last.
     """
     width = max(mode_features.shape[-1], body_features.shape[-1])
     nodes = torch.cat(
@@ -148,15 +138,12 @@ class BodyTrack(NamedTuple):
 
 
 def body_track(poses: np.ndarray, points: np.ndarray | None, body_nodes: str) -> BodyTrack:
-    """Describe a path as the network sees it.
+    """A path as the network sees it, float64.
 
     Args:
         poses: Centre of mass [m] and unit quaternion x, y, z, w, shape (T, 7).
         points: Body points in the world frame [m], shape (T, M, 3); only read for "points".
         body_nodes: "pose" (one node) or "points" (one node per point).
-
-    Returns:
-        The track, float64.
     """
     if body_nodes == "points":
         if points is None or points.shape[1] == 0:
@@ -190,28 +177,26 @@ def free_axes(predicted: bool, body_nodes: str) -> Tensor:
     return torch.tensor([0.0, 0.0, 1.0] if body_nodes == "pose" else [1.0, 1.0, 1.0], dtype=torch.float64)
 
 
+def moves_freely(runs: Sequence[ReducedRun]) -> bool:
+    """Whether the body moves as the soil lets it, which only a wheel's axle does; refuses a mixture."""
+    free = {run.scene.get("kind") == "wheel" for run in runs}
+    if len(free) > 1:
+        raise UserError(
+            "the training runs mix wheels, whose height is predicted, with bodies whose motion is prescribed; keep one "
+            "dataset for each"
+        )
+    return free.pop()
+
+
 def nearest_rigid(reference: Tensor, points: Tensor) -> Tensor:
-    """The rigidly moved reference that lies nearest to some points (Kabsch 1976), in the sense of least squares.
-
-    Args:
-        reference: Points of the body in any one pose [m], shape (..., M, 3).
-        points: Where they are said to be [m], shape (..., M, 3).
-
-    Returns:
-        Shape (..., M, 3); not finite where the points are not.
-    """
+    """The points of a body in any one pose (..., M, 3) [m], moved rigidly to where they lie nearest to some points
+    (..., M, 3); not finite where these are not."""
     here, there = reference.mean(-2, keepdim=True), points.mean(-2, keepdim=True)
-    product = (reference - here).transpose(-1, -2) @ (points - there)
-    # The decomposition fails where one of many is not finite; there `there` is not finite either, and what comes out.
-    sound = product.isfinite().flatten(-2).all(-1)[..., None, None]
-    u, _, vh = torch.linalg.svd(torch.where(sound, product, 0.0))
-    # A reflection is no motion: turn the direction of least extent round.
-    flip = torch.ones_like(u[..., 0])
-    flip[..., 2] = torch.sign(torch.linalg.det(u @ vh))
-    return (reference - here) @ ((u * flip.unsqueeze(-2)) @ vh) + there
+    rotation = torch.from_numpy(fitted_rotations(reference.cpu().numpy(), points.cpu().numpy()))
+    return (reference - here) @ rotation.to(points.device).transpose(-1, -2) + there
 
 
-# --- Constants of a run that the tool's path does not show: gravity, load, the friction angle of the soil,
+# --- Constants of a run that the tool's path does not show: gravity, load, friction angle of the soil -----
 
 
 def varying_context(runs: Sequence[ReducedRun], candidates: Sequence[str]) -> list[str]:
@@ -249,11 +234,10 @@ def _value(scene: Mapping[str, Any], key: str) -> float | None:
     return float(found) if isinstance(found, Real) and not isinstance(found, bool) else None
 
 
-# --- Slow dry soil follows the way a tool travels, not the time that it takes ---------------------------
-# Dynamics learn from tools that move by so much per frame, and in every step they err a little: along a
-# path much slower
-# than that, or at rest, the errors of thousands of steps add up to soil that flows on its own. There the soil takes a
-# step only each time that the tool has travelled as far as the slowest trained one does in a frame.
+# --- Rate independence: slow dry soil follows the way a tool goes, not the time that it takes -----------
+# Dynamics learn from tools that move by so much per frame, and in every step they err a little: along a path much
+# slower than that, or at rest, the errors of thousands of steps add up to soil that flows on its own. There the soil
+# takes a step only each time that the tool has gone as far as the slowest trained one does in a frame.
 #
 # Shapes: T frames, M body points.
 
@@ -264,7 +248,7 @@ _STILL = 1e-9
 _STOPPING, _ROUNDING = 0.01, 0.01
 
 
-class Travel(NamedTuple):
+class ToolMotion(NamedTuple):
     """How a tool has moved, as far as the next step of the soil depends on it.
 
     Attributes:
@@ -284,47 +268,37 @@ class Travel(NamedTuple):
     steps: bool
 
     @classmethod
-    def along(cls, given: np.ndarray, least: float, settling: int) -> Travel:
+    def along(cls, given: np.ndarray, least: float, settling: int) -> ToolMotion:
         """In the last of some given frames of markers (any, M + 1, 3), before which it rested."""
-        travel = cls(max(least, _STILL), settling, given[0], given[0], settling, True)
+        motion = cls(max(least, _STILL), settling, given[0], given[0], settling, True)
         for here in given[1:]:
-            travel = travel.moved(here)
-        return travel._replace(stepped=given[-1], steps=True)
+            motion = motion.moved(here)
+        return motion._replace(stepped=given[-1], steps=True)
 
-    def moved(self, here: np.ndarray) -> Travel:
+    def moved(self, here: np.ndarray) -> ToolMotion:
         """One frame later."""
         slow = 0 if distance(here, self.here) >= self.least else self.slow + 1
         steps = slow < self.settling or bool(distance(here, self.stepped) >= self.least)
         return self._replace(here=here, stepped=here if steps else self.stepped, slow=slow, steps=steps)
 
 
-def stepped_frames(path: np.ndarray, given: int, least: float, settling: int) -> np.ndarray:
-    """Numbers of the frames of a path that the soil takes a step into, and before them of those that are given.
-
-    Args:
-        path: Markers [m], shape (T, M + 1, 3).
-        given: Frames at the start that are given: 1 for a bed at rest, or d.
-        least: See `Travel`.
-        settling: See `Travel`.
-    """
-    travel = Travel.along(path[:given], least, settling)
-    if (distance(path[given:], path[given - 1 : -1]) >= travel.least).all():
+def step_frames(path: np.ndarray, given: int, least: float, settling: int) -> np.ndarray:
+    """Numbers of the frames of a path of markers (T, M + 1, 3) that the soil takes a step into, and before them of
+    those that are given: 1 for a bed at rest, or d. For the others see `ToolMotion`."""
+    motion = ToolMotion.along(path[:given], least, settling)
+    if (distance(path[given:], path[given - 1 : -1]) >= motion.least).all():
         return np.arange(len(path))  # as most paths; one by one it takes as long as the steps of many paths
     frames = list(range(given))
     for t in range(given, len(path)):
-        travel = travel.moved(path[t])
-        if travel.steps:
+        motion = motion.moved(path[t])
+        if motion.steps:
             frames.append(t)
     return np.array(frames)
 
 
 def markers(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """What shows how far a tool moves: its centre of mass and its points, shape (T, M + 1, 3).
-
-    Args:
-        poses: Shape (T, 7).
-        points: World frame [m], shape (T, M, 3).
-    """
+    """What shows how far a tool moves: its centre of mass, of poses (T, 7), and its points in the world frame
+    (T, M, 3); shape (T, M + 1, 3)."""
     return np.concatenate([np.asarray(poses)[:, None, :3], points], axis=1)
 
 

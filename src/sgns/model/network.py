@@ -7,7 +7,7 @@ definition. What `EncodeProcessDecode.forward` runs is the same function by exac
 - the first layer of the edge update is linear, so its receiver and sender blocks are applied to the V nodes and
   not to the E edges, and its edge block can be multiplied into the last layer of whatever made the edges;
 - the last layer of the edge update is linear, so it is applied to the V sums and not to the E edges;
-- a complete graph needs no index: senders and receivers are broadcast (`pairs`);
+- a complete graph needs no index: senders and receivers are broadcast (`adjacency`);
 - without gradients batches go through in blocks, so that memory is bounded and stays in the cache.
 
 A layer normalisation stands in the way of the second, and of the multiplication in the first; the rest holds.
@@ -15,27 +15,14 @@ A layer normalisation stands in the way of the second, and of the multiplication
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch_geometric.nn import MessagePassing
 
-from sgns.model.algebra import Pairs, affine, pairs_of
-
-# --- Encode, pass messages, decode: the graph network of the paper (section 3.3), batched over graphs of on
-# topology.
-#
-# Every part is written twice. `forward` of `MLP` and `InteractionNetwork` and `EncodeProcessDecode.plain` are the
-# definition. What `EncodeProcessDecode.forward` runs is the same function by exact algebra:
-#
-# - the first layer of the edge update is linear, so its receiver and sender blocks are applied to the V nodes and
-#   not to the E edges, and its edge block can be multiplied into the last layer of whatever made the edges;
-# - the last layer of the edge update is linear, so it is applied to the V sums and not to the E edges;
-# - a complete graph needs no index: senders and receivers are broadcast (`pairs`);
-# - without gradients batches go through in blocks, so that memory is bounded and stays in the cache.
-#
-# A layer normalisation stands in the way of the second, and of the multiplication in the first; the rest holds.
+from sgns.model.algebra import Adjacency, adjacency_of, affine
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "silu": nn.SiLU, "gelu": nn.GELU, "tanh": nn.Tanh}
 # Edges that go through the network at once on a CPU when nothing is kept for gradients.
@@ -53,16 +40,7 @@ def keep_freed_memory() -> None:
 
 
 class MLP(nn.Module):
-    """A multilayer perceptron.
-
-    Args:
-        inputs: Width of the input.
-        hidden: Width of the hidden layers.
-        hidden_layers: Number of hidden layers.
-        outputs: Width of the output.
-        layer_norm: Whether the output is layer-normalised.
-        activation: One of "relu", "silu", "gelu", "tanh".
-    """
+    """A multilayer perceptron: widths of input, hidden layers and output; the output may be layer-normalised."""
 
     def __init__(
         self,
@@ -150,9 +128,9 @@ class Unapplied(NamedTuple):
         """The output of the linear layer that follows, as one product."""
         return affine(self.hidden, weight @ self.weight, torch.addmv(bias, weight, self.bias))
 
-    def gathered(self, pairs: Pairs) -> Tensor:
+    def gathered(self, adjacency: Adjacency) -> Tensor:
         """Sum of the output at the receivers: the layer applied to the sum of its input."""
-        return nn.functional.linear(pairs.gather(self.hidden), self.weight) + pairs.degree * self.bias
+        return nn.functional.linear(adjacency.gather(self.hidden), self.weight) + adjacency.degree * self.bias
 
 
 def value_of(features: Tensor | Unapplied) -> Tensor:
@@ -169,12 +147,12 @@ class InteractionNetwork(MessagePassing):
     for the edge from sender j to receiver i.
 
     Args:
-        width: Width of node and edge features.
-        hidden: Width of the hidden layers.
-        hidden_layers: Number of hidden layers of each MLP.
+        width: Of node and edge features.
+        hidden: Width of the hidden layers of each MLP.
+        hidden_layers: Their number.
         layer_norm: Whether updates are layer-normalised.
         residual: Whether updates are added to what they update.
-        activation: Activation between layers.
+        activation: Between layers.
 
     Shapes:
         nodes (..., V, width), edges (..., E, width), edge_index (2, E) with senders in row 0.
@@ -215,7 +193,7 @@ class InteractionNetwork(MessagePassing):
         return edges
 
     def rearranged(
-        self, nodes: Tensor, edges: Tensor | Unapplied, pairs: Pairs
+        self, nodes: Tensor, edges: Tensor | Unapplied, adjacency: Adjacency
     ) -> tuple[Tensor, Tensor | Unapplied]:
         """The same by the algebra of this module's head; nodes (B, V, width), edges (B, E, width)."""
         first = self.edge_mlp.first
@@ -225,11 +203,11 @@ class InteractionNetwork(MessagePassing):
             if isinstance(edges, Unapplied)
             else affine(edges, own_weight, first.bias)
         )
-        spread = pairs.spread(
+        spread = adjacency.spread(
             own, nn.functional.linear(nodes, receiver_weight), nn.functional.linear(nodes, sender_weight)
         )
         updated = self.edge_mlp.ending(self.edge_mlp.hidden_after_first(spread))
-        summed = updated.gathered(pairs) if isinstance(updated, Unapplied) else pairs.gather(updated)
+        summed = updated.gathered(adjacency) if isinstance(updated, Unapplied) else adjacency.gather(updated)
         moved = value_of(self.node_mlp.ending(self.node_mlp.hidden(torch.cat([nodes, summed], dim=-1))))
         if self.residual:
             return nodes + moved, value_of(edges) + value_of(updated)
@@ -237,22 +215,12 @@ class InteractionNetwork(MessagePassing):
 
 
 class EncodeProcessDecode(nn.Module):
-    """Five MLPs: encoders of nodes and edges, edge and node updates, decoder of nodes.
+    """Five MLPs: encoders of nodes and edges, edge and node updates of every message-passing step, decoder of nodes.
 
-    Args:
-        node_inputs: Width of node features.
-        edge_inputs: Width of edge features.
-        outputs: Width of the decoded node quantities.
-        hidden: Width of every layer and of the encoded features.
-        hidden_layers: Hidden layers of each MLP.
-        steps: Message-passing steps, each with its own two MLPs.
-        layer_norm: Layer normalisation after every MLP but the decoder.
-        residual: Whether message passing adds to nodes and edges.
-        activation: Activation between layers.
+    Every layer and what is encoded is `hidden` wide; the layer normalisation comes after every MLP but the decoder.
 
     Shapes:
-        nodes (..., V, node_inputs), edges (..., E, edge_inputs), edge_index (2, E). Returns (..., V,
-        outputs).
+        nodes (..., V, node_inputs), edges (..., E, edge_inputs), edge_index (2, E). Returns (..., V, outputs).
     """
 
     def __init__(
@@ -277,7 +245,7 @@ class EncodeProcessDecode(nn.Module):
         )
         self.decode = MLP(hidden, hidden, hidden_layers, outputs, activation=activation)
         # The edges of the last call: a training or a rollout keeps them.
-        self._known_pairs: tuple[Tensor, Pairs] | None = None
+        self._known_adjacency: tuple[Tensor, Adjacency] | None = None
 
     def plain(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> Tensor:
         """Node quantities from a batch of graphs, as defined."""
@@ -291,29 +259,29 @@ class EncodeProcessDecode(nn.Module):
         """Node quantities from a batch of graphs: `plain` to rounding, in less time and memory."""
         leading = nodes.shape[:-2]
         nodes, edges = nodes.reshape(-1, *nodes.shape[-2:]), edges.reshape(-1, *edges.shape[-2:])
-        pairs = self.pairs(edge_index, nodes.shape[1])
+        adjacency = self.adjacency(edge_index, nodes.shape[1])
         at_once = len(nodes)
         if nodes.device.type == "cpu" and not torch.is_grad_enabled():
             at_once = max(1, EDGES_AT_ONCE // max(1, edges.shape[1]))
         blocks = zip(nodes.split(at_once), edges.split(at_once), strict=True)
-        decoded = torch.cat([self.rearranged(*block, pairs) for block in blocks])
+        decoded = torch.cat([self.rearranged(*block, adjacency) for block in blocks])
         return decoded.reshape(*leading, *decoded.shape[1:])
 
-    def rearranged(self, nodes: Tensor, edges: Tensor, pairs: Pairs) -> Tensor:
+    def rearranged(self, nodes: Tensor, edges: Tensor, adjacency: Adjacency) -> Tensor:
         """`plain` by the algebra of this module's head; nodes (B, V, node_inputs), edges (B, E, edge_inputs)."""
         nodes = value_of(self.encode_nodes.ending(self.encode_nodes.hidden(nodes)))
         messages = self.encode_edges.ending(self.encode_edges.hidden(edges))
         for step in self.process:
-            nodes, messages = step.rearranged(nodes, messages, pairs)
+            nodes, messages = step.rearranged(nodes, messages, adjacency)
         return value_of(self.decode.ending(self.decode.hidden(nodes)))
 
-    def pairs(self, edge_index: Tensor, node_count: int) -> Pairs:
+    def adjacency(self, edge_index: Tensor, node_count: int) -> Adjacency:
         """The edges as sums; looked at once per `edge_index` object."""
-        known = self._known_pairs  # looked up once: another thread may have other edges
+        known = self._known_adjacency  # looked up once: another thread may have other edges
         if known is None or known[0] is not edge_index:
             # What is made in inference mode could not be trained with later.
             with torch.inference_mode(False):
-                known = self._known_pairs = edge_index, pairs_of(edge_index, node_count)
+                known = self._known_adjacency = edge_index, adjacency_of(edge_index, node_count)
         return known[1]
 
 
@@ -341,18 +309,13 @@ class Standardiser(nn.Module):
 
     @classmethod
     def fit(cls, samples: Tensor, floor: float = 0.0, centred: bool = True) -> Standardiser:
-        """Statistics over the first dimension.
+        """Statistics over the first dimension; a quantity that never varies gets scale one.
 
         Args:
             samples: Training values [unit], shape (samples, ...).
-            floor: Smallest allowed scale as a share of the largest one; a direction in which (almost) nothing
-                happens, such as the lateral one by symmetry, keeps a small normalised value instead of being
-                blown up.
-            centred: Whether the mean is subtracted; without it zero stays zero and the scale is the root mean
-                square.
-
-        Returns:
-            The fitted standardiser; a quantity that never varies gets scale one.
+            floor: Smallest scale as a share of the largest one; a direction in which (almost) nothing happens, such as
+                the lateral one by symmetry, keeps a small normalised value instead of being blown up.
+            centred: Whether the mean is subtracted; without it zero stays zero and the scale is the root mean square.
         """
         samples = samples.double()
         if samples[0].numel() == 0:
@@ -364,6 +327,15 @@ class Standardiser(nn.Module):
         if largest <= 1e-12 * float(samples.abs().max()) or largest == 0.0:
             return cls(mean, torch.ones_like(scale))
         return cls(mean, scale.clamp_min(max(floor, 1e-9) * largest))
+
+    def __getitem__(self, index: slice | Tensor) -> Standardiser:
+        """Of a part of the quantity."""
+        return Standardiser(self.mean[index], self.scale[index])
+
+    @classmethod
+    def cat(cls, parts: Iterable[Standardiser]) -> Standardiser:
+        """Of several quantities side by side."""
+        return cls(*(torch.cat(values) for values in zip(*((p.mean, p.scale) for p in parts), strict=True)))
 
     @classmethod
     def empty(cls, *shape: int) -> Standardiser:

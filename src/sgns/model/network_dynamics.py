@@ -1,23 +1,24 @@
-"""Latent dynamics as a graph network."""
+"""Latent dynamics as a graph network: history and next tool motion in, next state and force out; and one path stepped
+quickly.
+
+Shapes: B batch, d history positions, r modes, N body nodes, V = r + N nodes, E edges, K context numbers, T frames,
+W = T - d + 1 windows.
+"""
 
 from __future__ import annotations
 
 import copy
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from sgns.model.dynamics import Dynamics, Path, Prediction, Step, unrolled
-from sgns.model.fast_step import GraphStepper
+from sgns.model.algebra import GraphStepper
+from sgns.model.dynamics import Dynamics, Path, Prediction, Step, Stepper, unrolled
 from sgns.model.features import BodyTrack, build_graph, edge_indices, free_axes, nearest_rigid
 from sgns.model.network import EncodeProcessDecode, Standardiser
 from sgns.model.settings import ModelSettings
-
-# --- The dynamics of the latent soil around a body as a graph network: history and next tool motion in, nex
-# force out.
-#
-# Shapes: B batch, d history positions, r modes, N body nodes, V = r + N nodes, K context numbers, T frames.
 
 
 class LatentDynamics(Dynamics):
@@ -49,8 +50,8 @@ class LatentDynamics(Dynamics):
         mode_width = place + 3 * (settings.history - 1)
         body_width = place + (6 if pose else 0) + motion * motions
         # A learned vector for each mode, or one for all of them, and one for the body's nodes.
-        kinds = num_modes if settings.identity == "mode" else 1
-        self.identity = nn.Embedding(kinds + 1, settings.identity_width)
+        vectors = num_modes if settings.identity == "mode" else 1
+        self.identity = nn.Embedding(vectors + 1, settings.identity_width)
         self.network = EncodeProcessDecode(
             max(mode_width, body_width) + settings.identity_width + len(context),
             4 if settings.edge_length else 3,
@@ -75,6 +76,22 @@ class LatentDynamics(Dynamics):
         self.register_buffer("free", free_axes(predicts_body, settings.body_nodes), persistent=False)
         self._edges: dict[tuple[int, torch.device], Tensor] = {}
 
+    @classmethod
+    def from_card(cls, card: Mapping[str, Any], state: Mapping[str, Tensor]) -> LatentDynamics:
+        """As for all `Dynamics`."""
+        model = card["model"]
+        for key in ("hidden_layers", "message_passing_steps"):
+            if model[key] > len(state):
+                raise ValueError(f"model.{key} is {model[key]}, but there are {len(state)} tensors of it")
+        told = tuple(map(str, card["context"])), bool(card["predicts_body"])
+        arguments = ModelSettings(**model), int(card["num_modes"]), *told
+        with torch.device("meta"):  # shapes without memory
+            described = cls(*arguments).state_dict()
+        for name, value in described.items():
+            if state[name].shape != value.shape:
+                raise ValueError(f"{name} has not the shape {tuple(value.shape)} that its card says")
+        return cls(*arguments)
+
     def with_modes(self, num_modes: int) -> LatentDynamics:
         """The same network on the first modes only; the weights are shared.
 
@@ -86,22 +103,14 @@ class LatentDynamics(Dynamics):
         fewer._modules = dict(self._modules)
         fewer.num_modes, fewer._edges = num_modes, {}
         for name in ("position", "velocity", "change"):
-            whole = getattr(self, name)
-            setattr(fewer, name, Standardiser(whole.mean[:num_modes], whole.scale[:num_modes]))
+            setattr(fewer, name, getattr(self, name)[:num_modes])
         if self.settings.identity == "mode":
             weight = torch.cat([self.identity.weight[:num_modes], self.identity.weight[-1:]])
             fewer.identity = nn.Embedding.from_pretrained(weight, freeze=False)
         return fewer
 
     def forward(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Prediction:
-        """Predict one step of every window in a batch.
-
-        Args:
-            latent: The last d latent positions, oldest first [m], float64, shape (B, d, r, 3).
-            body: The d frames that end with the *next* one, the frame to be predicted; (B, d, N, ...). Where it is
-                then, and how it gets there along the free axes, is not looked at.
-            context: Numbers of the runs, shape (B, K); not needed when K is 0.
-        """
+        """Predict one step of every window in a batch; arguments as for `advance`."""
         modes, nodes = latent.shape[-2], body.position.shape[-2]
         edge_index = self.edge_index(modes, nodes, latent.device)
         graph = build_graph(
@@ -163,12 +172,9 @@ class LatentDynamics(Dynamics):
         return torch.cat([told, numbers], dim=-1)
 
     def force_contributions(self, prediction: Prediction) -> tuple[Tensor, Tensor]:
-        """Force [N] and torque [N m] that each node adds; their sums over nodes are the force and the torque.
+        """Force [N] and torque [N m] that each node adds, float64, shape (B, V, 3) each.
 
-        Every node carries 1/V of the mean, so that the sum, not the average, is the physical quantity.
-
-        Returns:
-            Two float64 tensors of shape (B, V, 3).
+        Every node carries 1/V of the mean, so that the sum over nodes, not the average, is the physical quantity.
         """
         count = prediction.force.shape[-2]
         return tuple(
@@ -177,13 +183,7 @@ class LatentDynamics(Dynamics):
         )  # type: ignore[return-value]
 
     def advance(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Step:
-        """Take one step: z+ = z + (z - z-) + a, or z + v. A predicted body of points stays rigid if it is to.
-
-        Args:
-            latent: As for `forward`.
-            body: As for `forward`.
-            context: As for `forward`.
-        """
+        """As for all `Dynamics`: z+ = z + (z - z-) + a, or z + v; a predicted body of points kept rigid if so set."""
         return self.stepped(self(latent, body, context), latent, body)
 
     def stepped(self, prediction: Prediction, latent: Tensor, body: BodyTrack) -> Step:
@@ -226,15 +226,7 @@ class LatentDynamics(Dynamics):
         stepper = self.stepper(body.position.shape[-2], context)
         if self.predicts_body:
             return unrolled(stepper.advance, latent, body, self.predicts_body)
-        d, frames = self.history, body.position.shape[1]
-        states = torch.empty((1, frames, *latent.shape[2:]), dtype=torch.float64, device=latent.device)
-        states[:, :d] = latent
-        force = torch.zeros((1, frames, 3), dtype=torch.float64, device=latent.device)
-        torque = torch.zeros_like(force)
-        loads = stepper.follow(states[0], body)
-        force[0, d:] = loads[:, :3]
-        torque[0, d:] = loads[:, 3:] if self.settings.torque else self.torque.mean
-        return Path(states, force, torque, body)
+        return stepper.unroll(latent, body)
 
     def edge_index(self, modes: int, body_nodes: int, device: torch.device) -> Tensor:
         """Senders and receivers, made once."""
@@ -248,40 +240,13 @@ class LatentDynamics(Dynamics):
         return self._edges[key]
 
 
-# --- One path, stepped quickly: the features of `LatentDynamics` written into kept memory, the network by
-# `GraphStepper`.
-#
-# Shapes: d history positions, r modes, N body nodes, V = r + N nodes, E edges, T frames, W = T - d + 1 windows.
+# --- One path: the features of `LatentDynamics` written into kept memory, the network by `GraphStepper` ---
 
 # A body whose nodes keep their places among themselves to this share of the positions' unit has only been shifted.
 _SHIFTED = 1e-6
 
 
-class Known(NamedTuple):
-    """What is known of the body, for every window.
-
-    Attributes:
-        features: Of its nodes [1], shape (W, N, any).
-        places: Of its nodes in the unit of the edges' features [1], float64, shape (W, N, 3).
-    """
-
-    features: Tensor
-    places: Tensor
-
-
-class Memory(NamedTuple):
-    """What is kept from one step to the next; never overwritten, only replaced.
-
-    Attributes:
-        shape: Places of the body's nodes from its first when the edges within it were last computed [1], shape (N, 3).
-        kept: What was computed of these edges (see `GraphStepper`), shape (N, any, H).
-    """
-
-    shape: Tensor | None
-    kept: Tensor | None
-
-
-class PathStepper:
+class PathStepper(Stepper):
     """`LatentDynamics.advance` and `unroll` for one path and without gradients; to rounding (1e-6) the same.
 
     Copies, pickled ones too, are built anew from the dynamics as they are then (see `GraphStepper`) and go on to the
@@ -305,30 +270,27 @@ class PathStepper:
                 self.graph = GraphStepper(network, self.edge_index, count, body_nodes)
             self.prepare_features(dynamics.told(r, body_nodes, 1, context)[0])
             self.prepare_outputs()
-        self.reset()
+        self.shape: Tensor | None = None
 
-    def __getstate__(self) -> tuple[tuple[Any, ...], Memory]:
+    def __getstate__(self) -> tuple[tuple[Any, ...], Any]:
         return self.arguments, self.memory
 
-    def __setstate__(self, state: tuple[tuple[Any, ...], Memory]) -> None:
+    def __setstate__(self, state: tuple[tuple[Any, ...], Any]) -> None:
         arguments, memory = state
         PathStepper.__init__(self, *arguments)
         self.memory = memory
 
     @property
-    def memory(self) -> Memory:
-        """All that a step depends on of those before it, besides what it is given."""
-        return Memory(self.shape, None if self.graph is None else self.graph.kept)
+    def memory(self) -> tuple[Tensor | None, Tensor | None]:
+        """Places of the body's nodes from its first when the edges within it were last computed [1], shape (N, 3), and
+        what was computed of these edges (see `GraphStepper`), shape (N, any, H); never overwritten, only replaced."""
+        return self.shape, None if self.graph is None else self.graph.kept
 
     @memory.setter
-    def memory(self, memory: Memory) -> None:
-        self.shape = memory.shape
+    def memory(self, memory: tuple[Tensor | None, Tensor | None]) -> None:
+        self.shape, kept = memory
         if self.graph is not None:
-            self.graph.kept = memory.kept
-
-    def reset(self) -> None:
-        """Forget the shape of the body seen last: what follows does not depend on what was stepped before."""
-        self.shape: Tensor | None = None
+            self.graph.kept = kept
 
     def prepare_features(self, told: Tensor) -> None:
         """Memory of the network's inputs; what the nodes are told once, shape (V, any), stays in it."""
@@ -366,8 +328,9 @@ class PathStepper:
         self.accelerates = dynamics.settings.predicts == "acceleration"
         self.nearest, self.furthest = dynamics.reach()
 
-    def known(self, body: BodyTrack) -> Known:
-        """What is known of the body (1, T, N, ...) in each of its windows of d frames."""
+    def windows(self, body: BodyTrack) -> tuple[Tensor, Tensor]:
+        """Features of the nodes of the body (1, T, N, ...) in each of its windows of d frames [1], shape (W, N, any),
+        and their places in the unit of the edges' features [1], float64, shape (W, N, 3)."""
         d, dynamics = self.dynamics.history, self.dynamics
         windows = BodyTrack(*(part[0].unfold(0, d, 1).movedim(-1, 1) for part in body))
         places = windows.position[:, -2]
@@ -375,7 +338,7 @@ class PathStepper:
             places = (places - dynamics.body_position.mean) / dynamics.body_position.scale
         else:
             places = places / dynamics.settings.edge_scale
-        return Known(dynamics.body_features(windows), places)
+        return dynamics.body_features(windows), places
 
     def has_only_shifted(self, places: Tensor) -> bool:
         """Whether the body's nodes (N, 3) lie to each other as they last did when this was not so."""
@@ -386,13 +349,8 @@ class PathStepper:
         return False
 
     def decoded(self, latent: Tensor, features: Tensor, places: Tensor) -> Tensor:
-        """What the network says, shape (V, 6 or 9); overwritten by the next call.
-
-        Args:
-            latent: Shape (d, r, 3).
-            features: Of the body nodes, shape (N, any).
-            places: Of the body nodes, shape (N, 3).
-        """
+        """What the network says of latent positions (d, r, 3) and of the body nodes' features (N, any) and places
+        (N, 3), shape (V, 6 or 9); overwritten by the next call."""
         newest = latent[-1]
         torch.sub(latent[1:], latent[:-1], out=self.velocity)
         torch.div(self.velocity - self.velocity_mean, self.velocity_scale, out=self.velocity_features)
@@ -425,31 +383,30 @@ class PathStepper:
     def advance(self, latent: Tensor, body: BodyTrack) -> Step:
         """One step; latent (1, d, r, 3), body (1, d, N, ...) as for `LatentDynamics.forward`."""
         with torch.inference_mode():
-            known = self.known(body)
-            decoded = self.decoded(latent[0], known.features[0], known.places[0])
+            features, places = self.windows(body)
+            decoded = self.decoded(latent[0], features[0], places[0])
             if self.dynamics.predicts_body:
                 return self.dynamics.stepped(self.dynamics.read(decoded[None]), latent, body)
             following, load = self.outcome(decoded, latent[0])
             torque = load[3:] if self.dynamics.settings.torque else self.dynamics.torque.mean
             return Step(following[None], load[None, :3], torque[None], body.motion[:, -1, :, :3])
 
-    def follow(self, states: Tensor, body: BodyTrack) -> Tensor:
-        """Steps along a prescribed body.
-
-        Args:
-            states: Latent positions [m], float64, shape (T, r, 3), whose first d frames are given; filled.
-            body: Shape (1, T, N, ...).
-
-        Returns:
-            Force [N] and torque [N m] of frames d to T - 1, shape (T - d, 6), or (T - d, 3) of a network without
-            torque.
-        """
-        d = self.dynamics.history
-        self.reset()
+    def unroll(self, latent: Tensor, body: BodyTrack) -> Path:
+        """A whole path along a prescribed body; arguments as for `Dynamics.unroll`, B = 1."""
+        d, frames = latent.shape[1], body.position.shape[1]
+        self.shape = None  # what follows does not depend on what was stepped before
+        states = latent.new_empty((1, frames, *latent.shape[2:]), dtype=torch.float64)
+        states[:, :d] = latent
+        path = states[0]
+        loads = self.load_mean.new_zeros(frames, len(self.load_mean))
         with torch.inference_mode():
-            known = self.known(body)
-            loads = self.load_mean.new_empty(len(states) - d, len(self.load_mean))
-            for k, (features, places) in enumerate(zip(known.features[1:], known.places[1:], strict=True)):
-                latent = states[k : k + d]
-                states[k + d], loads[k] = self.outcome(self.decoded(latent, features, places), latent)
-            return loads
+            for t, features, places in zip(
+                range(d, frames), *(part[1:] for part in self.windows(body)), strict=True
+            ):
+                seen = path[t - d : t]
+                path[t], loads[t] = self.outcome(self.decoded(seen, features, places), seen)
+        torque = loads[:, 3:]
+        if not self.dynamics.settings.torque:
+            torque = self.dynamics.torque.mean.repeat(frames, 1)
+            torque[:d] = 0.0
+        return Path(states, loads[None, :, :3], torque[None], body)

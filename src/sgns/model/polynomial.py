@@ -8,7 +8,7 @@ Letters: B batch, d history positions, r modes, K context numbers, p inputs, m m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -78,6 +78,17 @@ class PolynomialDynamics(Dynamics):
         weights = torch.zeros(len(self.terms), 3 * r + f + 6, dtype=torch.float64)
         self.weights = nn.Parameter(weights, requires_grad=False)
 
+    @classmethod
+    def from_card(cls, card: Mapping[str, Any], state: Mapping[str, Tensor]) -> PolynomialDynamics:
+        """As for all `Dynamics`."""
+        model, num_modes, used = card["model"], int(card["num_modes"]), card["used"]
+        most = len(used) * (len(used) + 1) // 2 if model["degree"] == 2 else len(used)
+        groups = len(state["inputs.mean"]) // (3 * num_modes)
+        if model["history"] > groups or most > len(state["weights"]):
+            raise ValueError("its card describes other polynomials")
+        told = tuple(map(str, card["context"])), bool(card["predicts_body"])
+        return cls(PolynomialSettings(**model), num_modes, *told, used)
+
     def card(self) -> dict[str, Any]:
         """As for all `Dynamics`."""
         return super().card() | {"used": self.used.tolist()}
@@ -101,22 +112,15 @@ class PolynomialDynamics(Dynamics):
         number = torch.cumsum(kept, 0) - 1
         held = kept[self.used]
         fewer = PolynomialDynamics(
-            self.settings,
-            num_modes,
-            self.context_keys,
-            self.predicts_body,
-            number[self.used[held]].tolist(),
+            self.settings, num_modes, self.context_keys, self.predicts_body, number[self.used[held]].tolist()
         )
-        fewer.inputs = Standardiser(self.inputs.mean[kept], self.inputs.scale[kept])
-        fewer.velocity = Standardiser(
-            self.velocity.mean[: 3 * num_modes], self.velocity.scale[: 3 * num_modes]
-        )
+        fewer.inputs, fewer.velocity = self.inputs[kept], self.velocity[: 3 * num_modes]
         fewer.body_displacement, fewer.force, fewer.torque = self.body_displacement, self.force, self.torque
         fewer.bounds = self.bounds[:, held]
         fewer.lowest, fewer.highest = self.lowest, self.highest
-        rows = torch.nn.functional.pad(held, (1, 0), value=True)[self.terms].all(1)
+        monomials = torch.nn.functional.pad(held, (1, 0), value=True)[self.terms].all(1)
         columns = torch.cat([self.weights[:, : 3 * num_modes], self.weights[:, 3 * r :]], dim=1)
-        fewer.weights.copy_(columns[rows])
+        fewer.weights.copy_(columns[monomials])
         return fewer
 
     def raw_inputs(self, latent: Tensor, body: BodyTrack, context: Tensor | None) -> list[Tensor]:

@@ -71,14 +71,8 @@ class TrainingRange:
     def of(
         cls, runs: Sequence[ReducedRun], num_modes: int, context: Sequence[str], points: bool = False
     ) -> TrainingRange:
-        """Of the first modes of some runs, and of the numbers of their scenes that the dynamics are told.
-
-        Args:
-            runs: The training runs.
-            num_modes: r.
-            context: Keys of the scene.
-            points: Whether the dynamics see the body's points, so that their number counts, too.
-        """
+        """Of the first modes of the training runs, and of the numbers of their scenes that the dynamics are told, by
+        their keys; with `points` the dynamics see the body's points, so that their number counts, too."""
         low: dict[str, np.ndarray] = {}
         high: dict[str, np.ndarray] = {}
         for run in runs:
@@ -123,14 +117,8 @@ class TrainingRange:
     def excess(
         self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, context: Mapping[str, float]
     ) -> Excess:
-        """How far a path is outside.
-
-        Args:
-            poses: Of the tool, shape (T, 7).
-            points: Of its body, world frame [m], shape (T, M, 3).
-            latent: Modes [m], shape (T, r, 3); fewer than those of the training are compared with the first of them.
-            context: Numbers of the scene by their keys.
-        """
+        """How far a path of poses (T, 7), body points in the world frame (T, M, 3) [m] and modes (T, r, 3) [m] is
+        outside; fewer modes than those of the training are compared with the first of them."""
         amounts, names = [], []
         found = quantities(poses, points, latent, context)
         for name in self.low:

@@ -18,13 +18,9 @@ import torch
 from torch import Tensor
 
 from sgns.config import UserError
-from sgns.data.files import new_hdf5
-from sgns.data.layout import BROKEN, open_hdf5, own_attribute, own_dataset
+from sgns.data.files import new_hdf5, parse_json
+from sgns.data.layout import BROKEN, one_line, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
-from sgns.data.small_files import parse_json
-
-# --- The subspace of the soil's motion: modes, what they explain, and the file they are kept in ---------
-# Letters: n particles, r modes; "..." stands for any leading axes, such as frames.
 
 CENTRINGS = ("scalar", "particle", "particle_axis")
 """What is subtracted before modes are found: one number, a mean per particle, one per particle and axis."""
@@ -152,11 +148,7 @@ class Basis:
 
     @classmethod
     def from_state(cls, state: dict[str, Any], where: str = "basis state") -> Basis:
-        """Basis of a dict made by `state`.
-
-        Args:
-            state: The dict.
-            where: What to call its origin in an error.
+        """Basis of a dict made by `state`; errors say `where` it comes from.
 
         Raises:
             UserError: If a key is missing, a value is not finite, shapes disagree or modes are askew.
@@ -225,9 +217,8 @@ class Basis:
                 state["fitted_on"] = parse_json(own_dataset(file, "fitted_on")[()])
                 state.update((key, torch.from_numpy(own_dataset(file, key)[()])) for key in _ARRAYS)
         except (*BROKEN, AttributeError) as error:
-            reason = " ".join(str(error).split())
             raise UserError(
-                f"{path}: not a readable basis, truncated or damaged ({reason}); fit again with `sgns reduce`"
+                f"{path}: not a readable basis, truncated or damaged ({one_line(error)}); fit again with `sgns reduce`"
             ) from error
         return cls.from_state(state, where=str(path))
 
@@ -307,10 +298,6 @@ def reconstruction_curve(paths: Sequence[Path], basis: Basis) -> np.ndarray:
 
     Orthonormal modes take away their share one after the other: the residual with r modes is
     ‖S − S̄‖² less the squared first r coordinates.
-
-    Args:
-        paths: Run files to reconstruct, each read in chunks.
-        basis: `Basis` with R modes.
 
     Returns:
         Mean over frames, particles and axes [m²] for r = 0 … R, shape (R + 1,); NaN without runs.

@@ -41,9 +41,8 @@ class _Moments:
     # Orthogonal rows, (k, n) [m]: sketch^T sketch is the scatter, centred per particle and axis.
     sketch: Tensor
     scatter: float  # trace of that scatter [m^2], dropped directions included
-    dropped: (
-        float  # its part in dropped directions [m^2]; the difference of the two would be round-off if small
-    )
+    # Its part in dropped directions [m^2]; the difference of the two would be round-off if small.
+    dropped: float
 
 
 class _Spectrum(NamedTuple):
@@ -122,16 +121,11 @@ class IncrementalPCA:
         return self._pending_count + (self._moments.count if self._moments else 0)
 
     def partial_fit(self, positions: Tensor | np.ndarray) -> IncrementalPCA:
-        """Add frames to the stream.
-
-        Pass positions in the type they were stored in: modes weaker than its rounding are not counted
-        as modes.
+        """Add frames to the stream; returns this object.
 
         Args:
-            positions: Particle positions [m], (t, n, 3), floating point.
-
-        Returns:
-            This object.
+            positions: Particle positions [m], (t, n, 3), floating point, in the type they were stored in: modes weaker
+                than its rounding are not counted as modes.
 
         Raises:
             UserError: If shape or type is wrong or a value is not finite; the stream is then as it was.
@@ -349,12 +343,9 @@ def _centred(frames: Tensor, old: _Moments) -> tuple[Tensor, _Moments]:
     """Rows of a block for the sketch, and the moments with its frames in all but the sketch.
 
     Args:
-        frames: (m + 1, 3, n) [m], relative to the reference; the last is not one but room for the move of
-            the mean. Overwritten.
+        frames: (m + 1, 3, n) [m], relative to the reference; the last is not one but room for the move of the mean.
+            Overwritten: the rows whose scatter is to be added, (3 m or 3 (m + 1), n), are a view of it.
         old: Moments so far.
-
-    Returns:
-        Rows whose scatter is to be added, (3 m or 3 (m + 1), n), a view of `frames`; new moments.
     """
     m = len(frames) - 1
     mean = frames[:m].mean(0)

@@ -19,10 +19,9 @@ from tqdm import tqdm
 from sgns.arrays import require_shapes
 from sgns.config import UserError, check_fields
 from sgns.data.dataset import SPLITS, Dataset
-from sgns.data.files import new_hdf5, require_replaceable
+from sgns.data.files import new_hdf5, parse_json, require_replaceable
 from sgns.data.layout import BROKEN, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
-from sgns.data.small_files import parse_json
 from sgns.reduction.basis import CENTRINGS, Basis, reconstruction_curve
 from sgns.reduction.pca import IncrementalPCA, checked_device
 
@@ -33,13 +32,7 @@ log = logging.getLogger(__name__)
 
 
 def fit_runs(paths: Iterable[Path], max_modes: int, device: str = "cpu") -> IncrementalPCA:
-    """One stream over runs; the bases of all centrings follow from it.
-
-    Args:
-        paths: Run files, each read in chunks.
-        max_modes: Modes to keep track of.
-        device: Torch device that does it.
-    """
+    """One stream over runs; the bases of all centrings follow from it."""
     pca = IncrementalPCA(max_modes, device=device)
     for path in paths:
         with Run(path) as run:
@@ -121,7 +114,7 @@ def _shown(value: float, limit: float) -> str:
     return f"{value:.{digits}g}"
 
 
-# --- The basis of a dataset's training runs, and every run in that basis, kept in the dataset's folder --
+# --- The cache in the dataset's folder ------------------------------------------------------------------
 #     <dataset>/reduced/<key>/basis.h5               fitted on the training split only
 #     <dataset>/reduced/<key>/<content hash>.h5      one reduced run each
 #
@@ -210,23 +203,21 @@ def reduce_dataset(
         progress: Whether to show a bar (never without a terminal).
         device: Torch device that fits and projects.
 
-    Returns:
-        The reduced dataset, with all `max_modes` modes.
-
     Raises:
         UserError: No training runs, runs of different beds, more modes asked than the data has, or no
             number of modes good enough.
     """
     settings = check_settings(reduction)
     checked_device(device)
-    paths = {split: [Path(path) for path in dataset.runs(split)] for split in SPLITS}
+    paths = {split: dataset.runs(split) for split in SPLITS}
+    everything = [path for split in SPLITS for path in paths[split]]
     if not paths["train"]:
         raise UserError(
             f"{dataset.path} has no complete training runs; make them with: sgns simulate "
             f"dataset={dataset.name}"
         )
-    content, frame_rate = check_one_bed([path for split in SPLITS for path in paths[split]])
-    folder = Path(dataset.path) / "reduced" / cache_key([content[path] for path in paths["train"]], settings)
+    content, frame_rate = check_one_bed(everything)
+    folder = dataset.path / "reduced" / cache_key([content[path] for path in paths["train"]], settings)
     bar = {"disable": not (progress and sys.stderr.isatty()), "unit": "run", "leave": False}
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -235,7 +226,6 @@ def reduce_dataset(
         basis = fitted_basis(folder / "basis.h5", paths["train"], settings, bar, device)
         projector = basis.to(device)
         num_modes = modes_to_use(projector, settings, paths["validation"])
-        everything = [path for split in SPLITS for path in paths[split]]
         reduced = {
             path: reduced_run(folder / f"{content[path]}.h5", path, projector)
             for path in tqdm(everything, desc="reducing runs", **bar)
@@ -362,16 +352,8 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
             parts.append(basis.transform(positions).cpu())
             if not bool(parts[-1].isfinite().all()):
                 require_positions(run_path, frames.start, positions)
-        reduced = ReducedRun(
-            run_path.stem,
-            torch.cat(parts).numpy(),
-            run.time,
-            run.pose,
-            run.body_points,
-            run.force,
-            run.torque,
-            run.scene,
-        )
+        series = {name: getattr(run, name) for name in _SERIES if name != "latent"}
+        reduced = ReducedRun(run_path.stem, torch.cat(parts).numpy(), **series, scene=run.scene)
     write_reduced(path, reduced)
     return reduced
 
@@ -387,11 +369,7 @@ def write_reduced(path: Path, run: ReducedRun) -> None:
 
 
 def read_reduced(path: Path, counts: Mapping[str, int] | None = None) -> ReducedRun:
-    """Read a reduced run.
-
-    Args:
-        path: The file.
-        counts: T, r or M where they are known.
+    """Read a reduced run; `counts` are T, r or M where they are known.
 
     Raises:
         One of sgns.data.layout.BROKEN: Not one, or its arrays do not fit together.

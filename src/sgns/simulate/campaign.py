@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import itertools
 import shutil
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,8 +17,8 @@ from omegaconf import OmegaConf
 
 from mpm_warp import Decision, Effects, Scene, SceneError, substeps_per_frame
 from sgns.config import UserError, flattened
-from sgns.data.dataset import SPLITS, _read
-from sgns.data.files import claimed, write_whole
+from sgns.data.dataset import SPLITS, read_description
+from sgns.data.files import file_lock, write_whole
 from sgns.simulate.scene import decided
 
 # --- What runs cost in work, time and disk, before and while they are made ------------------------------
@@ -46,14 +45,14 @@ class RunCost:
     """Of the run file [bytes], to a few per cent."""
 
     @property
-    def work_per_frame(self) -> int:
+    def steps_per_frame(self) -> int:
         """Particle-steps between two frames."""
         return self.particles * self.substeps
 
     @property
-    def work(self) -> int:
+    def particle_steps(self) -> int:
         """Particle-steps of the run."""
-        return self.work_per_frame * (self.frames - 1)
+        return self.steps_per_frame * (self.frames - 1)
 
 
 def run_cost(scene: Scene) -> RunCost:
@@ -175,17 +174,16 @@ class Campaign:
         """Write dataset.yaml, or check that the folder's own says the same."""
         file = self.path / "dataset.yaml"
         try:
-            while not file.exists():
-                with claimed(
-                    file
-                ) as ours:  # of two campaigns that begin at once the second finds the first's
-                    if ours and not file.exists():
+            if not file.exists():
+                with file_lock(
+                    file, wait=True
+                ):  # of two campaigns that begin at once the second finds the first's
+                    if not file.exists():
                         write_whole(file, yaml.safe_dump(self.describe(), sort_keys=False))
                         return
-                time.sleep(0.05)
         except OSError as error:
             raise UserError(f"cannot write {file}: {error.strerror}") from None
-        there, here = _read(file), self.describe()
+        there, here = read_description(file), self.describe()
         if there == here:
             return
         advice = "give another dataset.path, or remove the folder to make this one"

@@ -17,7 +17,7 @@ from sgns.config import UserError
 from sgns.data.files import only_here
 from sgns.data.run import Run, require_run_place
 from sgns.simulate.campaign import plan, require_space, run_cost
-from sgns.simulate.run import continued, simulate_scene
+from sgns.simulate.run import restart_from, simulate_scene
 from sgns.simulate.scene import asked_effects, decided, decision_line, recorded, scene_from_config
 from sgns.simulate.workers import simulate_campaign
 
@@ -50,16 +50,9 @@ def main(cfg: DictConfig) -> float | None:
     if cfg.continue_from is not None:
         if cfg.get("dataset") is not None:
             raise UserError("continue_from goes on with one run; leave out dataset=")
-        going_on = continued(cfg, HydraConfig.get().overrides.task)
-        return _simulate_one(
-            going_on.scene,
-            cfg,
-            effects=going_on.effects,
-            reasons=going_on.reasons,
-            seed=going_on.seed,
-            precision=going_on.precision,
-            going_on=going_on,
-        )
+        restart = restart_from(cfg, HydraConfig.get().overrides.task)
+        same = {name: getattr(restart, name) for name in ("effects", "reasons", "seed", "precision")}
+        return _simulate_one(restart.scene, cfg, **same, restart=restart)
     asked, batch = asked_effects(cfg), cfg.solver.batch
     if type(batch) is not int or batch < 1:
         raise UserError(f"solver.batch is {batch!r}; it must be a whole number, 1 or more")
@@ -70,13 +63,8 @@ def main(cfg: DictConfig) -> float | None:
                 "dataset.where picks among runs that are there; to simulate fewer change dataset.draw"
             )
         campaign = plan(settings, _base_scene(settings), asked, cfg.solver.precision, cfg.seed)
-        simulate_campaign(
-            campaign,
-            device=cfg.device,
-            batch=1 if cfg.device == "cpu" else batch,
-            shard=cfg.shard,
-            shards=cfg.shards,
-        )
+        batch = 1 if cfg.device == "cpu" else batch
+        simulate_campaign(campaign, device=cfg.device, batch=batch, shard=cfg.shard, shards=cfg.shards)
         return None
     if (cfg.shard, cfg.shards) != (0, 1):
         raise UserError("shard and shards divide the runs of a dataset; give dataset=... or leave them out")
@@ -86,14 +74,8 @@ def main(cfg: DictConfig) -> float | None:
     effects, decisions = decided(scene, asked)
     for name, decision in decisions.items():
         log.info("%s", decision_line(name, decision))
-    return _simulate_one(
-        scene,
-        cfg,
-        effects=effects,
-        reasons=recorded(decisions),
-        seed=cfg.seed,
-        precision=cfg.solver.precision,
-    )
+    settings = {"reasons": recorded(decisions), "seed": cfg.seed, "precision": cfg.solver.precision}
+    return _simulate_one(scene, cfg, effects=effects, **settings)
 
 
 def _simulate_one(scene: Scene, cfg: DictConfig, **settings: Any) -> float:
@@ -103,13 +85,7 @@ def _simulate_one(scene: Scene, cfg: DictConfig, **settings: Any) -> float:
         require_run_place(output)
         require_space(output.parent, run_cost(scene).size)
         with tqdm(total=scene.frame_count, unit="frame", desc=scene.name, disable=None) as bar:
-            timing = simulate_scene(
-                scene,
-                output,
-                device=cfg.device,
-                progress=bar.update,
-                **settings,
-            )
+            timing = simulate_scene(scene, output, device=cfg.device, progress=bar.update, **settings)
     with Run(output) as run:
         every = scene.bed.store_every
         kept = f" (one of every {every} recorded)" if every > 1 else ""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from mpm_warp import Effects, MeshBody, Scene, Solver, SolverStopped, State
+from mpm_warp import Effects, Scene, Solver, SolverStopped, State
 from mpm_warp.batch import all_together
 from mpm_warp.launch import Work
 from sgns.clock import elapsed
@@ -37,14 +37,14 @@ _OTHERS = ("continue_from", "output", "device", "solver.precision", "hydra")
 
 
 @dataclass(frozen=True)
-class Continuation:
+class Restart:
     """A stopped run and what it goes on with."""
 
     path: Path
     scene: Scene
     """What was asked for at first; the run file says this."""
     changes: dict[str, Any]
-    """Keys of `CHANGES` with new values, those of earlier continuations included."""
+    """Keys of `CHANGES` with new values, those of earlier restarts included."""
     effects: Effects
     reasons: dict[str, dict[str, Any]]
     """Of the effects, as in the file."""
@@ -53,8 +53,8 @@ class Continuation:
     state: State
     wall_time: float
     """What its frames took [s]."""
-    before: list[dict[str, Any]]
-    """What the file says of earlier continuations."""
+    earlier: list[dict[str, Any]]
+    """What the file says of earlier restarts."""
 
     @property
     def changed_scene(self) -> Scene:
@@ -71,7 +71,7 @@ class Continuation:
     @property
     def record(self) -> list[dict[str, Any]]:
         """For the run file: at which frames the solver went on, and with what changed."""
-        return [*self.before, {"frame": self.state.frame, "changed": dict(self.changes)}]
+        return [*self.earlier, {"frame": self.state.frame, "changed": dict(self.changes)}]
 
     def frames(self) -> Iterator[tuple[np.ndarray, ...]]:
         """The frames that are there, as `RunWriter.append` takes them."""
@@ -82,69 +82,38 @@ class Continuation:
                 yield (time, *soil, *(series[index] for series in small))
 
 
-def continued(cfg: DictConfig, overrides: Sequence[str]) -> Continuation:
+def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
     """What `cfg.continue_from` holds, with the changes among the command's `overrides`.
 
     Raises:
         UserError: the file is no stopped run, or something else is to be changed than how it is computed.
     """
     path = Path(str(cfg.continue_from))
-    asked_changes = _changes(cfg, overrides)
+    asked = _changes(cfg, overrides)
     with Run(path) as run:
-        reason = run.stopped
-        if reason is None:
+        if run.stopped is None:
             raise UserError(f"continue_from: {path} is a whole run; there is nothing to go on with")
-        scene, reasons, extra = run.scene, run.effects, run.extra
+        scene, mesh, reasons, extra = run.scene, run.mesh, run.effects, run.extra
         seed, count, wall_time = run.seed, run.frame_count, run.wall_time_s
-        mesh = _mesh(run, cfg, overrides)
+    if any(o.lstrip("+").startswith(f"{_FILE}=") for o in overrides):
+        raise UserError(f"{path} brings its own tool; leave out {_FILE}")
+    if mesh is None and isinstance(tool := scene.get("tool"), dict) and tool.get("shape") == "mesh":
+        raise UserError(f"{path} does not hold the mesh of its tool; repeat the run")
     state = read_state(path)
     if state.frame != count - 1:
         raise UserError(f"{path} holds {count} frames but the state of frame {state.frame}; repeat the run")
-    effects, before = _effects(reasons, path), _earlier(extra, path)
-    changes = {key: value for earlier in before for key, value in earlier["changed"].items()} | asked_changes
+    effects, earlier = _effects(reasons, path), _earlier(extra, path)
+    changes = {key: value for one in earlier for key, value in one["changed"].items()} | asked
     if effects.nonlocality and "bed.headroom" in changes:
         raise UserError(
             "with effects.nonlocality the grid keeps what flows, so scene.bed.headroom cannot change half-way; "
             "simulate the scene anew"
         )
-    asked = any(o.startswith("solver.precision=") for o in overrides)
-    return Continuation(
-        path=path,
-        scene=Scene.from_dict(scene, mesh),
-        changes=changes,
-        effects=effects,
-        reasons=reasons,
-        precision=cfg.solver.precision if asked else str(extra.get("precision", cfg.solver.precision)),
-        seed=seed,
-        state=state,
-        wall_time=wall_time,
-        before=before,
-    )
-
-
-def _mesh(run: Run, cfg: DictConfig, overrides: Sequence[str]) -> tuple[np.ndarray, np.ndarray] | None:
-    """The tool's mesh: what the run holds, or for a run from before it was kept the file that the command names."""
-    tool = run.scene.get("tool")
-    is_mesh = isinstance(tool, dict) and tool.get("shape") == "mesh"
-    given = any(o.lstrip("+").startswith(f"{_FILE}=") for o in overrides)
-    if is_mesh and run.mesh is None:
-        if not given:
-            raise UserError(
-                f"{run.path} does not hold the mesh of its tool, as runs of before did not, and no file is read "
-                f"because a run names it; give the file: '+{_FILE}=...'"
-            )
-        asked = {"shape": "mesh", "file": str(OmegaConf.select(cfg, _FILE)), "digest": tool["digest"]}
-        return MeshBody(**asked, scale=_scale(tool, run.path)).mesh[:2]
-    if given:
-        raise UserError(f"{run.path} brings its own tool; leave out {_FILE}")
-    return run.mesh
-
-
-def _scale(tool: Mapping[str, Any], path: Path) -> float:
-    scale = tool.get("scale", 1.0)
-    if isinstance(scale, bool) or not isinstance(scale, (int, float)):
-        raise UserError(f"{path}: scene.tool.scale is {scale!r}, which is no number; repeat the run")
-    return float(scale)
+    precision = cfg.solver.precision
+    if not any(o.startswith("solver.precision=") for o in overrides):
+        precision = str(extra.get("precision", precision))
+    scene = Scene.from_dict(scene, mesh)
+    return Restart(path, scene, changes, effects, reasons, precision, seed, state, wall_time, earlier)
 
 
 def _effects(reasons: Mapping[str, Any], path: Path) -> Effects:
@@ -220,14 +189,14 @@ def scene_stages(
     device: str = "cpu",
     precision: str = "float32",
     progress: Any = None,
-    going_on: Continuation | None = None,
+    restart: Restart | None = None,
 ) -> Generator[Timing | Work, None, None]:
     """Compute a scene and write its run file, with the particles that `scene.bed.store_every` leaves in it.
 
     Args:
         reasons: effect → on, reason, number, for the run file; by default what `effects` says of itself.
         progress: called once after every frame.
-        going_on: a stopped run of this scene; its frames are copied and the solver begins after them.
+        restart: a stopped run of this scene; its frames are copied and the solver begins after them.
 
     Yields:
         All work that the device has to do (mpm_warp.launch.Work), and at the end what it cost.
@@ -235,7 +204,9 @@ def scene_stages(
     Raises:
         SolverStopped: the line says where the frames before it are kept and how to go on.
     """
-    computed, state = (scene, None) if going_on is None else (going_on.changed_scene, going_on.state)
+    computed, state, before = scene, None, 0.0
+    if restart is not None:
+        computed, state, before = restart.changed_scene, restart.state, restart.wall_time
     solver = Solver(computed, effects, device, precision, start=state)
     stored = scene.stored
     with RunWriter(
@@ -255,17 +226,16 @@ def scene_stages(
             "substeps_per_frame": solver.substeps_per_frame,
             "particles_simulated": solver.particle_count,
         }
-        | ({"continued": going_on.record} if going_on is not None else {}),
+        | ({"continued": restart.record} if restart is not None else {}),
         mesh=scene.mesh,
     ) as writer:
-        for frame in going_on.frames() if going_on is not None else ():
+        for frame in restart.frames() if restart is not None else ():
             writer.append(*frame)
             if progress is not None:
                 progress()
         there = writer.frame_count
         # Loading kernels is not part of the cost of a run: the clock starts with the first frame, or with the first
         # work where the first frames are there already.
-        before = going_on.wall_time if going_on is not None else 0.0
         wall_time, seen, shared_by = before, None, 1
         try:
             for stage in solver.stages():
@@ -306,7 +276,7 @@ def scene_stages(
 
 
 def _way_on(cause: str, kept: Path, output: Path, computed: Scene) -> str:
-    """Where the frames are, and how to go on if a continuation can do what the cause asks for."""
+    """Where the frames are, and how to go on if a restart can do what the cause asks for."""
     command = f"They are kept: sgns simulate continue_from={kept} output={output}"
     if "scene.courant" in cause:
         return f"{command} scene.courant={0.5 * computed.courant:g} goes on from there with half the step"

@@ -24,7 +24,7 @@ from mpm_warp.batch import all_together
 from mpm_warp.launch import Work
 from sgns.clock import elapsed
 from sgns.config import UserError, flattened
-from sgns.data.files import claimed, remove_leftovers
+from sgns.data.files import file_lock, remove_abandoned
 from sgns.data.run import Run
 from sgns.simulate.campaign import (
     Campaign,
@@ -40,7 +40,7 @@ from sgns.simulate.scene import decision_summary, recorded
 
 log = logging.getLogger(__name__)
 
-_MEASURED = 0.3  # seconds of stepping, at least, that the first estimate rests on
+_MEASURED = 0.3  # seconds of simulating, at least, that the first estimate rests on
 _MEMORY = 600.0  # seconds after which what was seen of the speed counts 1/e
 _LOG_EVERY = 60.0  # seconds between lines about the progress where there is no terminal for a bar
 
@@ -79,11 +79,11 @@ def simulate_campaign(
     physics = campaign.physics  # before anything is written: what was asked for may be impossible
     campaign.record()
     costs = {name: run_cost(scene) for name, scene in campaign.scenes.items()}
-    by_length = sorted(costs, key=lambda name: costs[name].work, reverse=True)
+    by_length = sorted(costs, key=lambda name: costs[name].particle_steps, reverse=True)
     share = by_length[shard::shards]
     missing = [name for name in share if not _done(campaign.file(name), campaign.scenes[name])]
     for name in set(share) - set(missing):  # nobody will write these again
-        remove_leftovers(campaign.file(name))
+        remove_abandoned(campaign.file(name))
     part = f", {len(share)} of them in shard {shard} of {shards}" if shards > 1 else ""
     total = f"{len(campaign.scenes)} runs{part}"
     log.info("dataset %s in %s: %s, %d to do", campaign.name, campaign.path, total, len(missing))
@@ -96,8 +96,8 @@ def simulate_campaign(
     _compile(campaign, missing, device)
     workers = min(workers or (1 if device != "cpu" else len(os.sched_getaffinity(0))), len(missing))
     batch = min(batch, math.ceil(len(missing) / workers))
-    production = _Production(campaign, {name: costs[name] for name in missing}, device, workers, batch)
-    failed = production.make_all(f"about {size_words(size)} of disk")
+    pool = _Workers(campaign, {name: costs[name] for name in missing}, device, workers, batch)
+    failed = pool.make_all(f"about {size_words(size)} of disk")
     if failed:
         name, message = next(iter(failed.items()))
         raise UserError(
@@ -106,28 +106,27 @@ def simulate_campaign(
 
 
 def _compile(campaign: Campaign, names: list[str], device: str) -> None:
-    """Compile the kernels of every kind of scene, once; the processes find them in Warp's cache.
+    """Compile the kernels that the scenes need, once; the processes find them in Warp's cache.
 
     Kernels can differ only where scenes differ in their effects or in something else than the size of a number.
     """
-    kinds = {}
+
+    def switch(value: Any) -> Any:
+        if isinstance(value, (int, float)):
+            return bool(value)
+        return value if isinstance(value, str) else type(value)
+
+    with_other_kernels = {}
     for name in names:
-        scene = campaign.scenes[name]
-        chosen = {
-            key: value
-            if isinstance(value, str)
-            else bool(value)
-            if isinstance(value, (int, float))
-            else type(value)
-            for key, value in flattened(scene.to_dict()).items()
-            if key != "name"
-        }
-        kinds.setdefault((frozenset(chosen.items()), campaign.physics[name][0]), scene)
-    for (_, physics), scene in kinds.items():
-        next(Solver(scene, physics, device, campaign.precision).frames())
+        scene, effects = campaign.scenes[name], campaign.physics[name][0]
+        settings = flattened(scene.to_dict() | {"name": ""})
+        switches = frozenset((key, switch(value)) for key, value in settings.items())
+        with_other_kernels.setdefault((switches, effects), scene)
+    for (_, effects), scene in with_other_kernels.items():
+        next(Solver(scene, effects, device, campaign.precision).frames())
 
 
-class _Production:
+class _Workers:
     """Worker processes, what they have done, and how long the rest will take."""
 
     def __init__(
@@ -143,7 +142,7 @@ class _Production:
         self._pool = ProcessPoolExecutor(workers, context, _start_worker, shared)
         self._jobs: dict[str, Future[dict[str, tuple[str, str]]]] = {}
         # What the estimates rest on: particle-steps made, and the seconds that they took, of each run for itself.
-        self._work_seen, self._seconds_seen = 0.0, 0.0
+        self._steps_seen, self._seconds_seen = 0.0, 0.0
 
     def make_all(self, disk: str) -> dict[str, str]:
         """Make the runs; returns the message of each that could not be made."""
@@ -164,10 +163,9 @@ class _Production:
                 for process in multiprocessing.active_children():
                     process.terminate()
                 raise
-        elsewhere = sum(kind == "elsewhere" for kind, _ in outcomes.values())
-        if elsewhere:
+        if elsewhere := sum(outcome == "elsewhere" for outcome, _ in outcomes.values()):
             log.info("runs left to another process that is making them or has made them: %d", elsewhere)
-        return {name: message for name, (kind, message) in outcomes.items() if kind == "failed"}
+        return {name: message for name, (outcome, message) in outcomes.items() if outcome == "failed"}
 
     def _measure(self) -> None:
         """Let all workers step runs from all over the list for a moment, at the same time."""
@@ -183,7 +181,7 @@ class _Production:
         for share, trial in zip(shares, trials, strict=True):
             frames, seconds = trial.result()
             for name, count in zip(share, frames, strict=True):
-                self._work_seen += count * self.costs[name].work_per_frame
+                self._steps_seen += count * self.costs[name].steps_per_frame
                 self._seconds_seen += seconds
 
     def _submit(self) -> None:
@@ -193,25 +191,22 @@ class _Production:
             scene, file = _described(self.campaign.scenes[name]), self.campaign.file(name)
             effects, decisions = self.campaign.physics[name]
             jobs.append((name, index, scene, file, effects, recorded(decisions)))
-        if self.batch > 1:
-            shares = [jobs[worker :: self.workers] for worker in range(self.workers)]
-        else:
-            shares = [[job] for job in jobs]
-        for share in shares:
+        shares = self.workers if self.batch > 1 else len(jobs)
+        for share in (jobs[number::shares] for number in range(shares)):
             future = self._pool.submit(_make_share, share, self.batch, *self._settings)
             self._jobs.update((name, future) for name, *_ in share)
 
     def _follow(self) -> None:
         """Wait for all runs, keeping the bar and the estimate up to date."""
-        total = sum(cost.work for cost in self.costs.values())
+        total = sum(cost.particle_steps for cost in self.costs.values())
         made, last, last_line = 0, time.monotonic(), time.monotonic()
         layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
         with tqdm(total=total, desc=f"{self.at_once} at once", bar_format=layout, disable=None) as bar:
             while rest := self._rest():
                 time.sleep(0.2)
-                now, work = time.monotonic(), self._work_made()
-                self._see(work - made, elapsed(last, now), busy=min(self.at_once, len(rest)))
-                made, last = work, now
+                now, steps = time.monotonic(), self._steps_made()
+                self._see(steps - made, elapsed(last, now), busy=min(self.at_once, len(rest)))
+                made, last = steps, now
                 done = f"{len(self._jobs) - len(rest)} of {len(self._jobs)} runs"
                 bar.set_postfix_str(f"{done}, {self._left()} left", refresh=False)
                 bar.update(total - sum(rest.values()) - bar.n)
@@ -221,35 +216,35 @@ class _Production:
             bar.set_postfix_str(f"{len(self._jobs)} of {len(self._jobs)} runs", refresh=False)
             bar.update(total - bar.n)
 
-    def _see(self, work: float, elapsed: float, busy: int) -> None:
+    def _see(self, steps: float, elapsed: float, busy: int) -> None:
         """Add the particle-steps of `busy` runs in the last `elapsed` seconds; a machine's speed may change."""
         kept = math.exp(-elapsed / _MEMORY)
-        self._work_seen = kept * self._work_seen + work
+        self._steps_seen = kept * self._steps_seen + steps
         self._seconds_seen = kept * self._seconds_seen + elapsed * busy
 
-    def _work_made(self) -> int:
+    def _steps_made(self) -> int:
         """Particle-steps in all frames so far; a run's first frame takes none."""
         counts = zip(self._frames_done, self.costs.values(), strict=True)
-        return sum(max(0, frames - 1) * cost.work_per_frame for frames, cost in counts)
+        return sum(max(0, frames - 1) * cost.steps_per_frame for frames, cost in counts)
 
     def _rest(self) -> dict[str, int]:
         """Particle-steps that are left of every run that is not finished."""
         runs = zip(self.costs.items(), self._frames_done, self._ended, strict=True)
         return {
-            name: cost.work - max(0, frames - 1) * cost.work_per_frame
+            name: cost.particle_steps - max(0, frames - 1) * cost.steps_per_frame
             for (name, cost), frames, ended in runs
             if name not in self._jobs or not (ended or self._jobs[name].done())
         }
 
     def _left(self) -> str:
         """Time to the end of the last run at the speed seen so far, in words."""
-        if not self._work_seen:
+        if not self._steps_seen:
             return "an unknown time"
         rest = self._rest()
         begun = {name for name, frames in zip(self.costs, self._frames_done, strict=True) if frames}
-        running = [work for name, work in rest.items() if name in begun][: self.at_once]
-        waiting = [work for name, work in rest.items() if name not in begun]
-        rate = self._work_seen / self._seconds_seen
+        running = [steps for name, steps in rest.items() if name in begun][: self.at_once]
+        waiting = [steps for name, steps in rest.items() if name not in begun]
+        rate = self._steps_seen / self._seconds_seen
         return duration_words(finishing_time(waiting, running, self.at_once) / rate)
 
 
@@ -334,23 +329,21 @@ def _make(
     def count_frame() -> None:
         _frames_done[index] += 1
 
+    settings = {
+        "effects": effects,
+        "reasons": reasons,
+        "seed": seed,
+        "device": device,
+        "precision": precision,
+    }
     outcome = "made", ""
     try:
         scene = Scene.from_dict(*described)
-        with claimed(output) as ours:
+        with file_lock(output) as ours:
             if not ours or _done(output, scene):
                 outcome = "elsewhere", ""
             else:
-                for stage in scene_stages(
-                    scene,
-                    output,
-                    effects=effects,
-                    reasons=reasons,
-                    seed=seed,
-                    device=device,
-                    precision=precision,
-                    progress=count_frame,
-                ):
+                for stage in scene_stages(scene, output, progress=count_frame, **settings):
                     if isinstance(stage, Work):
                         yield stage
     except (UserError, SceneError, SolverStopped) as error:

@@ -21,16 +21,16 @@ from tqdm import tqdm
 from sgns.clock import elapsed
 from sgns.model.dynamics import Dynamics
 from sgns.model.features import BodyTrack, body_track, context_of
-from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
 from sgns.train.windows import filled, pad_start, require_finite
 
 if TYPE_CHECKING:
     from sgns.reduction.reduce import ReducedRun
+    from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
 
 log = logging.getLogger(__name__)
 
 
-# --- How well the dynamics follow the validation runs, all at once: what a checkpoint is chosen by ------
+# --- How well dynamics follow the validation runs, all at once: what every kind of model is chosen by -----
 # Letters: B runs, T frames of the longest run, d history positions, r modes.
 
 
@@ -56,14 +56,9 @@ class RolloutScore(NamedTuple):
 
 
 class ValidationRollouts:
-    """Runs to be rolled out side by side.
+    """Runs to be rolled out side by side; shorter ones are filled up with their last frame, which is not counted.
 
-    Args:
-        runs: Reduced runs; shorter ones are filled up with their last frame, which is not counted.
-        num_modes: r.
-        history: d.
-        body_nodes: "pose" or "points".
-        context: Keys of the scene whose numbers the dynamics are told.
+    `context` are the keys of the scene whose numbers the dynamics are told.
     """
 
     def __init__(
@@ -155,7 +150,7 @@ class ValidationRollouts:
         return states, force, found
 
 
-# --- What is seen of a training: rollouts of the validation runs, checkpoints, TensorBoard, a progress bar
+# --- On the way: rollouts of the validation runs, checkpoints, TensorBoard, a progress bar -----------------
 
 
 class RolloutValidation(L.Callback):
@@ -165,10 +160,7 @@ class RolloutValidation(L.Callback):
     It is done between steps instead of in Lightning's validation loop, so that the last step is always judged
     and saved.
 
-    Args:
-        rollouts: The validation runs.
-        output: Folder of best.ckpt and last.ckpt.
-        settings: `validate_every`, `log_every`, `max_steps`, `batch_size`.
+    `output` is the folder of best.ckpt and last.ckpt.
     """
 
     def __init__(self, rollouts: ValidationRollouts, output: Path, settings: TrainingSettings) -> None:
@@ -187,10 +179,9 @@ class RolloutValidation(L.Callback):
         self.best = float(state_dict["best"])
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: L.Trainer, pl_module: SurrogateTraining, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Log speed and learning rate, validate when it is time."""
-        assert isinstance(pl_module, SurrogateTraining)
         step = trainer.global_step
         if self._mark is None:
             self._mark = (step, time.perf_counter())
@@ -237,11 +228,7 @@ class RolloutValidation(L.Callback):
 
 
 class StepProgress(L.Callback):
-    """A bar over optimisation steps, only at a terminal.
-
-    Args:
-        total: Steps when complete.
-    """
+    """A bar over all optimisation steps, only at a terminal."""
 
     def __init__(self, total: int) -> None:
         self.total = total
@@ -280,16 +267,8 @@ class StepProgress(L.Callback):
 
 
 def force_figure(rollouts: ValidationRollouts, score: RolloutScore, most: int = 4) -> Figure:
-    """Force on the tool along validation runs, true and predicted.
-
-    Args:
-        rollouts: The runs with their true force.
-        score: The predicted one.
-        most: How many runs to draw.
-
-    Returns:
-        The figure; draft is -F_x, vertical F_z, in newtons over frames.
-    """
+    """Force on the tool along the first validation runs, true and predicted: draft -F_x and vertical F_z [N] over
+    frames."""
     count = min(most, len(rollouts.names))
     figure = Figure(figsize=(3.2 * count, 4.4), layout="constrained")
     axes = np.atleast_2d(figure.subplots(2, count, sharex=True, squeeze=False))

@@ -1,31 +1,57 @@
-"""The loss, the optimiser and its schedule.
+"""How networks are trained: the loss, the optimiser and its schedule, and Lightning's trainer around them.
 
 Letters: B batch, V nodes, r modes, h steps of the horizon.
 """
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Mapping
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import lightning as L
 import numpy as np
 import torch
+from lightning.pytorch.plugins import TorchCheckpointIO
 from torch import Tensor
 
+from sgns.clock import elapsed
 from sgns.config import UserError, check_fields
-from sgns.model.checkpoint import Surrogate
-from sgns.model.features import BodyTrack
+from sgns.model.checkpoint import Surrogate, load_surrogate, read_checkpoint, write_checkpoint
+from sgns.model.features import BodyTrack, moves_freely, varying_context
 from sgns.model.network_dynamics import LatentDynamics
-from sgns.train.windows import NOISE_UNITS, SCALES, Batch
+from sgns.model.settings import ModelSettings
+from sgns.train import Fit, Fitted, Task
+from sgns.train.callbacks import RolloutValidation, StepProgress, ValidationRollouts
+from sgns.train.windows import (
+    NOISE_UNITS,
+    SCALES,
+    Batch,
+    TrainingWindows,
+    WindowLoader,
+    fit_normalisation,
+)
+
+if TYPE_CHECKING:
+    from sgns.reduction.reduce import ReducedDataset, ReducedRun
+
+log = logging.getLogger(__name__)
 
 SCHEDULES = ("cosine", "exponential")
 LOSSES = ("change", "force", "torque")
 CHANGE_OF = ("free", "all")
 # A training whose loss is this many times that of its first step learns no more.
 _DIVERGED = 1e4
+_ANEW = "train anew with training.resume=false, or into another output"
+_MOMENTS = ("exp_avg", "exp_avg_sq")  # what AdamW keeps of each weight
 
 
 @dataclass(frozen=True)
@@ -124,12 +150,7 @@ class TrainingSettings:
 
 
 class SurrogateTraining(L.LightningModule):
-    """One optimisation step of a surrogate.
-
-    Args:
-        surrogate: What is trained; all of it goes into the checkpoint.
-        settings: How.
-    """
+    """One optimisation step of a surrogate, all of which goes into the checkpoint."""
 
     def __init__(self, surrogate: Surrogate, settings: TrainingSettings) -> None:
         super().__init__()
@@ -247,3 +268,227 @@ class SurrogateTraining(L.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """A resumed training knows how it began."""
         self.first_loss = checkpoint.get("first_loss")
+
+
+# --- A training from its data to its best checkpoint ---------------------------------------------------------
+
+
+def fit_network(task: Task) -> Fitted:
+    """Train a network; best.ckpt, last.ckpt and the log appear on the way."""
+    settings, output = task.settings, task.output
+    surrogate, data = prepared(
+        task.reduced, task.num_modes, task.model, settings, task.seed, task.card, task.start_from
+    )
+    rollouts = ValidationRollouts(
+        task.validation_runs,
+        task.num_modes,
+        task.model.history,
+        task.model.body_nodes,
+        surrogate.dynamics.context_keys,
+    )
+    module = SurrogateTraining(surrogate, settings)
+    last = output / "last.ckpt" if task.resumed else None
+    with quiet_lightning():
+        trainer = make_trainer(
+            task, [RolloutValidation(rollouts, output, settings), StepProgress(settings.max_steps)]
+        )
+        began = time.perf_counter()
+        if last is not None:
+            require_resumable(last, trainer, module, settings)
+        try:
+            run_trainer(trainer, module, data, last)
+        except UserError as error:
+            if not (output / "best.ckpt").exists():
+                raise
+            raise UserError(
+                f"{error}; the best checkpoint of before is kept, to go on from into another output: "
+                f"checkpoint={output / 'best.ckpt'}"
+            ) from error
+        seconds = elapsed(began, time.perf_counter())
+    score = rollouts.measure(load_surrogate(output / "best.ckpt").dynamics)
+    return Fitted(surrogate, score, seconds, {"steps": settings.max_steps})
+
+
+def prepared(
+    reduced: ReducedDataset,
+    num_modes: int,
+    model: ModelSettings,
+    settings: TrainingSettings,
+    seed: int,
+    card: dict[str, Any],
+    start_from: str | Path | None,
+) -> tuple[Surrogate, WindowLoader]:
+    """The untrained surrogate with its statistics, and its data."""
+    runs = reduced.runs("train")
+    context = tuple(varying_context(runs, model.context))
+    windows = TrainingWindows(
+        runs, num_modes, model.history, model.body_nodes, seed, settings.horizon, context
+    )
+    dynamics = LatentDynamics(model, num_modes, context, moves_freely(runs))
+    noise = fit_normalisation(
+        dynamics, windows, settings.noise, settings.noise_unit, settings.scales, settings.normalisation_floor
+    )
+    if start_from is not None:
+        given = load_surrogate(start_from)
+        other = given.dynamics
+        known = (other.settings, other.context_keys, other.predicts_body, given.basis.arrangement_hash)
+        if known != (model, context, dynamics.predicts_body, reduced.arrangement_hash):
+            raise UserError(
+                f"{start_from} has another model or another bed; use the same model.* and "
+                "dataset, or checkpoint=null"
+            )
+        if not torch.equal(given.basis.modes, reduced.basis.modes[:, :num_modes]):
+            raise UserError(
+                f"{start_from} belongs to another basis; use the dataset it was trained on, or "
+                "checkpoint=null"
+            )
+        dynamics = given.dynamics.requires_grad_(True).train()
+    surrogate = Surrogate.of(dynamics, reduced, card)
+    return surrogate, WindowLoader(windows, settings.batch_size, noise)
+
+
+def require_resumable(
+    last: Path, trainer: L.Trainer, module: SurrogateTraining, settings: TrainingSettings
+) -> None:
+    """Refuses a checkpoint that lacks, or has in odd shape, what a training goes on from.
+
+    Raises:
+        UserError: It does.
+    """
+    load_surrogate(last)
+    content = read_checkpoint(last)
+    fresh = module.configure_optimizers()
+    weights = fresh["optimizer"].param_groups[0]["params"]
+    try:
+        (optimizer,), (schedule,) = content["optimizer_states"], content["lr_schedulers"]
+        step = content["global_step"]
+        done = content["loops"]["fit_loop"]["epoch_loop.automatic_optimization.optim_progress"]
+        if type(step) is not int or not 0 <= step <= settings.max_steps:
+            raise ValueError(f"global_step is {step!r:.40}, of {settings.max_steps} steps")
+        if done["optimizer"]["step"]["total"]["completed"] != step:
+            raise ValueError("it disagrees with itself about its steps")
+        require_alike(content["loops"]["fit_loop"], trainer.fit_loop.state_dict(), "loops")
+        require_alike(optimizer["param_groups"], fresh["optimizer"].state_dict()["param_groups"], "optimiser")
+        require_alike(schedule, fresh["lr_scheduler"]["scheduler"].state_dict(), "schedule")
+        if not set(optimizer["state"]) <= set(range(len(weights))) or (step and not optimizer["state"]):
+            raise ValueError("the optimiser knows other weights")
+        for index, state in optimizer["state"].items():
+            for key, shape in (("step", ()), *((key, weights[index].shape) for key in _MOMENTS)):
+                if tuple(state[key].shape) != tuple(shape) or not bool(state[key].isfinite().all()):
+                    raise ValueError(f"{key} of weights {index} is not finite or has another shape")
+        for key, value in (
+            ("first_loss", content.get("first_loss")),
+            ("best skill", content["callbacks"]["RolloutValidation"]["best"]),
+        ):
+            if value is not None and type(value) not in (int, float):
+                raise ValueError(f"{key} is {value!r:.40}")
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise UserError(f"{last} cannot be gone on from ({reason}); {_ANEW}") from error
+
+
+def require_alike(given: Any, fresh: Any, where: str) -> None:
+    """Refuses plain values that lack keys of fresh ones, or hold another kind of value there.
+
+    Raises:
+        ValueError: Which.
+    """
+    if isinstance(fresh, (float, int)) and not isinstance(fresh, bool):
+        if isinstance(given, bool) or not isinstance(given, (float, int)) or not math.isfinite(given):
+            raise ValueError(f"{where} is {given!r:.40}, not a finite number")
+    elif type(given) is not type(fresh):
+        raise ValueError(f"{where} is a {type(given).__name__}, not a {type(fresh).__name__}")
+    elif isinstance(fresh, dict):
+        for key in fresh.keys() & given.keys():
+            require_alike(given[key], fresh[key], f"{where}.{key}")
+    elif isinstance(fresh, (list, tuple)):
+        if len(given) != len(fresh):
+            raise ValueError(f"{where} has {len(given)} entries, not {len(fresh)}")
+        for one, other in zip(given, fresh, strict=True):
+            require_alike(one, other, where)
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Lightning's way of writing checkpoints, but none is ever seen half-written.
+
+    Its own writes to the machine's folder for temporary files and moves that, which is a copy where the results are on
+    another disk.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write it whole."""
+        write_checkpoint(checkpoint, Path(path))
+
+
+def make_trainer(task: Task, callbacks: list[L.Callback]) -> L.Trainer:
+    """Lightning's trainer: by steps, one device, no validation loop of its own (see `RolloutValidation`)."""
+    settings, device = task.settings, task.device
+    if device not in ("cpu", "cuda"):
+        raise UserError(f"device is {device!r}; allowed: cpu, cuda")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device is cuda but torch finds no CUDA device; use device=cpu")
+    return L.Trainer(
+        accelerator="gpu" if device == "cuda" else "cpu",
+        devices=1,
+        max_steps=settings.max_steps,
+        max_epochs=-1,
+        logger=task.logger,
+        callbacks=callbacks,
+        log_every_n_steps=settings.log_every,
+        gradient_clip_val=settings.gradient_clip,
+        num_sanity_val_steps=0,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        plugins=[WholeCheckpoints()],
+    )
+
+
+@contextmanager
+def quiet_lightning() -> Iterator[None]:
+    """Lightning's log without its information: which devices there are, tips, that it stopped when it should."""
+    logger = logging.getLogger("lightning.pytorch")
+    before = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+def run_trainer(trainer: L.Trainer, module: SurrogateTraining, data: WindowLoader, last: Path | None) -> None:
+    """Run the trainer; an interruption stays one."""
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    handler = signal.getsignal(signal.SIGINT) if in_main_thread else None
+    with warnings.catch_warnings():
+        # Everything is in memory: there is nothing for worker processes to do.
+        warnings.filterwarnings("ignore", ".*does not have many workers.*")
+        warnings.filterwarnings("ignore", ".*GPU available but not used.*")
+        # Lightning's own use of torch, not ours.
+        warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.*")
+        path = None if last is None else str(last)
+        data.trainer = trainer
+        try:
+            trainer.fit(module, data, ckpt_path=path, weights_only=True)
+        except SystemExit as error:
+            # Lightning turns Ctrl-C into an exit of its own.
+            raise KeyboardInterrupt from error
+        except UserError:
+            raise
+        except Exception as error:
+            if last is None or module.begun:
+                raise
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise UserError(f"{last} cannot be gone on from ({reason:.200}); {_ANEW}") from error
+        finally:
+            if in_main_thread and handler is not None:
+                signal.signal(signal.SIGINT, handler)
+
+
+def stand_ins(runs: list[ReducedRun]) -> list[ReducedRun]:
+    """See `Fit.stand_ins`."""
+    log.warning("the validation split is empty; the checkpoint is chosen by rollouts of training runs")
+    return runs[:4]
+
+
+NETWORK = Fit(TrainingSettings.from_dict, stand_ins, fit_network)

@@ -1,38 +1,39 @@
-"""How `sgns train model=polynomial` comes to its coefficients."""
+"""Coefficients of `PolynomialDynamics`: ridge regression (dynamic mode decomposition with control: Proctor, Brunton,
+Kutz 2016, doi:10.1137/15M1013857) and sequentially thresholded least squares (SINDy: Brunton, Proctor, Kutz 2016,
+doi:10.1073/pnas.1517384113).
+
+Both need only the moments of monomials and outputs, summed once over all windows and noise draws. What one step
+cannot tell, the noise and the penalty, is selected by rollouts of validation runs.
+
+Letters: B batch, r modes, p inputs, m monomials, f free axes of the body, o = 3r + f + 6 outputs.
+"""
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from sgns.clock import elapsed
 from sgns.config import UserError
-from sgns.model.features import varying_context
+from sgns.model.checkpoint import Surrogate
+from sgns.model.features import moves_freely, varying_context
 from sgns.model.network import Standardiser
 from sgns.model.polynomial import PolynomialDynamics, normalised
 from sgns.model.settings import FitSettings, PolynomialSettings
+from sgns.train import Fit, Fitted, Task
 from sgns.train.callbacks import RolloutScore, ValidationRollouts
 from sgns.train.windows import Batch, TrainingWindows, generator, random_walk
 
 if TYPE_CHECKING:
     from sgns.reduction.reduce import ReducedRun
-    from sgns.train.callbacks import RolloutScore, ValidationRollouts
 
 log = logging.getLogger(__name__)
 
-
-# --- Coefficients of `PolynomialDynamics`: ridge regression (dynamic mode decomposition with control: Proct
-# Kutz 2016, doi:10.1137/15M1013857) and sequentially thresholded least squares (SINDy: Brunton, Proctor, Kutz 2016,
-# doi:10.1073/pnas.1517384113).
-#
-# Both need only the moments of monomials and outputs, summed once over all windows and noise draws. What one step
-# cannot tell, the noise and the penalty, is chosen by rollouts of validation runs.
-#
-# Letters: B batch, r modes, p inputs, m monomials, f free axes of the body, o = 3r + f + 6 outputs.
 
 # Windows whose monomials are in memory at once.
 _CHUNK = 2048
@@ -56,7 +57,7 @@ class Setting(NamedTuple):
     linear: bool = False
 
 
-class Choice(NamedTuple):
+class Selection(NamedTuple):
     """How the coefficients of each group of outputs are found.
 
     Attributes:
@@ -93,14 +94,8 @@ def unfitted(
 ) -> PolynomialDynamics:
     """Polynomials with the statistics of the training windows and all coefficients zero.
 
-    They predict that nothing moves and that the force is the training runs' mean.
-
-    Args:
-        windows: The training windows.
-        settings: What to build.
-        context: Keys of the scene whose numbers the windows hold.
-        predicts_body: Whether the body's height is predicted.
-        floor: Smallest scale as a share of the quantity's largest.
+    They predict that nothing moves and that the force is the training runs' mean. `context` are the keys of the scene
+    whose numbers the windows hold; no scale is below the share `floor` of the quantity's largest.
     """
     batch = windows.windows(windows.targets)
     modes = batch.latent.shape[2]
@@ -110,7 +105,7 @@ def unfitted(
     # prescribed, and the numbers of the context have nothing in common: no floor for these.
     centred = (True, False, True, True, False, False, True, False, True)
     floors = (floor,) * 6 + (0.0,) * 3
-    inputs = joined([Standardiser.fit(*of_group) for of_group in zip(groups, floors, centred, strict=True)])
+    inputs = Standardiser.cat(map(Standardiser.fit, groups, floors, centred))
     values = normalised(inputs, groups)
     used = (values.std(0) > _STILL).nonzero()[:, 0]
     model = PolynomialDynamics(settings, modes, context, predicts_body, used.tolist())
@@ -135,34 +130,23 @@ def true_outputs(model: PolynomialDynamics, batch: Batch) -> list[Tensor]:
     return [velocity.flatten(1), rise, batch.force[:, 0], batch.torque[:, 0]]
 
 
-def joined(parts: Sequence[Standardiser]) -> Standardiser:
-    """Statistics of quantities side by side."""
-    return Standardiser(torch.cat([p.mean for p in parts]), torch.cat([p.scale for p in parts]))
-
-
 def moments(
     model: PolynomialDynamics, windows: TrainingWindows, noise: float = 0.0, draws: int = 2
 ) -> Moments:
-    """Moments of a model's monomials and outputs; its coefficients do not matter.
-
-    Args:
-        model: Whose library and statistics to use.
-        windows: The training windows.
-        noise: As in `Setting`.
-        draws: How often all windows are taken, with other noise each time.
-    """
+    """Moments of a model's monomials and outputs over all windows, taken `draws` times with other noise each time (see
+    `Setting`); the model's coefficients do not matter."""
     scale = noise * model.velocity.scale.unflatten(0, (-1, 3))
     body_scale = torch.zeros(1, 3, dtype=torch.float64)
     body_scale[:, model.free] = noise * model.body_displacement.scale
-    outputs = joined(model.outputs())
+    outputs = Standardiser.cat(model.outputs())
     gram = torch.zeros(2 * model.weights.shape[:1], dtype=torch.float64)
     target = torch.zeros_like(model.weights)
     for draw in range(draws):
         source, body_source = (generator(windows.seed, draw, stream) for stream in (1, 2))
-        for rows in windows.targets.split(_CHUNK):
-            shape = len(rows), windows.history
+        for targets in windows.targets.split(_CHUNK):
+            shape = len(targets), windows.history
             walks = random_walk(scale, shape, source), random_walk(body_scale, shape, body_source)
-            batch = windows.windows(rows, walks)
+            batch = windows.windows(targets, walks)
             monomials = model.monomials(batch.history, batch.shown_body, batch.context)
             gram += monomials.T @ monomials
             target += monomials.T @ normalised(outputs, true_outputs(model, batch))
@@ -186,17 +170,8 @@ def solved(gram: Tensor, target: Tensor) -> Tensor:
 
 
 def sparse(known: Moments, penalty: float, threshold: float, rounds: int = 10) -> Tensor:
-    """Ridge regression of each output, repeated without the terms that add little until none does.
-
-    Args:
-        known: Moments of the library.
-        penalty: As in `Setting`.
-        threshold: As in `Setting`.
-        rounds: Most repetitions.
-
-    Returns:
-        Coefficients, shape (m, o), most of them zero.
-    """
+    """Ridge regression of each output, repeated without the terms that add little until none does; shape (m, o), most
+    of them zero. Penalty and threshold as in `Setting`."""
     size = known.gram.diagonal().sqrt()
     weight = torch.full_like(size, penalty)
     weight[0] = 0.0
@@ -230,34 +205,22 @@ def coefficients(known: Moments, setting: Setting) -> Tensor:
 def candidates(
     known: Mapping[float, Moments], penalties: Sequence[float], threshold: float = 0.0, linear: bool = False
 ) -> dict[Setting, Tensor]:
-    """Coefficients for every penalty and noise.
-
-    Args:
-        known: Moments of one model by noise.
-        penalties: As in `Setting`.
-        threshold: As in `Setting`.
-        linear: Whether those without products of inputs are among them, too.
-    """
+    """Coefficients for every penalty and every noise that the moments of a model are known for; with `linear`
+    also those without products of inputs."""
     settings = [Setting(noise, penalty, threshold) for noise in known for penalty in penalties]
     if linear:
         settings += [setting._replace(linear=True) for setting in settings]
     return {setting: coefficients(known[setting.noise], setting) for setting in settings}
 
 
-def choose(
+def select(
     model: PolynomialDynamics, found: Mapping[Setting, Tensor], rollouts: ValidationRollouts
-) -> Choice:
+) -> Selection:
     """Give a model the best coefficients: of the modes by the skill of rollouts, then of a free body by its error
-    along the rollouts of these modes, then of force and torque by the force error along those of both.
+    along the rollouts of these modes, then of force and torque by the force error along those of both."""
 
-    Args:
-        model: Its coefficients are replaced.
-        found: From `candidates`.
-        rollouts: Of the validation runs.
-    """
-
-    def score(*choice: Setting) -> RolloutScore:
-        take(model, *(found[setting] for setting in choice))
+    def score(*selection: Setting) -> RolloutScore:
+        take(model, *(found[setting] for setting in selection))
         return rollouts.measure(model)
 
     motion = body = max(found, key=lambda setting: score(setting, setting, setting).skill)
@@ -265,7 +228,7 @@ def choose(
         body = min(found, key=lambda setting: score(motion, setting, motion).body_rmse)
     force = min(found, key=lambda setting: score(motion, body, setting).force_nrmse)
     take(model, found[motion], found[body], found[force])
-    return Choice(motion, body, force)
+    return Selection(motion, body, force)
 
 
 def take(model: PolynomialDynamics, motion: Tensor, body: Tensor, force: Tensor) -> None:
@@ -274,26 +237,28 @@ def take(model: PolynomialDynamics, motion: Tensor, body: Tensor, force: Tensor)
     model.weights.copy_(torch.cat([motion[:, :modes], body[:, modes:-6], force[:, -6:]], dim=1))
 
 
-def refitted(model: PolynomialDynamics, windows: TrainingWindows, choice: Choice, draws: int = 2) -> None:
-    """Give a model the coefficients of settings that `choose` found on a part of these windows."""
-    known = {noise: moments(model, windows, noise, draws) for noise in {setting.noise for setting in choice}}
-    take(model, *(coefficients(known[setting.noise], setting) for setting in choice))
+def refitted(
+    model: PolynomialDynamics, windows: TrainingWindows, selection: Selection, draws: int = 2
+) -> None:
+    """Give a model the coefficients of settings that `select` found on a part of these windows."""
+    known = {noise: moments(model, windows, noise, draws) for noise in {of.noise for of in selection}}
+    take(model, *(coefficients(known[setting.noise], setting) for setting in selection))
 
 
-# --- How `sgns train model=polynomial` comes to its coefficients ----------------------------------------
+# --- From runs to a checkpoint ----------------------------------------------------------------------------
 
 
-class Fitted(NamedTuple):
+class FittedPolynomial(NamedTuple):
     """Fitted polynomials.
 
     Attributes:
         dynamics: The polynomials.
-        choice: Noise and penalty of each group of outputs.
+        selection: Noise and penalty of each group of outputs.
         score: On the runs that chose these.
     """
 
     dynamics: PolynomialDynamics
-    choice: Choice
+    selection: Selection
     score: RolloutScore
 
     def about(self) -> dict[str, Any]:
@@ -301,13 +266,13 @@ class Fitted(NamedTuple):
         groups = ("motion", "body", "force") if self.dynamics.predicts_body else ("motion", "force")
         found: dict[str, Any] = {"coefficients": self.dynamics.num_terms}
         for group in groups:
-            setting = getattr(self.choice, group)
+            setting = getattr(self.selection, group)
             degree = 1 if setting.linear else self.dynamics.settings.degree
             found[group] = {"degree": degree, "noise": setting.noise, "penalty": setting.penalty}
         return found
 
 
-def fit_polynomial(
+def best_polynomial(
     runs: Sequence[ReducedRun],
     choosing: Sequence[ReducedRun],
     num_modes: int,
@@ -315,7 +280,7 @@ def fit_polynomial(
     settings: FitSettings,
     predicts_body: bool,
     seed: int = 0,
-) -> Fitted:
+) -> FittedPolynomial:
     """Fit polynomials for every noise and penalty and take what follows some runs best.
 
     Args:
@@ -346,20 +311,38 @@ def fit_polynomial(
     rollouts = ValidationRollouts(choosing, num_modes, model.history, model.body_nodes, context)
     linear = settings.linear and model.degree > 1
     found = candidates(known, settings.penalties, linear=linear)
-    choice = choose(dynamics, found, rollouts)
+    selection = select(dynamics, found, rollouts)
     score = rollouts.measure(dynamics)
     if len(fitting) < len(runs):
         windows = windows_of(runs)
         dynamics = blank(windows)
-        refitted(dynamics, windows, choice, settings.draws)
-    return Fitted(dynamics, choice, score)
+        refitted(dynamics, windows, selection, settings.draws)
+    return FittedPolynomial(dynamics, selection, score)
 
 
-def check_start(start_from: str | Path | None, device: str) -> None:
-    """Refuses what polynomials have no use for."""
-    if start_from is not None:
+def fit_polynomial(task: Task) -> Fitted:
+    """Fit polynomials and write their checkpoint; nothing of before is of use to them."""
+    if task.start_from is not None:
         raise UserError(
-            f"checkpoint is {start_from}, but polynomials start from nothing; use checkpoint=null"
+            f"checkpoint is {task.start_from}, but polynomials start from nothing; use checkpoint=null"
         )
-    if device != "cpu":
-        raise UserError(f"device is {device}, but polynomials are fitted on the CPU; use device=cpu")
+    if task.device != "cpu":
+        raise UserError(f"device is {task.device}, but polynomials are fitted on the CPU; use device=cpu")
+    runs = task.reduced.runs("train")
+    began = time.perf_counter()
+    best = best_polynomial(
+        runs, task.validation_runs, task.num_modes, task.model, task.settings, moves_freely(runs), task.seed
+    )
+    seconds = elapsed(began, time.perf_counter())
+    surrogate = Surrogate.of(best.dynamics, task.reduced, task.card)
+    surrogate.save(task.output / "best.ckpt")
+    return Fitted(surrogate, best.score, seconds, best.about())
+
+
+def stand_ins(runs: list[ReducedRun]) -> list[ReducedRun]:
+    """See `Fit.stand_ins`."""
+    log.warning("the validation split is empty; every third training run chooses noise and penalty")
+    return runs[::3]
+
+
+POLYNOMIAL = Fit(FitSettings.from_dict, stand_ins, fit_polynomial)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 # F stacked frames of all runs.
 
 # Streams of random numbers that must not be the same.
-_CHOICE, _NOISE, _BODY_NOISE = 0, 1, 2
+_SAMPLING, _NOISE, _BODY_NOISE = 0, 1, 2
 
 
 class NoiseScales(NamedTuple):
@@ -97,7 +98,7 @@ class TrainingWindows:
         num_modes: r.
         history: d.
         body_nodes: "pose" or "points".
-        seed: Of choice and noise.
+        seed: Of sampling and noise.
         horizon: h, targets of a window.
         context: Keys of the scene whose numbers go with every window.
     """
@@ -153,15 +154,15 @@ class TrainingWindows:
         """W, the number of windows."""
         return len(self.targets)
 
-    def windows(self, rows: Tensor, noise: tuple[Tensor, Tensor] | None = None) -> Batch:
+    def windows(self, targets: Tensor, noise: tuple[Tensor, Tensor] | None = None) -> Batch:
         """The windows whose first targets are the given stacked frames, shape (B,), of runs with the same number of
         body nodes; without noise unless the offsets of modes and body are given."""
-        frames = rows[:, None] + torch.arange(-self.history, self.horizon)
+        frames = targets[:, None] + torch.arange(-self.history, self.horizon)
         latent = self.latent[frames]
-        nodes = int(self.body_nodes[self.of_run[rows[0]]])
+        nodes = int(self.body_nodes[self.of_run[targets[0]]])
         body = BodyTrack(*(part[frames[:, 1:], :nodes] for part in self.body))
         if noise is None:
-            shown = len(rows), self.history
+            shown = len(targets), self.history
             noise = latent.new_zeros(*shown, *latent.shape[2:]), latent.new_zeros(*shown, nodes, 3)
         last = frames[:, self.history :]
         return Batch(
@@ -171,35 +172,23 @@ class TrainingWindows:
             noise[1],
             self.force[last],
             self.torque[last],
-            self.context[self.of_run[rows]],
+            self.context[self.of_run[targets]],
         )
 
     def batch(self, step: int, size: int, noise: NoiseScales) -> Batch:
-        """The batch of a step: a function of (seed, step) and nothing else, so that resuming changes nothing.
-
-        Args:
-            step: Optimisation step from 0.
-            size: B.
-            noise: Its deviations.
-        """
-        chance = generator(self.seed, step, _CHOICE)
+        """The batch of an optimisation step from 0: a function of (seed, step) and nothing else, so that resuming
+        changes nothing."""
+        chance = generator(self.seed, step, _SAMPLING)
         sizes = torch.tensor([float(len(group)) for group in self.groups])
         group = self.groups[int(torch.multinomial(sizes, 1, generator=chance))]
-        rows = group[torch.randint(len(group), (size,), generator=chance)]
-        nodes = int(self.body_nodes[self.of_run[rows[0]]])
+        targets = group[torch.randint(len(group), (size,), generator=chance)]
+        nodes = int(self.body_nodes[self.of_run[targets[0]]])
         shape = (size, self.history)
         offsets = random_walk(noise.latent, shape, generator(self.seed, step, _NOISE))
         body_offsets = random_walk(
             noise.body.expand(nodes, 3), shape, generator(self.seed, step, _BODY_NOISE)
         )
-        return self.windows(rows, (offsets, body_offsets))
-
-    def batches(self, size: int, noise: NoiseScales, first: int = 0) -> Iterator[Batch]:
-        """Batches without end, from step `first`."""
-        step = first
-        while True:
-            yield self.batch(step, size, noise)
-            step += 1
+        return self.windows(targets, (offsets, body_offsets))
 
 
 def require_finite(run: ReducedRun) -> None:
@@ -254,43 +243,22 @@ def random_walk(scale: Tensor, shape: tuple[int, int], source: torch.Generator) 
     return torch.nn.functional.pad(torch.cumsum(velocity, dim=1), (0, 0, 0, 0, 1, 0))
 
 
-class WindowDataModule(L.LightningDataModule):
-    """Hands the trainer an endless stream of batches that starts at the step it stands at.
+class WindowLoader:
+    """Batches without end, from the step that a trainer, resumed or not, stands at.
 
     Everything is in memory and a batch is a few tensor look-ups, so there are no worker processes.
-
-    Args:
-        windows: The training windows.
-        batch_size: B.
-        noise: Deviations of its noise.
     """
 
     def __init__(self, windows: TrainingWindows, batch_size: int, noise: NoiseScales) -> None:
-        super().__init__()
         self.training_windows = windows
         self.batch_size = batch_size
         self.noise = noise
-
-    def train_dataloader(self) -> StepBatches:
-        """Called by the trainer once its step is known, resumed or not."""
-        return StepBatches(self)
-
-
-class StepBatches:
-    """Iterates batches from the trainer's step on.
-
-    Args:
-        module: Whose windows and trainer to use.
-    """
-
-    def __init__(self, module: WindowDataModule) -> None:
-        self.module = module
+        self.trainer: L.Trainer | None = None
 
     def __iter__(self) -> Iterator[Batch]:
-        """Endless."""
-        trainer = self.module.trainer
-        first = 0 if trainer is None else trainer.global_step
-        return self.module.training_windows.batches(self.module.batch_size, self.module.noise, first)
+        first = 0 if self.trainer is None else self.trainer.global_step
+        for step in itertools.count(first):
+            yield self.training_windows.batch(step, self.batch_size, self.noise)
 
 
 # --- Scales of all quantities, from the training windows, and of the noise that is added to them --------
@@ -317,19 +285,16 @@ def fit_normalisation(
     Args:
         dynamics: Filled in place.
         windows: The training windows.
-        noise: Deviation of the velocity noise.
+        noise: Deviation of the velocity noise; the deviations of modes and body are returned.
         noise_unit: "velocity": as a share of the velocity scale of each mode and axis; "metre": [m].
         scales: "per_mode" or "pooled".
         floor: Smallest scale as a share of the quantity's largest.
-
-    Returns:
-        Deviations of the velocity noise.
     """
-    rows = windows.targets
-    position, velocity, change = motions(windows.latent, rows)
-    body_position, body_velocity, body_change = map(nodes, motions(windows.body.position, rows))
+    targets = windows.targets
+    position, velocity, change = motions(windows.latent, targets)
+    body_position, body_velocity, body_change = map(nodes, motions(windows.body.position, targets))
     free = free_axes(dynamics.predicts_body, dynamics.settings.body_nodes)
-    motion = nodes(windows.body.motion[rows])
+    motion = nodes(windows.body.motion[targets])
 
     if scales == "pooled":
         # Rigid points and modes together; the pose node's rotation has a scale of its own.
@@ -337,7 +302,7 @@ def fit_normalisation(
         dynamics.position, dynamics.body_position = pooled(position, body_position)
         dynamics.velocity, moved = pooled(velocity, body_velocity)
         turned = Standardiser.fit(motion[:, 3:], floor, centred=True)
-        dynamics.body_motion = joined(moved, turned) if pose else moved
+        dynamics.body_motion = Standardiser.cat([moved, turned]) if pose else moved
         clean, body_clean = pooled(change, body_change)
     else:
         dynamics.position = Standardiser.fit(position, floor)
@@ -345,7 +310,9 @@ def fit_normalisation(
         dynamics.body_position = Standardiser.fit(body_position, floor)
         # Displacement [m] and rotation [rad] have their own largest scale each.
         parts = motion.split(3, dim=-1)
-        dynamics.body_motion = joined(*(Standardiser.fit(part, floor, centred=False) for part in parts))
+        dynamics.body_motion = Standardiser.cat(
+            Standardiser.fit(part, floor, centred=False) for part in parts
+        )
         clean = Standardiser.fit(change, floor, centred=False)
         # No floor here: a wheel rises and sinks far less than it drives, and that little is to be predicted.
         body_clean = Standardiser.fit(body_change, centred=False)
@@ -361,17 +328,17 @@ def fit_normalisation(
         # The target contains the correction of the velocity's noise; without either it would be constant.
         dynamics.change = widened(clean, scale.latent)
         dynamics.body_change = widened(body_clean, scale.body)
-    dynamics.body_orientation = Standardiser.fit(nodes(windows.body.orientation[rows - 1]), floor)
-    dynamics.force = Standardiser.fit(windows.force[rows], floor)
-    dynamics.torque = Standardiser.fit(windows.torque[rows], floor)
-    dynamics.context = Standardiser.fit(windows.context[windows.of_run[rows]])
+    dynamics.body_orientation = Standardiser.fit(nodes(windows.body.orientation[targets - 1]), floor)
+    dynamics.force = Standardiser.fit(windows.force[targets], floor)
+    dynamics.torque = Standardiser.fit(windows.torque[targets], floor)
+    dynamics.context = Standardiser.fit(windows.context[windows.of_run[targets]])
     return scale
 
 
-def motions(position: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def motions(position: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Where things are before the given frames, their velocity into them, and how that changes; (W, r or N, 3)."""
-    velocity = position[rows] - position[rows - 1]
-    return position[rows - 1], velocity, velocity - (position[rows - 1] - position[rows - 2])
+    velocity = position[targets] - position[targets - 1]
+    return position[targets - 1], velocity, velocity - (position[targets - 1] - position[targets - 2])
 
 
 def nodes(values: Tensor) -> Tensor:
@@ -385,11 +352,6 @@ def pooled(modes: Tensor, body: Tensor) -> tuple[Standardiser, Standardiser]:
     both = Standardiser.fit(torch.cat([modes.flatten(0, 1), body]))
     count = modes.shape[1]
     return Standardiser(both.mean.expand(count, 3), both.scale.expand(count, 3)), both
-
-
-def joined(*parts: Standardiser) -> Standardiser:
-    """Of several quantities side by side."""
-    return Standardiser(torch.cat([p.mean for p in parts]), torch.cat([p.scale for p in parts]))
 
 
 def widened(clean: Standardiser, noise: Tensor) -> Standardiser:

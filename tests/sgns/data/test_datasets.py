@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from functools import cache
 from types import SimpleNamespace
-from unittest import mock
 
 import pytest
 from hydra import compose, initialize_config_module
@@ -17,29 +15,31 @@ from sgns.simulate import command as simulate
 from sgns.simulate.campaign import plan, run_cost
 
 
-@cache
-def planned(name, *overrides):
+@pytest.fixture
+def planned(monkeypatch, tmp_path):
     """The campaign of `sgns simulate dataset=<name> <overrides>`."""
-    task = [f"dataset={name}", *overrides]
-    current = SimpleNamespace(overrides=SimpleNamespace(task=task))
-    with (
-        mock.patch.object(simulate.HydraConfig, "get", lambda: current),
-        initialize_config_module("sgns.conf", version_base="1.3"),
-    ):
-        cfg = compose("simulate", task)
-        settings = OmegaConf.to_container(cfg.dataset, resolve=True)
-        return plan(settings, simulate._base_scene(settings), {}, "float32", cfg.seed)
+
+    def planned(name, *overrides):
+        task = [f"dataset={name}", *overrides]
+        current = SimpleNamespace(overrides=SimpleNamespace(task=task))
+        monkeypatch.setattr(simulate.HydraConfig, "get", lambda: current)
+        with initialize_config_module("sgns.conf", version_base="1.3"):
+            cfg = compose("simulate", task)
+            settings = OmegaConf.to_container(cfg.dataset, resolve=True)
+            return plan(settings, simulate._base_scene(settings), {}, "float32", cfg.seed)
+
+    return planned
 
 
 @pytest.mark.parametrize("name", [name for name in options_of("dataset") if name != "published"])
-def test_every_dataset_has_valid_scenes_that_share_a_bed(name):
+def test_every_dataset_has_valid_scenes_that_share_a_bed(planned, name):
     campaign = planned(name)
     assert campaign.name == name
     assert len({scene.arrangement_hash for scene in campaign.scenes.values()}) == 1
     assert all(count > 0 for count in Counter(campaign.split.values()).values())
 
 
-def test_the_papers_excavation():
+def test_the_papers_excavation(planned):
     campaign = planned("paper_excavation")
     scenes = list(campaign.scenes.values())
     assert len({(s.motion, s.rake, s.depth, s.speed) for s in scenes}) == 250
@@ -48,7 +48,7 @@ def test_the_papers_excavation():
     assert sum(run_cost(s).size for s in scenes) == pytest.approx(250 * 46e6, rel=0.01)
 
 
-def test_the_desktop_excavation_is_part_of_the_papers():
+def test_the_desktop_excavation_is_part_of_the_papers(planned):
     whole = {(s.motion, s.rake, s.depth, s.speed) for s in planned("paper_excavation").scenes.values()}
     part = {(s.motion, s.rake, s.depth, s.speed) for s in planned("desktop_excavation").scenes.values()}
     assert len(part) == 60 and part < whole
@@ -56,7 +56,18 @@ def test_the_desktop_excavation_is_part_of_the_papers():
         assert min(Counter(values).values()) >= 12
 
 
-def test_the_command_line_comes_after_what_the_dataset_changes():
+@pytest.mark.parametrize(("name", "runs"), [("paper_wheel", 243), ("desktop_wheel", 60), ("quick_wheel", 16)])
+def test_the_wheels(planned, name, runs):
+    scenes = planned(name).scenes.values()
+    assert len(scenes) == runs
+    if name == "paper_wheel":
+        small = {s.load for s in scenes if s.diameter == 0.05}
+        assert sorted(small) == pytest.approx([100 / 9, 164 / 9, 225 / 9])
+        assert {s.width for s in scenes if s.diameter == 0.30} == {0.125}
+        assert {round(1e3 * s.speed, 6) for s in scenes} == {15.6, 12.0, 5.85}
+
+
+def test_the_command_line_comes_after_what_the_dataset_changes(planned):
     def recorded(*overrides):
         return next(iter(planned("desktop_excavation", *overrides).scenes.values())).bed.store_every
 
@@ -65,6 +76,6 @@ def test_the_command_line_comes_after_what_the_dataset_changes():
     assert recorded("dataset.change={bed.store_every: 4}") == 4
 
 
-def test_a_change_that_is_no_group_is_refused():
+def test_a_change_that_is_no_group_is_refused(planned):
     with pytest.raises(UserError, match=r"dataset\.change is 3; it must be a group"):
         planned("desktop_excavation", "dataset.change=3")

@@ -1,38 +1,54 @@
-"""A claim on a file: one process has it, and it ends with that process."""
+"""Files: locked by one process, whole or not there, and read within bounds."""
 
 from __future__ import annotations
 
+import errno
+import io
 import os
+import random
 import socket
 import subprocess
 import sys
 import threading
+import time
+import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sgns.config import UserError
-from sgns.data.files import claimed, claimed_in_turn, only_here, whole_file, write_whole
+from sgns.data.files import (
+    MOST_OF_ARRAYS,
+    file_lock,
+    only_here,
+    read_arrays,
+    read_json,
+    read_table,
+    read_text,
+    whole_file,
+    write_whole,
+)
 from sgns_testing.runs import make_run, make_writer, random_frame
 
-# --- A claim on a file: one process has it, and it ends with that process -------------------------------
+# --- A lock on a file: one process has it, and it ends with that process --------------------------------
 
 pytest.importorskip("fcntl", reason="this system has no file locks")
-# Claims the file named on the command line, says so and waits for a line.
+# Locks the file named on the command line, says so and waits for a line.
 HOLD = """
 import sys, pathlib
-from sgns.data.files import claimed
-with claimed(pathlib.Path(sys.argv[1])) as ours:
+from sgns.data.files import file_lock
+with file_lock(pathlib.Path(sys.argv[1])) as ours:
     print(ours, flush=True)
     sys.stdin.readline()
 """
-# Adds 1 to a number in a file whenever it has the claim; a second process in between would lose a count.
+# Adds 1 to a number in a file whenever it has the lock; a second process in between would lose a count.
 COUNT = """
 import sys, pathlib
-from sgns.data.files import claimed
+from sgns.data.files import file_lock
 path, done = pathlib.Path(sys.argv[1]), 0
 while done < 200:
-    with claimed(path) as ours:
+    with file_lock(path) as ours:
         if ours:
             path.write_text(str(int(path.read_text()) + 1))
             done += 1
@@ -45,27 +61,27 @@ def start(code, path):
     )
 
 
-def test_another_process_cannot_claim_until_the_first_ends(tmp_path):
+def test_another_process_cannot_lock_until_the_first_ends(tmp_path):
     path = tmp_path / "runs" / "a.h5"
     with start(HOLD, path) as holder:
         assert holder.stdout.readline() == "True\n"
-        with claimed(path) as ours:
+        with file_lock(path) as ours:
             assert not ours
-        with claimed(path.with_name("b.h5")) as ours:
+        with file_lock(path.with_name("b.h5")) as ours:
             assert ours
         holder.kill()  # it leaves its lock file behind, without the lock
-    with claimed(path) as ours:
+    with file_lock(path) as ours:
         assert ours
     assert list(path.parent.iterdir()) == []
 
 
-def test_an_error_gives_the_claim_back(tmp_path):
-    with pytest.raises(RuntimeError), claimed(tmp_path / "a.h5"):
+def test_an_error_gives_the_lock_back(tmp_path):
+    with pytest.raises(RuntimeError), file_lock(tmp_path / "a.h5"):
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
 
 
-def test_claims_exclude_each_other(tmp_path):
+def test_locks_exclude_each_other(tmp_path):
     path = tmp_path / "count"
     path.write_text("0")
     processes = [start(COUNT, path) for _ in range(3)]
@@ -90,14 +106,25 @@ def test_who_asks_second_hears_who_is_at_it(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_claim_in_turn_waits(tmp_path):
+def test_a_lock_may_be_waited_for(tmp_path):
     path = tmp_path / "a"
     with start(HOLD, path) as holder:
         assert holder.stdout.readline() == "True\n"
         threading.Timer(0.3, holder.stdin.close).start()
-        with claimed_in_turn(path):
+        with file_lock(path, wait=True):
             assert holder.stdin.closed
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_system_without_locks_gives_everybody_one(tmp_path, monkeypatch):
+    def flock(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with file_lock(tmp_path / "a") as ours, file_lock(tmp_path / "a") as theirs:
+        assert ours and theirs
+    write_whole(tmp_path / "a", "whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: os.symlink("file", path)])
@@ -112,7 +139,7 @@ def test_what_is_no_lock_file_is_not_used_as_one(tmp_path, make):
     assert (tmp_path / "file").read_text() == "mine"
 
 
-# ---  ---------------------------------------------------------------------------------------------------
+# --- A file is replaced whole, and only by a plain file ------------------------------------------------
 
 
 def test_a_file_is_replaced_whole(tmp_path):
@@ -238,7 +265,7 @@ def test_a_disk_that_fills_up_at_any_moment(tmp_path, limit):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs file locks")
-def test_leftovers_of_killed_processes_go_and_those_of_living_ones_stay(tmp_path):
+def test_hidden_files_of_killed_processes_go_and_those_of_living_ones_stay(tmp_path):
     with make_writer(tmp_path / "a.h5"):
         (alive,) = tmp_path.iterdir()
         host = alive.name.removeprefix(".a.h5.").rsplit("-", 2)[0]
@@ -246,8 +273,8 @@ def test_leftovers_of_killed_processes_go_and_those_of_living_ones_stay(tmp_path
         dead.wait()
         killed = tmp_path / f".a.h5.{host}-{dead.pid}-00000000.partial"
         elsewhere = tmp_path / f".a.h5.other-{dead.pid}-00000000.partial"
-        for leftover in (killed, elsewhere):
-            leftover.write_bytes(b"x")
+        for hidden in (killed, elsewhere):
+            hidden.write_bytes(b"x")
         make_run(tmp_path / "a.h5", frames=2, n=3)
         assert {p.name for p in tmp_path.iterdir()} == {"a.h5", alive.name, elsewhere.name}
 
@@ -274,3 +301,90 @@ def test_a_run_replaces_runs_only(tmp_path):
     assert (tmp_path / "f.stopped.h5").read_text() == "mine"
     names = "a.h5 b.stopped.h5 c.stopped.h5 d.stopped.h5 e.h5 f.h5 f.stopped.h5".split()
     assert sorted(path.name for path in tmp_path.iterdir()) == names
+
+
+# --- Readers of small files: whatever is there, an answer or one line, at once ---------------------------
+
+READERS = (read_text, read_json, read_table, read_arrays)
+
+
+def line_of(read, path: Path) -> str:
+    """The line with which a reader refuses a file, within two seconds."""
+    began = time.monotonic()
+    with pytest.raises(UserError) as caught:
+        read(path, "no list of tools", "make it again")
+    assert time.monotonic() - began < 2.0
+    said = str(caught.value)
+    assert str(path) in said and said.endswith("; make it again") and "\n" not in said
+    return said
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_what_is_no_file_or_never_ends(tmp_path, read) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "device").symlink_to("/dev/zero")
+    (tmp_path / "folder").mkdir()
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(1 << 40)
+    assert "pipe or device" in line_of(read, tmp_path / "pipe")
+    assert "pipe or device" in line_of(read, tmp_path / "device")
+    assert "is no list of tools (it is larger than" in line_of(read, tmp_path / "large")
+    assert "cannot read" in line_of(read, tmp_path / "folder")
+    assert "cannot read" in line_of(read, tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("read", "content", "words"),
+    [
+        (read_text, b"\xff\xfe", "decode"),
+        (read_json, b"", "Expecting value"),
+        (read_json, b'{"a": ', "Expecting value"),
+        (read_json, b"[" * 100_000, "nested too deep"),
+        (read_json, b"1" * 5000, "digits"),
+        (read_table, b"", "name columns"),
+        (read_table, b"a,a\n1,2\n", "each once"),
+        (read_table, b"a,b\n1,2\n3\n", "line 3 has 1 values"),
+        (read_table, b"a\n" + b"x" * 200_000, "field larger"),
+        (read_table, b"a" + b"\n,,,,," * 100_000, "line 2 has 6 values"),
+        (read_arrays, b"", "zip"),
+        (read_arrays, b"PK\x03\x04", "zip"),
+    ],
+)
+def test_damaged_content_is_one_line(tmp_path, read, content, words) -> None:
+    (tmp_path / "a").write_bytes(content)
+    assert words in line_of(read, tmp_path / "a")
+
+
+def test_good_files(tmp_path) -> None:
+    (tmp_path / "a.csv").write_text('\ufeffa,b\n1,"x\ny"\n\n2,z\n', encoding="utf-8")
+    assert read_table(tmp_path / "a.csv", "", "") == [{"a": "1", "b": "x\ny"}, {"a": "2", "b": "z"}]
+    (tmp_path / "a.json").write_text('{"a": [1, null]}')
+    assert read_json(tmp_path / "a.json", "", "") == {"a": [1, None]}
+    np.savez_compressed(tmp_path / "a.npz", x=np.arange(3.0))
+    assert read_arrays(tmp_path / "a.npz", "", "")["x"].tolist() == [0.0, 1.0, 2.0]
+
+
+def test_arrays_that_unfold_to_more_than_fits(tmp_path) -> None:
+    zeros = b"\0" * (1 << 20)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        with archive.open("x.npy", "w", force_zip64=True) as part:
+            for _ in range((MOST_OF_ARRAYS >> 20) + 1):
+                part.write(zeros)
+    assert "unfolds to more than" in line_of(read_arrays, tmp_path / "a.npz")
+
+
+def test_arrays_whose_headers_are_damaged(tmp_path) -> None:
+    """Parts with right check sums and wrong headers."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.arange(6.0).reshape(2, 3))
+    good, rng = buffer.getvalue(), random.Random(0)
+    for _ in range(300):
+        damaged = bytearray(good)
+        for _ in range(rng.choice([1, 1, 3])):
+            damaged[rng.randrange(80)] = rng.choice(b"0123456789(){}[]',<>f8O\x00\xff")
+        with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+            archive.writestr("x.npy", bytes(damaged))
+        try:
+            read_arrays(tmp_path / "a.npz", "no list of tools", "make it again")
+        except UserError as error:
+            assert "\n" not in str(error)

@@ -16,15 +16,15 @@ from sgns_testing.runs import make_run, make_writer, random_frame, start_positio
 @pytest.mark.parametrize(
     "frames",
     [
-        *[
+        *(
             slice(None),
             slice(3, 8),
             slice(-3, None),
             slice(None, None, 4),
             slice(None, None, -1),
             slice(5, 2),
-        ],
-        *[slice(5, 2), 3, -1, [4, 0, 0, 11], np.array([2, 1]), np.arange(12) % 3 == 0, []],
+        ),
+        *(3, -1, [4, 0, 0, 11], np.array([2, 1]), np.arange(12) % 3 == 0, []),
     ],
     ids=str,
 )
@@ -73,16 +73,12 @@ def refused(path: Path) -> str:
     return text
 
 
-def test_missing_folder_text_and_empty_files(tmp_path):
+def test_what_is_no_run_file(tmp_path):
     assert "no such run file" in refused(tmp_path / "none.h5")
     assert "is a folder" in refused(tmp_path)
-    (tmp_path / "text.h5").write_text("not a run")
-    assert "not an HDF5 file" in refused(tmp_path / "text.h5")
-    (tmp_path / "empty.h5").write_bytes(b"")
-    assert "not an HDF5 file" in refused(tmp_path / "empty.h5")
-
-
-def test_foreign_hdf5(tmp_path):
+    for content in ("not a run", ""):
+        (tmp_path / "text.h5").write_text(content)
+        assert "not an HDF5 file" in refused(tmp_path / "text.h5")
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["particles/soil/position/value"] = np.zeros((2, 3, 3))
     assert "not a run of sgns" in refused(tmp_path / "foreign.h5")

@@ -97,7 +97,9 @@ def test_a_tool_that_only_turns_moves():
 
 
 def test_outline_of_a_wheel_is_a_circle_about_its_axle():
-    wheel = SimpleNamespace(scene={"diameter": 0.15}, pose=np.array([[0.1, 0.0, 0.07, 0, 0, 0, 1.0]]))
+    wheel = SimpleNamespace(
+        scene={"kind": "wheel", "diameter": 0.15}, pose=np.array([[0.1, 0.0, 0.07, 0, 0, 0, 1.0]])
+    )
     outline = body_outline(wheel, 0)
     assert np.linalg.norm(outline - [0.1, 0.07], axis=1) == pytest.approx(0.075)
 

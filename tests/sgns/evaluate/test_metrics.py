@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from mpm_warp import Bed
+from mpm_warp import Bed, Scene
 from sgns.config import UserError
 from sgns.data import run as chunks
 from sgns.evaluate.metrics import (
@@ -90,7 +90,7 @@ def test_surface_error_of_a_thinned_bed_is_that_of_the_bed(arrangement):
         )  # a column without particles makes it NaN
 
     full = bed.filled[0]
-    thinned = full[bed.stored]
+    thinned = full[Scene(bed=bed).stored]
     assert error(thinned) == pytest.approx(error(full), rel=0.05)
     assert particle_spacing(thinned) == pytest.approx(5 ** (1 / 3) * particle_spacing(full), rel=0.05)
 
@@ -273,7 +273,7 @@ def test_body_errors_by_hand():
     moved[0, 0] = 9.0  # within the history: does not count
     moved[2:, 2] = [-0.003, 0.003, -0.003]
     moved[2:, 1] = 0.004
-    wheel = {"diameter": 0.15}
+    wheel = {"kind": "wheel"}
     errors = body_errors(SimpleNamespace(pose=poses, scene=wheel), SimpleNamespace(pose=moved), 2)
     assert errors.mse == pytest.approx(0.005**2)
     assert errors.sinkage_mae == pytest.approx(0.003)

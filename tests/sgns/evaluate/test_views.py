@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mpm_warp.scenes import Wheel
+from mpm_warp.scenes import Wheel, sinkage
 from sgns.data.run import Run
 from sgns.evaluate.figures import latent_path, subspace_view
-from sgns.evaluate.metrics import forward_force, is_wheel, sinkage
+from sgns.evaluate.metrics import forward_force, is_wheel
 from sgns.evaluate.side_view import body_corners
 from sgns.evaluate.solid_view import Camera, DepthBuffer, hull_triangles, solid_views, upper_scale
 from sgns_testing.pictures import pixels
@@ -43,7 +43,7 @@ def test_whole_bed_is_drawn_three_times_with_one_scale_of_displacement(pair):
 @pytest.mark.parametrize(
     "scene",
     [
-        {"blade": None, "diameter": 0.15, "width": 0.08},
+        {"blade": None, "kind": "wheel", "diameter": 0.15, "width": 0.08},
         {"blade": None, "kind": "body"},
         {"blade": None, "speed": 1e-12, "depth": 0.0},
     ],
@@ -161,20 +161,21 @@ REST = np.array([[0.3, 0.2, 0.1, 0.0, 0.0, 0.0, 1.0]])
 
 
 def test_forward_force_follows_the_kind_of_body():
-    assert forward_force({"diameter": 0.15}) == ("drawbar pull Fx", 1.0)
+    assert forward_force({"kind": "wheel"}) == ("drawbar pull Fx", 1.0)
     assert forward_force({"blade": {}}) == ("draft −Fx", -1.0)
-    assert is_wheel({"diameter": 0.15}) and not is_wheel({"kind": "bed"})
+    assert is_wheel({"kind": "wheel"}) and not is_wheel({"kind": "bed"})
 
 
 @pytest.mark.parametrize("grousers", [{}, {"grousers": 6, "grouser_height": 0.01, "grouser_thickness": 0.02}])
 def test_sinkage_is_that_of_the_scene(grousers):
-    scene = Wheel(**grousers)
+    scene = Wheel(clearance=0.002, **grousers)
     poses = scene.body_poses()[:5]
-    assert sinkage(scene.to_dict(), poses) == pytest.approx(scene.sinkage(poses))
+    assert sinkage(scene.to_dict(), poses) == pytest.approx(-0.002)
+    assert (sinkage(scene.to_dict(), poses) == scene.sinkage(poses)).all()
 
 
 def test_corners_of_a_wheel_lie_on_its_rims():
-    run = SimpleNamespace(scene={"diameter": 0.15, "width": 0.08}, pose=REST)
+    run = SimpleNamespace(scene={"kind": "wheel", "diameter": 0.15, "width": 0.08}, pose=REST)
     corners = body_corners(run, 0) - REST[0, :3]
     assert np.hypot(corners[:, 0], corners[:, 2]) == pytest.approx(0.075)
     assert np.abs(corners[:, 1]) == pytest.approx(0.04)

@@ -11,14 +11,14 @@ import torch
 from mpm_warp.poses import in_world_frame, rotation_matrices
 from sgns.config import UserError
 from sgns.model.features import (
-    Travel,
+    ToolMotion,
     body_track,
     build_graph,
     context_of,
     edge_indices,
     markers,
     slowest_travel,
-    stepped_frames,
+    step_frames,
 )
 from sgns_testing.runs import random_poses
 from sgns_testing.tiny import reduced
@@ -108,7 +108,7 @@ def test_what_is_no_finite_number_is_named(bad) -> None:
         context_of({"load": bad}, ["load"])
 
 
-# --- When soil takes a step: with the tool's travel, with the clock, not at all -------------------------
+# --- When soil takes a step: with the tool, with the clock, not at all ------------------------------------
 
 
 def line(*steps: float) -> np.ndarray:
@@ -118,47 +118,47 @@ def line(*steps: float) -> np.ndarray:
     return path
 
 
-def test_a_slow_tool_steps_by_its_travel() -> None:
-    frames = stepped_frames(line(*[0.3] * 10), 1, 1.0, 5)
+def test_soil_under_a_slow_tool_steps_by_the_way_it_goes() -> None:
+    frames = step_frames(line(*[0.3] * 10), 1, 1.0, 5)
     np.testing.assert_array_equal(frames, [0, 4, 8])
 
 
 @pytest.mark.parametrize("given", [1, 3, 11])
 def test_a_fast_tool_steps_in_every_frame(given) -> None:
-    np.testing.assert_array_equal(stepped_frames(line(*[1.0] * 10), given, 1.0, 5), np.arange(11))
+    np.testing.assert_array_equal(step_frames(line(*[1.0] * 10), given, 1.0, 5), np.arange(11))
 
 
 def test_soil_settles_after_a_fast_tool() -> None:
-    frames = stepped_frames(line(0.0, 0.0, 2.0, *[0.0] * 9, 0.5, 0.5), 1, 1.0, 4)
+    frames = step_frames(line(0.0, 0.0, 2.0, *[0.0] * 9, 0.5, 0.5), 1, 1.0, 4)
     np.testing.assert_array_equal(frames, [0, 3, 4, 5, 6, 14])
 
 
-def test_shaking_is_no_travel_unless_it_is_far() -> None:
-    assert len(stepped_frames(line(*[0.9, -0.9] * 10), 1, 1.0, 5)) == 1
-    assert len(stepped_frames(line(*[0.5, 0.5, -0.5, -0.5] * 5), 1, 1.0, 5)) == 11
+def test_shaking_is_no_motion_unless_it_is_far() -> None:
+    assert len(step_frames(line(*[0.9, -0.9] * 10), 1, 1.0, 5)) == 1
+    assert len(step_frames(line(*[0.5, 0.5, -0.5, -0.5] * 5), 1, 1.0, 5)) == 11
 
 
 def test_given_frames_are_all_seen_and_say_how_the_tool_moves() -> None:
     path = line(0.1, 2.0, *[0.0] * 8)
-    np.testing.assert_array_equal(stepped_frames(path, 3, 1.0, 4), [0, 1, 2, 3, 4, 5])
-    np.testing.assert_array_equal(stepped_frames(line(*[0.4] * 8), 3, 1.0, 4), [0, 1, 2, 5, 8])
+    np.testing.assert_array_equal(step_frames(path, 3, 1.0, 4), [0, 1, 2, 3, 4, 5])
+    np.testing.assert_array_equal(step_frames(line(*[0.4] * 8), 3, 1.0, 4), [0, 1, 2, 5, 8])
 
 
 def test_nothing_is_slower_than_rest() -> None:
     """Without a known pace only a tool at rest is slow."""
-    frames = stepped_frames(line(*[1e-6] * 3, *[0.0] * 6), 1, 0.0, 2)
+    frames = step_frames(line(*[1e-6] * 3, *[0.0] * 6), 1, 0.0, 2)
     np.testing.assert_array_equal(frames, [0, 1, 2, 3, 4])
 
 
-def test_turning_is_travel_of_the_points() -> None:
+def test_turning_is_motion_of_the_points() -> None:
     angle = np.radians(1.0) * np.arange(20)
     poses = np.zeros((20, 7))
     poses[:, 5], poses[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
     points = 0.2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)[:, None]
-    frames = stepped_frames(markers(poses, points), 1, 0.2 * np.radians(2.5), 5)
+    frames = step_frames(markers(poses, points), 1, 0.2 * np.radians(2.5), 5)
     np.testing.assert_array_equal(frames, np.arange(0, 20, 3))
     # A body without points shows its centre of mass only.
-    assert len(stepped_frames(markers(poses, points[:, :0]), 1, 0.01, 5)) == 1
+    assert len(step_frames(markers(poses, points[:, :0]), 1, 0.01, 5)) == 1
 
 
 def test_any_turn_of_a_tool_in_its_place_is_seen() -> None:
@@ -170,11 +170,11 @@ def test_any_turn_of_a_tool_in_its_place_is_seen() -> None:
             poses = np.zeros((4, 7))
             poses[:, 3 + axis], poses[:, 6] = np.sin(turns / 2), np.cos(turns / 2)
             path = markers(poses, in_world_frame(poses, points))
-            np.testing.assert_array_equal(stepped_frames(path, 1, 1e-4, 1), np.arange(4))
+            np.testing.assert_array_equal(step_frames(path, 1, 1e-4, 1), np.arange(4))
 
 
-def test_travel_is_not_changed_by_looking_ahead() -> None:
-    here = Travel.along(line(0.5), 1.0, 5)
+def test_motion_is_not_changed_by_looking_ahead() -> None:
+    here = ToolMotion.along(line(0.5), 1.0, 5)
     assert here.moved(line(1.5)[1]).steps and not here.moved(line(0.75)[1]).steps
     np.testing.assert_array_equal(here.stepped, line(0.5)[1])
 
@@ -197,8 +197,6 @@ def test_the_slowest_travel_is_a_pace_not_a_stop(tmp_path) -> None:
     many = [first] * 20
     assert slowest_travel([stopping, *many]) == pytest.approx(slowest_travel(many), rel=0.05)
     still = dataclasses.replace(
-        first,
-        pose=first.pose[:1].repeat(14, axis=0),
-        body_points=first.body_points[:1].repeat(14, axis=0),
+        first, pose=first.pose[:1].repeat(14, axis=0), body_points=first.body_points[:1].repeat(14, axis=0)
     )
     assert slowest_travel([still]) == 0.0

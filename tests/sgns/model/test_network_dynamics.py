@@ -16,14 +16,9 @@ from sgns.model.features import BodyTrack, body_track
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
 from sgns.train.windows import TrainingWindows, fit_normalisation
-from sgns_testing.tiny import MODEL, reduced
+from sgns_testing.tiny import MODEL
 
 # --- One latent step and whole paths: forces add up, rollouts are steps, modes have identities ----------
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 def fitted(data, body_nodes: str = "pose") -> tuple[LatentDynamics, TrainingWindows]:
@@ -104,8 +99,7 @@ def test_modes_are_told_apart(data) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
-    [("history", 1), ("hidden_layers", 0), ("body_nodes", "mesh"), ("activation", "step")],
+    ("key", "value"), [("history", 1), ("hidden_layers", 0), ("body_nodes", "mesh"), ("activation", "step")]
 )
 def test_wrong_settings_name_their_key(key, value) -> None:
     with pytest.raises(UserError, match=f"model.{key}"):

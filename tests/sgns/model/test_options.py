@@ -9,9 +9,9 @@ from omegaconf import OmegaConf
 
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
-from sgns.train.command import prepared, train
-from sgns.train.lightning_module import TrainingSettings
-from sgns_testing.tiny import MODEL, TRAINING, reduced
+from sgns.train.command import train
+from sgns.train.lightning_module import TrainingSettings, prepared
+from sgns_testing.tiny import MODEL, TRAINING
 
 OPTIONS = {
     "velocity": ({"predicts": "velocity"}, {}),
@@ -31,11 +31,6 @@ OPTIONS = {
     "fewer modes": ({}, {"fewer_modes": 1.0}),
     "exponential": ({}, {"schedule": "exponential", "decades": 4.0}),
 }
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 def module_of(data, model=None, training=None):

@@ -14,27 +14,21 @@ from sgns.model.polynomial import PolynomialDynamics, normalised, polynomial_ter
 from sgns.model.settings import PolynomialSettings
 from sgns.train.callbacks import ValidationRollouts
 from sgns.train.polynomial import (
-    Choice,
+    Selection,
     Setting,
     candidates,
-    choose,
     coefficients,
     moments,
     refitted,
     ridge,
+    select,
     sparse,
     take,
     unfitted,
 )
 from sgns.train.windows import TrainingWindows
-from sgns_testing.tiny import reduced
 
 HISTORY = 3
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 def windows_of(runs, modes: int = 4) -> TrainingWindows:
@@ -47,7 +41,7 @@ def blank(windows, degree: int) -> PolynomialDynamics:
 
 def fit(windows, degree: int, motion: Setting, force: Setting) -> PolynomialDynamics:
     model = blank(windows, degree)
-    refitted(model, windows, Choice(motion, motion, force))
+    refitted(model, windows, Selection(motion, motion, force))
     return model
 
 
@@ -247,7 +241,7 @@ def test_settings_are_chosen_by_rollouts(data) -> None:
     model = blank(windows, 1)
     known = {noise: moments(model, windows, noise) for noise in (0.0, 0.3)}
     found = candidates(known, (1e-3, 1e-1))
-    motion, _, force = choose(model, found, rollouts)
+    motion, _, force = select(model, found, rollouts)
     assert len(found) == 4
     chosen = rollouts.measure(model)
     for weights in found.values():
@@ -303,7 +297,7 @@ def wheels(data, count: int = 220, frames: int = 8):
 def fitted_wheel(runs, context) -> PolynomialDynamics:
     windows = TrainingWindows(runs, 2, HISTORY, "pose", context=context)
     model = unfitted(windows, PolynomialSettings(HISTORY, 1, ["load"]), tuple(context), predicts_body=True)
-    refitted(model, windows, Choice(*[Setting(0.0, 0.0)] * 3))
+    refitted(model, windows, Selection(*[Setting(0.0, 0.0)] * 3))
     model.bounds.copy_(torch.tensor([[-torch.inf], [torch.inf]]))
     return model
 
@@ -371,10 +365,10 @@ def test_a_free_body_is_chosen_by_its_own_error(data) -> None:
     model = unfitted(windows, PolynomialSettings(HISTORY, 1, ["load"]), ("load",), predicts_body=True)
     rollouts = ValidationRollouts(runs[-5:], 2, HISTORY, "pose", ["load"])
     found = candidates({noise: moments(model, windows, noise) for noise in (0.0, 1.0)}, (1e-4, 1.0))
-    choice = choose(model, found, rollouts)
+    selection = select(model, found, rollouts)
     best = rollouts.measure(model).body_rmse
     for setting in found:
-        take(model, found[choice.motion], found[setting], found[choice.motion])
+        take(model, found[selection.motion], found[setting], found[selection.motion])
         assert rollouts.measure(model).body_rmse >= best
     assert best < rollouts.measure(unfitted(windows, model.settings, ("load",), True)).body_rmse
 

@@ -7,12 +7,6 @@ import pytest
 
 from sgns.config import UserError
 from sgns.model.training_range import NOTEWORTHY, TrainingRange, components, widths
-from sgns_testing.tiny import reduced
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ def test_work_and_size_are_those_of_the_run(tmp_path, store_every):
     scene = Scene.from_dict(data)
     expected = run_cost(scene)
     timing = simulate_scene(scene, tmp_path / "run.h5", effects=Effects())
-    assert expected.work == timing.particle_steps
+    assert expected.particle_steps == timing.particle_steps
     assert expected.particles == 20 * 10 * 8
     assert (tmp_path / "run.h5").stat().st_size == pytest.approx(expected.size, rel=0.05)
 

@@ -18,23 +18,20 @@ from mpm_warp import (
     Plate,
     Push,
     Scene,
-    SceneError,
     Solver,
     SolverStopped,
     bodies,
     effects_for,
 )
-from mpm_warp import (
-    mesh as mesh_file,
-)
+from mpm_warp import mesh as mesh_file
 from mpm_warp.batch import all_together
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run, read_state, stopped_path
 from sgns.simulate import workers as campaign_runs
-from sgns.simulate.run import continued, simulate_scene
+from sgns.simulate.run import restart_from, simulate_scene
 from sgns.simulate.scene import recorded
-from sgns_testing.commands import SHORT, sgns
+from sgns_testing.commands import SHORT, refusal, sgns
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
 LAST = 3  # frame before the one in which the solver stops
@@ -136,7 +133,7 @@ def test_it_may_stop_again(stopped, monkeypatch):
     cfg = OmegaConf.create(
         {"continue_from": str(kept), "scene": {"courant": 0.3}, "solver": {"precision": "float32"}}
     )
-    going_on = continued(cfg, ["scene.courant=0.3", f"output={output}"])
+    restart = restart_from(cfg, ["scene.courant=0.3", f"output={output}"])
 
     def check(self, index):
         if index == LAST + 2:
@@ -144,7 +141,7 @@ def test_it_may_stop_again(stopped, monkeypatch):
 
     monkeypatch.setattr(Solver, "_check", check)
     with pytest.raises(SolverStopped, match=r"stops it again.*scene.bed.headroom=0"):
-        simulate_scene(going_on.scene, output, effects=going_on.effects, going_on=going_on)
+        simulate_scene(restart.scene, output, effects=restart.effects, restart=restart)
     with Run(kept) as run:
         assert run.frame_count == LAST + 2
         assert "stops it again" in run.stopped
@@ -153,7 +150,7 @@ def test_it_may_stop_again(stopped, monkeypatch):
     assert took > first  # the frames before the first stop included
     assert read_state(kept).frame == LAST + 1
     cfg.scene = {"bed": {"headroom": 0.5}}
-    third = continued(cfg, ["scene.bed.headroom=0.5"])
+    third = restart_from(cfg, ["scene.bed.headroom=0.5"])
     assert third.changes == {"courant": 0.3, "bed.headroom": 0.5}  # those of before as well
     assert third.changed_scene.courant == 0.3 and third.wall_time == took
 
@@ -182,25 +179,17 @@ def test_a_campaign_says_where_its_run_is_kept(stops, tmp_path, monkeypatch):
 )
 def test_what_may_not_change(stopped, arguments, words):
     kept, output = stopped
-    done = sgns(kept.parent, "simulate", f"continue_from={kept}", f"output={output}", *arguments)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert words in line
-    assert kept.exists()
+    assert words in refusal(kept.parent, "simulate", f"continue_from={kept}", f"output={output}", *arguments)
 
 
 def test_what_cannot_be_gone_on_with(tmp_path, stopped):
     kept, _ = stopped
     assert sgns(tmp_path, "simulate", *SHORT, "output=whole.h5").returncode == 0
     for name, words in (("whole.h5", "is a whole run"), ("none.h5", "no such run file")):
-        done = sgns(tmp_path, "simulate", f"continue_from={name}")
-        assert done.returncode == 2
-        assert words in done.stderr
+        assert words in refusal(tmp_path, "simulate", f"continue_from={name}")
     with h5py.File(kept, "r+") as file:
         file["state/log_volume"][0] = np.nan
-    done = sgns(tmp_path, "simulate", f"continue_from={kept}")
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert "log_volume is not finite" in done.stderr
+    assert "log_volume is not finite" in refusal(tmp_path, "simulate", f"continue_from={kept}")
     with h5py.File(kept, "r+") as file:
         del file["state/position"]
         file["state/position"] = "text"
@@ -239,7 +228,7 @@ def stopped_mesh(stops, tmp_path):
 def asked(kept, *overrides):
     cfg = {"continue_from": str(kept), "scene": {"courant": 0.3}, "solver": {"precision": "float32"}}
     found = OmegaConf.merge(cfg, OmegaConf.from_dotlist([o.lstrip("+") for o in overrides]))
-    return continued(found, ["scene.courant=0.3", *overrides])
+    return restart_from(found, ["scene.courant=0.3", *overrides])
 
 
 def test_a_run_brings_its_mesh(stopped_mesh, tmp_path, monkeypatch):
@@ -254,32 +243,21 @@ def test_a_run_brings_its_mesh(stopped_mesh, tmp_path, monkeypatch):
     monkeypatch.setattr(mesh_file, "read_bytes", never)
     with pytest.raises(UserError, match=r"brings its own tool; leave out scene\.tool\.file"):
         asked(kept, "+scene.tool.file=box.obj")
-    going_on = asked(kept)
-    simulate_scene(going_on.scene, tmp_path / "run.h5", effects=going_on.effects, going_on=going_on)
+    restart = asked(kept)
+    simulate_scene(restart.scene, tmp_path / "run.h5", effects=restart.effects, restart=restart)
     assert check_run(tmp_path / "run.h5") == []
     with Run(tmp_path / "run.h5") as run:
-        assert run.frame_count == going_on.scene.frame_count
-        np.testing.assert_array_equal(run.mesh[0], going_on.scene.mesh[0])
+        assert run.frame_count == restart.scene.frame_count
+        np.testing.assert_array_equal(run.mesh[0], restart.scene.mesh[0])
 
 
-def test_a_run_without_its_mesh_reads_what_the_command_names(stopped_mesh, tmp_path):
+def test_a_run_without_its_mesh_is_refused(stopped_mesh, tmp_path):
     kept, content = stopped_mesh
-    with Run(kept) as run:
-        whole = run.mesh
     with h5py.File(kept, "r+") as file:
         del file["parameters"]
     (tmp_path / "box.obj").write_text(content)  # where the run says it was
-    with pytest.raises(UserError, match=r"not hold the mesh of its tool.*'\+scene\.tool\.file=") as caught:
+    with pytest.raises(UserError, match="does not hold the mesh of its tool; repeat the run"):
         asked(kept)
-    assert "\n" not in str(caught.value)
-    other = tmp_path / "other.obj"
-    (tmp_path / "box.obj").rename(other)
-    going_on = asked(kept, f"+scene.tool.file={other}")
-    np.testing.assert_array_equal(going_on.scene.mesh[0], whole[0])
-    assert going_on.scene.tool.file.endswith("box.obj")  # a campaign knows the run by it
-    other.write_text(content.replace("v 0.08", "v 0.07"))
-    with pytest.raises(SceneError, match="is not the file this scene was made with"):
-        asked(kept, f"+scene.tool.file={other}")
 
 
 def test_a_run_cannot_ask_for_a_file(stopped_mesh):

@@ -1,34 +1,37 @@
-"""The group `effects`: from the settings to each run's physics, and into its file."""
+"""From the settings to scenes, soils and effects, and into the run file."""
 
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import yaml
-from hydra import compose, initialize_config_module
 
-from mpm_warp import Decision, Effects, SceneError, Tolerances
+from mpm_warp import Decision, Effects, Material, SceneError, Tolerances, Wheel
+from sgns import conf
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run
+from sgns.rollout import require_same_freedom
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import plan
 from sgns.simulate.command import simulate_campaign
 from sgns.simulate.scene import asked_effects, decided, decision_summary, scene_from_config
 from sgns_testing.campaigns import campaign
+from sgns_testing.commands import composed, refusal, sgns
+
+# --- Effects --------------------------------------------------------------------------------------------
 
 
 def chosen(*overrides: str) -> tuple[Effects, dict[str, Decision]]:
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        cfg = compose("simulate", list(overrides))
+    cfg = composed(*overrides)
     return decided(scene_from_config(cfg), asked_effects(cfg))
 
 
 def test_the_shipped_tolerances_are_the_solvers_own():
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        asked = asked_effects(compose("simulate"))
+    asked = asked_effects(composed())
     assert Tolerances(**asked.pop("tolerance")) == Tolerances()
     assert set(asked.values()) == {"auto"}
 
@@ -136,3 +139,116 @@ def test_summary_of_a_dataset():
     assert decision_summary([{"yielding": on}, {"yielding": off}]) == [
         "yielding on in 1 of 2 runs; else off: it rests"
     ]
+
+
+# --- Soils in conf/material ------------------------------------------------------------------------------
+
+SOILS = sorted(file.stem for file in (Path(conf.__path__[0]) / "material").glob("*.yaml"))
+
+
+def soil(name: str, *overrides: str) -> Material:
+    return scene_from_config(composed(f"material={name}", *overrides)).material
+
+
+@pytest.mark.parametrize("name", SOILS)
+def test_only_what_is_stated_is_warned_of(name: str) -> None:
+    """Glass beads of both sizes are below the K0 condition; nothing else is odd about any of them."""
+    warnings = soil(name).warnings()
+    assert ["K0" in w for w in warnings] == ([True] if "beads" in name else [])
+
+
+def test_default_soil_is_the_default_material() -> None:
+    assert soil("sand") == Material()
+
+
+@pytest.mark.parametrize(("angle", "friction"), [(30, 0.5774), (37, 0.7536), (43, 0.9325)])
+def test_the_papers_wheel_soils(angle: int, friction: float) -> None:
+    found = soil("wheel_sand", f"material.friction_angle={angle}")
+    assert found.static_friction == pytest.approx(friction, abs=1e-4)
+    assert found.limit_friction == 0.9616
+    assert found.youngs_modulus == 15e6
+
+
+def test_lunar_simulant_has_the_density_and_friction_of_its_source() -> None:
+    found = soil("lunar_simulant")
+    assert found.bulk_density == pytest.approx(1653.0)
+    assert found.static_friction == pytest.approx(1.0)
+    assert found.limit_friction == pytest.approx(1.2016)
+
+
+# --- Wheels and other bodies ------------------------------------------------------------------------------
+
+SHORT = ["scene=quick_wheel", "scene.settle=0.05", "scene.duration=0.1", "output=run.h5"]
+
+
+@pytest.mark.parametrize("name", ["wheel", "quick_wheel", "paper_wheel", "published_wheel"])
+def test_wheel_scenes_are_good(name):
+    scene = scene_from_config(composed(f"scene={name}"))
+    assert isinstance(scene, Wheel)
+    assert scene.warnings() == []
+
+
+def test_the_published_scene():
+    scene = scene_from_config(composed("scene=published_wheel"))
+    assert scene.bilateral and scene.friction == 3.0 and scene.damping == 500.0
+    assert scene.material.youngs_modulus == 15e6
+    assert len(scene.initial_positions()) == pytest.approx(6005, rel=0.02)
+    assert scene.frame_count == 561
+    assert 1e3 * scene.speed == pytest.approx(12.0)
+
+
+def test_a_wheel_run_says_what_a_wheel_does(tmp_path):
+    done = sgns(tmp_path, "simulate", *SHORT)
+    assert done.returncode == 0, done.stderr
+    for words in ("mean drawbar pull", "sinkage", "torque"):
+        assert words in done.stdout
+    assert "draft" not in done.stdout
+    assert check_run(tmp_path / "run.h5") == []
+    with Run(tmp_path / "run.h5") as run:
+        assert run.scene["kind"] == "wheel"
+        assert run.body_points.shape == (7, 16, 3)
+        assert run.pose[-1, 2] < run.pose[0, 2]
+
+
+def test_a_network_of_prescribed_bodies_cannot_roll_a_wheel_out():
+    blades, wheels = SimpleNamespace(predicts_body=False), SimpleNamespace(predicts_body=True)
+    wheel, blade = (scene_from_config(composed(f"scene={name}")) for name in ("wheel", "excavation"))
+    with pytest.raises(
+        UserError, match=r"scene\.kind is wheel, whose height is free; a\.ckpt was trained on pre"
+    ):
+        require_same_freedom(blades, wheel, "a.ckpt")
+    with pytest.raises(
+        UserError, match=r"scene\.kind is excavation, whose height is prescribed; a\.ckpt was"
+    ):
+        require_same_freedom(wheels, blade, "a.ckpt")
+    require_same_freedom(blades, blade, "a.ckpt")
+    require_same_freedom(wheels, wheel, "a.ckpt")
+
+
+def test_a_body_from_the_command_line(tmp_path):
+    (tmp_path / "path.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0.3,0.3,0.1,0,0,0,1\n1,0.3,0.3,0.05,0,0,0,1\n")
+    (tmp_path / "tool.obj").write_text(
+        "v 0 0 0\nv 90 0 0\nv 0 90 0\nv 0 0 90\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+    )
+    tool = ["scene/tool=mesh", "scene.tool.file=tool.obj", "scene.tool.scale=0.001"]
+    short = ["scene.duration=0.02", "scene.bed.spacing=0.03", "output=run.h5"]
+    done = sgns(tmp_path, "simulate", "scene=body", "scene.path=path.csv", *tool, *short)
+    assert done.returncode == 0, done.stderr
+    assert "mean force" in done.stdout
+    assert Run(tmp_path / "run.h5").body_points.shape[1] == 4
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["scene=body"], "scene.path=..."),
+        (["scene=body", "scene/tool=mesh"], "scene.tool.file=..."),
+        (["scene=body", "scene/tool=cone"], "scene/tool=cone: no such option"),
+        (["scene=wheel", "scene.load=heavy"], "scene.load is 'heavy'"),
+        (["scene=wheel", "scene.bilateral=maybe"], "scene.bilateral is 'maybe'; allowed: true, false"),
+        (["scene=wheel", "scene.friction_angle=steep"], "scene.friction_angle is 'steep'"),
+        (["scene=wheel", "scene.grousers=3"], "scene.grouser_height is 0.0; it must be above 0 m"),
+    ],
+)
+def test_bad_scenes_are_one_line(tmp_path, overrides, words):
+    assert words in refusal(tmp_path, "simulate", *overrides)

@@ -39,7 +39,7 @@ def runs(scenes, tmp_path_factory):
 
 
 def test_the_recorded_particles_are_those_of_the_whole_run(scenes, runs):
-    kept = longer(scenes[0], 3).bed.stored
+    kept = longer(scenes[0], 3).stored
     with Run(runs[0]) as part, Run(runs[-1]) as whole:
         assert part.particle_count == len(kept) == 67
         np.testing.assert_array_equal(part.positions(), whole.positions()[:, kept])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 
 from sgns.config import UserError
 from sgns.data.check import check_run
-from sgns.data.files import claimed
+from sgns.data.files import file_lock
 from sgns.data.run import Run
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import run_cost
@@ -54,7 +55,7 @@ def order(monkeypatch):
         self._pool.shutdown()
         return {}
 
-    monkeypatch.setattr(campaign_runs._Production, "make_all", make_all)
+    monkeypatch.setattr(campaign_runs._Workers, "make_all", make_all)
     monkeypatch.setattr(campaign_runs, "_compile", lambda *_: None)
     return names
 
@@ -107,7 +108,7 @@ def test_shards_are_the_campaign_in_shares_of_like_work(tmp_path, order):
     shares = []
     for shard in range(2):
         simulate_campaign(c, device="cpu", shard=shard, shards=2)
-        shares.append([run_cost(c.scenes[name]).work for name in order])
+        shares.append([run_cost(c.scenes[name]).particle_steps for name in order])
         done = list(order)
         order.clear()
         assert len(done) == 3
@@ -163,23 +164,23 @@ def test_kernels_are_compiled_once_for_each_kind_of_scene(tmp_path, monkeypatch)
 def test_time_left_follows_from_the_work_left_and_the_speed_seen(tmp_path):
     c = campaign(tmp_path, runs=6)
     costs = {name: run_cost(scene) for name, scene in c.scenes.items()}
-    per_frame = costs[next(iter(costs))].work_per_frame
-    production = campaign_runs._Production(c, costs, "cpu", 4)
+    per_frame = costs[next(iter(costs))].steps_per_frame
+    workers = campaign_runs._Workers(c, costs, "cpu", 4)
     try:
-        assert production._left() == "an unknown time"
+        assert workers._left() == "an unknown time"
         # A frame takes a worker 100 s; six runs of three steps on four workers end after two runs.
-        production._work_seen, production._seconds_seen = 10 * per_frame, 1000.0
-        assert production._left() == "10 min"
+        workers._steps_seen, workers._seconds_seen = 10 * per_frame, 1000.0
+        assert workers._left() == "10 min"
         # Then an hour at half that speed, with three of the workers busy: the estimate says so.
         for _ in range(60):
-            production._see(0.9 * per_frame, elapsed=60.0, busy=3)
-        assert production._left() == "20 min"
+            workers._see(0.9 * per_frame, elapsed=60.0, busy=3)
+        assert workers._left() == "20 min"
         # Four runs have only one step left (frames 0 to 2 are there), two have not begun.
-        production._frames_done[:] = [3, 3, 3, 3, 0, 0]
-        assert production._work_made() == 8 * per_frame
-        assert production._left() == "13 min"
+        workers._frames_done[:] = [3, 3, 3, 3, 0, 0]
+        assert workers._steps_made() == 8 * per_frame
+        assert workers._left() == "13 min"
     finally:
-        production._pool.shutdown()
+        workers._pool.shutdown()
 
 
 @pytest.mark.parametrize("batch", [1, 2])
@@ -196,7 +197,7 @@ def test_a_run_that_fails_does_not_stop_the_others(tmp_path, batch):
 def test_a_run_that_another_process_makes_is_left_to_it(tmp_path, caplog, batch):
     c = campaign(tmp_path, runs=3)
     first, *others = c.scenes
-    with claimed(c.file(first)) as ours, caplog.at_level(logging.INFO):
+    with file_lock(c.file(first)) as ours, caplog.at_level(logging.INFO):
         assert ours
         simulate_campaign(c, device="cpu", workers=1, batch=batch)
     assert "runs left to another process that is making them or has made them: 1" in caplog.text
@@ -221,8 +222,8 @@ def test_two_processes_on_an_empty_folder_make_every_run_once(tmp_path):
 
 
 def test_two_processes_may_compile_into_an_empty_cache_at_once(tmp_path):
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    pipes["env"] = environment() | {"WARP_CACHE_PATH": str(tmp_path)}
+    variables = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": variables}
     processes = [subprocess.Popen([sys.executable, "-c", COMPILE], **pipes) for _ in range(2)]
     for process in processes:
         assert process.stdout.readline() == "ready\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import os
@@ -17,16 +16,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sgns.config import UserError
 from sgns.model.network_dynamics import Path
 from sgns.simulator import Simulator
-from sgns.train import command as module
+from sgns.train import lightning_module as module
 from sgns.train.callbacks import ValidationRollouts
 from sgns.train.command import main, train
 from sgns.train.lightning_module import TrainingSettings
-from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
+from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset
 
 
 def run(data, output, **changes) -> float:
@@ -73,7 +67,7 @@ def test_lightning_says_nothing(data, tmp_path, capfd) -> None:
 
 def test_a_complete_training_is_not_repeated(data, tmp_path, monkeypatch) -> None:
     first = run(data, tmp_path)
-    monkeypatch.setattr(module, "fit", None)
+    monkeypatch.setattr(module, "run_trainer", None)
     assert run(data, tmp_path) == first
     # Speed and reporting do not make it another training.
     assert run(data, tmp_path, threads=1, log_every=7) == first
@@ -84,17 +78,6 @@ def test_other_settings_do_not_mix(data, tmp_path) -> None:
     with pytest.raises(UserError, match=r"training\.learning_rate is 0\.001 there and 0\.002 here"):
         run(data, tmp_path, learning_rate=2e-3)
     run(data, tmp_path, learning_rate=2e-3, resume=False)
-
-
-def test_a_training_from_before_goes_on_if_it_had_no_slower_windows(data, tmp_path) -> None:
-    run(data, tmp_path)
-    content = torch.load(tmp_path / "last.ckpt", weights_only=True)
-    for slower, words in ((0.0, None), (0.3, r"training\.slower is 0\.3 there")):
-        content["hyper_parameters"]["settings"]["training"]["slower"] = slower
-        torch.save(content, tmp_path / "last.ckpt")
-        (tmp_path / "training.json").unlink()
-        with pytest.raises(UserError, match=words) if words else contextlib.nullcontext():
-            run(data, tmp_path)
 
 
 def test_the_last_step_is_judged_even_if_odd(data, tmp_path) -> None:
@@ -310,14 +293,14 @@ def test_all_settings_that_differ_are_named(data, tmp_path) -> None:
 
 def test_one_training_at_a_time_in_a_folder(data, tmp_path, monkeypatch) -> None:
     """The second one's settings do not matter: neither result would be whole."""
-    before = module.fit
+    before = module.run_trainer
 
     def fit(*args) -> None:
         with pytest.raises(UserError, match=r"best\.ckpt is being made by process"):
             run(data, tmp_path, learning_rate=2e-3)
         before(*args)
 
-    monkeypatch.setattr(module, "fit", fit)
+    monkeypatch.setattr(module, "run_trainer", fit)
     run(data, tmp_path, max_steps=1, validate_every=1)
     names = sorted(p.name for p in tmp_path.iterdir())
     assert names == ["best.ckpt", "last.ckpt", "tensorboard", "training.json"]
@@ -327,7 +310,7 @@ def test_one_training_at_a_time_in_a_folder(data, tmp_path, monkeypatch) -> None
 @pytest.mark.parametrize("name", ["best.ckpt", "last.ckpt", "training.json"])
 def test_a_pipe_stays_a_pipe(data, tmp_path, monkeypatch, name, resume) -> None:
     os.mkfifo(tmp_path / name)
-    monkeypatch.setattr(module, "fit", None)  # it is found before
+    monkeypatch.setattr(module, "run_trainer", None)  # it is found before
     with pytest.raises(UserError, match=f"{name}: it is a pipe"):
         run(data, tmp_path, resume=resume)
     assert (tmp_path / name).is_fifo()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,14 +19,8 @@ from sgns.model.settings import FitSettings, PolynomialSettings
 from sgns.train import command as module
 from sgns.train.callbacks import ValidationRollouts
 from sgns.train.command import train
-from sgns.train.polynomial import fit_polynomial
-from sgns_testing.commands import call
-from sgns_testing.tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset, reduced
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
+from sgns.train.polynomial import best_polynomial
+from sgns_testing.tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset
 
 
 def run(data, output, model=POLYNOMIAL, training=FIT, **kw) -> float:
@@ -38,7 +34,7 @@ def without_validation(data, count: int):
 
 def fitted(data, **changes):
     runs = data.runs("train")
-    return fit_polynomial(
+    return best_polynomial(
         runs,
         data.runs("validation"),
         4,
@@ -71,7 +67,7 @@ def test_what_is_written_is_what_was_fitted(data, tmp_path) -> None:
 def test_a_complete_fit_is_not_repeated(data, tmp_path, monkeypatch) -> None:
     first = run(data, tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr(module, "fit_polynomial", None)
+        patch.setitem(module.FITS, "polynomial", module.FITS["polynomial"]._replace(run=None))
         assert run(data, tmp_path) == first
     with pytest.raises(UserError, match=r"model\.degree is 2 there and 1 here"):
         run(data, tmp_path, POLYNOMIAL | {"degree": 1})
@@ -88,12 +84,12 @@ def test_without_validation_runs_a_third_chooses_and_all_are_fitted(data, tmp_pa
     assert "every third training run" in caplog.text
     runs = data.runs("train")
     settings = PolynomialSettings(**POLYNOMIAL), FitSettings.from_dict(quadratic)
-    without = fit_polynomial(runs[1:3], runs[::3], 4, *settings, predicts_body=False, seed=3)
+    without = best_polynomial(runs[1:3], runs[::3], 4, *settings, predicts_body=False, seed=3)
     assert without.score.skill == skill
     # The same noise and penalty for all runs.
-    motion = without.choice.motion
+    motion = without.selection.motion
     chosen = {"noises": [motion.noise], "penalties": [motion.penalty]}
-    everything = fit_polynomial(
+    everything = best_polynomial(
         runs,
         data.runs("test"),
         4,
@@ -151,16 +147,21 @@ def test_the_commands(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     dataset = ["dataset=quick", "dataset.path=data"]
 
+    def call(*arguments: str) -> tuple[int, str]:
+        command = [sys.executable, "-m", "sgns", *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+        return done.returncode, done.stderr
+
     train_it = ["train", *dataset, "model=polynomial", "reduction.num_modes=4", "training.threads=1"]
-    assert call(*train_it, "output=out").returncode == 0
+    assert call(*train_it, "output=out")[0] == 0
     assert {path.name for path in Path("out").iterdir()} == {
         ".hydra",
         "best.ckpt",
         "tensorboard",
         "training.json",
     }
-    assert call("evaluate", *dataset, "checkpoint=out/best.ckpt", "output=report").returncode == 0
+    assert call("evaluate", *dataset, "checkpoint=out/best.ckpt", "output=report")[0] == 0
     assert Path("report/report.html").exists()
-    done = call(*train_it, "output=other", "preset=paper")
-    assert done.returncode == 2 and "model.body_nodes is unknown" in done.stderr
+    status, line = call(*train_it, "output=other", "preset=paper")
+    assert status == 2 and "model.body_nodes is unknown" in line
     assert not Path("other").exists()

@@ -11,13 +11,15 @@ import torch
 from sgns.config import UserError
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
-from sgns.train.windows import NoiseScales, TrainingWindows, fit_normalisation, generator, random_walk
-from sgns_testing.tiny import MODEL, reduced
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduced(tmp_path_factory.mktemp("tiny"))
+from sgns.train.windows import (
+    NoiseScales,
+    TrainingWindows,
+    WindowLoader,
+    fit_normalisation,
+    generator,
+    random_walk,
+)
+from sgns_testing.tiny import MODEL
 
 
 def windows_of(data, history: int = 3, seed: int = 0) -> TrainingWindows:
@@ -62,7 +64,7 @@ def test_windows_do_not_reach_across_runs(data) -> None:
 
 def test_batches_depend_on_seed_and_step_only(data) -> None:
     scale = still(torch.rand(4, 3, dtype=torch.float64))
-    stream = windows_of(data).batches(8, scale)
+    stream = iter(WindowLoader(windows_of(data), 8, scale))
     for _ in range(9):
         drawn = next(stream)
     alone = windows_of(data).batch(8, 8, scale)

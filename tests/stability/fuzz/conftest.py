@@ -46,8 +46,8 @@ def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in (
         "sgns.simulate.command.simulate_scene",
         "sgns.simulate.workers._compile",
-        "sgns.train.command.fit",
-        "sgns.train.command.fit_polynomial",
+        "sgns.train.lightning_module.run_trainer",
+        "sgns.train.polynomial.best_polynomial",
         "sgns.evaluate.command.roll_out",
         "sgns.rollout.rollout_scene",
     ):

@@ -1,7 +1,12 @@
-"""The reference without a reduction: the graph network on every particle, edges between near ones."""
+"""The reference without a reduction: the graph network on every particle, edges between near ones, and its windows.
+
+Letters: B batch, d history positions, n particles, N body nodes, V = n + N nodes, E edges, T frames.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,10 +17,13 @@ from torch.nn.functional import pad
 from tqdm import tqdm
 
 from mpm_warp.launch import start_warp
+from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
-from sgns.model.features import BodyTrack
+from sgns.data.run import Run
+from sgns.model.features import BodyTrack, body_track
 from sgns.model.network import EncodeProcessDecode, Standardiser
-from sgns.model.network_dynamics import ModelSettings
+from sgns.model.settings import ModelSettings
+from sgns.train.windows import random_walk
 
 # --- Body nodes close enough together that soil particles cannot pass between them unseen ---------------
 
@@ -38,7 +46,6 @@ def box_surface(half_size: np.ndarray, spacing: float) -> np.ndarray:
 
 
 # --- Which points are near each other: the edges of a graph in full space, found with Warp's hash grid --
-# Shapes: V points, E edges.
 
 # Cells per axis of the hash grid; what lies outside wraps around and is told apart by its distance.
 _CELLS = 64
@@ -125,10 +132,7 @@ def radius_graph(points: Tensor, radius: float) -> Tensor:
     return edges
 
 
-# --- The dynamics of every soil particle under a prescribed tool: the network of the latent dynamics on a g
-# of near particles.
-#
-# Shapes: B batch, d history positions, n particles, N body nodes, V = n + N nodes, E edges, T frames.
+# --- The dynamics of every soil particle under a prescribed tool -----------------------------------------
 
 
 class FullSpacePrediction(NamedTuple):
@@ -221,8 +225,10 @@ class FullSpaceDynamics(nn.Module):
         low, high = where[..., :2], self.bin_size[:2] - where[..., :2]
         floor = where[..., 2:] + self.bin_size[2]
         walls = (torch.cat([low, high, floor], dim=-1) / self.radius).clamp(-1.0, 1.0).float()
-        kinds = self.identity.weight
-        identity = torch.cat([kinds[:1].expand(soil.shape[2], -1), kinds[1:].expand(motion.shape[1], -1)])
+        identity = self.identity.weight
+        identity = torch.cat(
+            [identity[:1].expand(soil.shape[2], -1), identity[1:].expand(motion.shape[1], -1)]
+        )
         return torch.cat([moving, walls, identity.expand(len(soil), -1, -1)], dim=-1)
 
     def edge_features(self, position: Tensor, edge_index: Tensor) -> Tensor:
@@ -243,15 +249,8 @@ class FullSpaceDynamics(nn.Module):
         return prediction.force.double() * share * self.force.scale + self.force.mean / nodes
 
     def advance(self, soil: Tensor, body: BodyTrack) -> tuple[Tensor, Tensor]:
-        """Take one step: x+ = x + (x - x-) + a.
-
-        Args:
-            soil: As for `forward`.
-            body: As for `forward`.
-
-        Returns:
-            Next positions [m] (B, n, 3) and force [N] (B, 3), float64.
-        """
+        """Take one step, x+ = x + (x - x-) + a: next positions [m] (B, n, 3) and force [N] (B, 3), float64; arguments
+        as for `forward`."""
         prediction = self(soil, body)
         acceleration = self.acceleration.denormalise(prediction.acceleration)
         following = 2 * soil[:, -1] - soil[:, -2] + acceleration
@@ -278,3 +277,144 @@ class FullSpaceDynamics(nn.Module):
                 states[:, t - d : t], body.frames(slice(t - d + 1, t + 1))
             )
         return states, force
+
+
+# --- Its training windows, read from the run files as they are drawn, and its loss ------------------------
+
+
+class FullSpaceBatch(NamedTuple):
+    """Windows of one optimisation step; as `sgns.train.windows.Batch`, with particles in the place of modes.
+
+    Attributes:
+        position: Clean positions, the target last [m], float64, shape (B, d + 1, n, 3).
+        noise: Offset added to the history [m], float64, shape (B, d, n, 3).
+        body: The d frames that end with the target's, (B, d, N, ...).
+        force: At the target frame [N], shape (B, 3).
+    """
+
+    position: Tensor
+    noise: Tensor
+    body: BodyTrack
+    force: Tensor
+
+    @property
+    def history(self) -> Tensor:
+        """What the network is shown: the noisy history [m], shape (B, d, n, 3)."""
+        return self.position[:, :-1] + self.noise
+
+    @property
+    def acceleration(self) -> Tensor:
+        """The target [m], shape (B, n, 3): it undoes the noise of the velocity and keeps that of the position."""
+        shown = self.history
+        return self.position[:, -1] + self.noise[:, -1] - 2 * shown[:, -1] + shown[:, -2]
+
+    def to(self, device: torch.device) -> FullSpaceBatch:
+        """The batch on another device."""
+        body = BodyTrack(*(part.to(device) for part in self.body))
+        return FullSpaceBatch(self.position.to(device), self.noise.to(device), body, self.force.to(device))
+
+
+class FullSpaceRun:
+    """The small series of a run, in memory; its soil stays in the file.
+
+    Args:
+        path: The run file.
+        body_nodes: In the body frame [m], shape (N, 3); None: the body points that the run recorded.
+
+    Attributes:
+        track: The body at all T frames.
+        force: By the soil on the body [N], shape (T, 3), float64.
+        bin_size: Lx, Ly, Lz [m], shape (3,), float64.
+    """
+
+    def __init__(self, path: str | Path, body_nodes: np.ndarray | None = None) -> None:
+        self.path = Path(path)
+        with Run(path) as run:
+            points = run.body_points if body_nodes is None else in_world_frame(run.pose, body_nodes)
+            if points.shape[1] == 0:
+                raise UserError(f"{path} has no body points; give body nodes of your own")
+            self.track = body_track(run.pose, points, "points")
+            self.force = torch.as_tensor(run.force)
+            self.bin_size = torch.tensor(run.scene["bed"]["size"], dtype=torch.float64)
+            self.arrangement_hash, self.frame_rate = run.arrangement_hash, run.frame_rate
+            self.particle_count = run.particle_count
+
+    def __len__(self) -> int:
+        """T."""
+        return len(self.force)
+
+    def soil(self, frames: slice | np.ndarray = slice(None)) -> Tensor:
+        """Particles [m] in the chosen frames, float64, shape (t, n, 3)."""
+        with Run(self.path) as run:
+            return torch.from_numpy(run.positions(frames)).double()
+
+
+class FullSpaceWindows:
+    """Windows drawn from a set of runs with replacement, every frame but the first of each being a target.
+
+    Before frame 0 a run is at rest, as for the reduced windows.
+
+    Args:
+        runs: Of one bed.
+        history: d.
+        seed: Of order and noise.
+
+    Raises:
+        UserError: No runs, or runs that do not belong together.
+    """
+
+    def __init__(self, runs: Sequence[FullSpaceRun], history: int, seed: int = 0) -> None:
+        if not runs or all(len(run) < 2 for run in runs):
+            raise UserError(
+                "there are no training runs of two frames or more; make some: sgns simulate dataset=quick"
+            )
+        for run in runs[1:]:
+            one, other = (
+                (r.arrangement_hash, r.frame_rate, r.track.position.shape[1], r.bin_size.tolist())
+                for r in (runs[0], run)
+            )
+            if one != other:
+                raise UserError(
+                    f"{runs[0].path} and {run.path} differ in bed, frame rate or number of body nodes; train on runs "
+                    "of one bed"
+                )
+        self.runs = list(runs)
+        self.history = history
+        self.seed = seed
+        self.targets = [(run, frame) for run in self.runs for frame in range(1, len(run))]
+
+    def __len__(self) -> int:
+        """The number of windows."""
+        return len(self.targets)
+
+    def window(self, index: int) -> FullSpaceBatch:
+        """One window without noise, B = 1."""
+        run, target = self.targets[index]
+        frames = np.maximum(np.arange(target - self.history, target + 1), 0)
+        soil = run.soil(frames)[None]
+        body = BodyTrack(*(part[None] for part in run.track.frames(torch.from_numpy(frames[1:]))))
+        return FullSpaceBatch(soil, torch.zeros_like(soil[:, :-1]), body, run.force[None, target])
+
+    def batch(self, step: int, size: int, noise_scale: Tensor) -> FullSpaceBatch:
+        """The batch of an optimisation step from 0, a function of (seed, step) and nothing else; `noise_scale` is the
+        deviation of the newest velocity's noise [m], shape (3,)."""
+        source = torch.Generator().manual_seed(
+            int(np.random.SeedSequence([self.seed, step]).generate_state(1)[0])
+        )
+        drawn = torch.randint(len(self), (size,), generator=source).tolist()
+        windows = [self.window(index) for index in drawn]
+        body = BodyTrack(*(torch.cat(parts) for parts in zip(*(w.body for w in windows), strict=True)))
+        soil, force = (torch.cat([getattr(w, name) for w in windows]) for name in ("position", "force"))
+        noise = random_walk(noise_scale.expand(soil.shape[2], 3), (size, self.history), source)
+        return FullSpaceBatch(soil, noise, body, force)
+
+
+def losses(dynamics: FullSpaceDynamics, batch: FullSpaceBatch) -> tuple[Tensor, Tensor]:
+    """Squared errors of the normalised acceleration, mean over particles, and of the normalised force; the batch is
+    taken to the device of the dynamics."""
+    batch = batch.to(dynamics.bin_size.device)
+    prediction = dynamics(batch.history, batch.body)
+    acceleration = prediction.acceleration - dynamics.acceleration.normalise(batch.acceleration)
+    force = dynamics.force.normalise(dynamics.force_contributions(prediction).sum(-2))
+    force = force - dynamics.force.normalise(batch.force)
+    return acceleration.square().sum(-1).mean(), force.square().sum(-1).mean()

@@ -1,19 +1,33 @@
-"""Body nodes lie on the surface, none twice, no hole wider than asked."""
+"""The network on every particle: body nodes, neighbours, symmetries, windows, and the training of the experiment."""
 
 from __future__ import annotations
+
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
+from sgns.data.run import Run
+from sgns.evaluate.full_space import (
+    FullSpaceDynamics,
+    FullSpaceRun,
+    FullSpaceWindows,
+    box_surface,
+    losses,
+    radius_graph,
+)
 from sgns.model.features import BodyTrack
-from sgns.model.full_space import FullSpaceDynamics, box_surface, radius_graph
-from sgns.model.network_dynamics import ModelSettings
-from sgns.train.full_space import FullSpaceRun, FullSpaceWindows, fit_normalisation, losses, train
+from sgns.model.settings import ModelSettings
 from sgns.train.lightning_module import TrainingSettings
 from sgns_testing.runs import PLATE, make_run
 from sgns_testing.tiny import MODEL, TRAINING
+
+SCRIPT = runpy.run_path(str(Path(__file__).parents[3] / "experiments" / "full_space" / "run.py"))
+fit_normalisation, train = SCRIPT["fit_normalisation"], SCRIPT["train"]
 
 # --- Body nodes lie on the surface, none twice, no hole wider than asked --------------------------------
 
@@ -217,7 +231,7 @@ def trained(windows: FullSpaceWindows, steps: int) -> tuple[FullSpaceDynamics, l
         record = act()
         with torch.inference_mode():
             found.append(float(losses(dynamics, asked)[0]))
-    assert len(record.acceleration) == len(record.force) == len(record.seconds) == steps
+    assert len(record) == steps
     return dynamics, found
 
 
@@ -236,7 +250,7 @@ def test_a_loss_that_is_not_finite_stops_the_training(windows) -> None:
     dynamics = untrained(windows)
     with torch.no_grad():
         dynamics.network.decode.first.weight[0, 0] = torch.nan
-    with pytest.raises(UserError, match="learning_rate"):
+    with pytest.raises(ValueError, match="learning_rate"):
         train(dynamics, windows, TrainingSettings.from_dict(TRAINING), torch.zeros(3, dtype=torch.float64))
 
 
@@ -257,3 +271,65 @@ def test_a_rollout_is_steps_and_stays_finite(windows) -> None:
 def test_a_pose_is_no_body_in_full_space() -> None:
     with pytest.raises(UserError, match="body_nodes=points"):
         FullSpaceDynamics(ModelSettings(**MODEL), 0.1, torch.ones(3))
+
+
+# --- Windows hold what the files hold ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    return [make_run(folder / f"{seed}.h5", frames=6 + seed, n=20, seed=seed) for seed in range(2)]
+
+
+def test_a_window_is_frames_of_the_file(paths) -> None:
+    windows = FullSpaceWindows([FullSpaceRun(path) for path in paths], history=3)
+    assert len(windows) == 5 + 6
+    window = windows.window(5 + 3)  # the second run's frame 4
+    with Run(paths[1]) as run:
+        torch.testing.assert_close(window.position[0], torch.from_numpy(run.positions(slice(1, 5))).double())
+        torch.testing.assert_close(window.force[0], torch.from_numpy(run.force[4]))
+        torch.testing.assert_close(window.body.position[0], torch.from_numpy(run.body_points[2:5]))
+        np.testing.assert_allclose(
+            window.body.motion[0, -1], run.body_points[4] - run.body_points[3], atol=1e-15
+        )
+
+
+def test_a_run_starts_from_rest(paths) -> None:
+    windows = FullSpaceWindows([FullSpaceRun(path) for path in paths], history=3)
+    window = windows.window(0)
+    assert bool((window.position[0, :3] == window.position[0, 0]).all())
+    assert float(window.body.motion[0, :2].abs().max()) == 0.0
+
+
+def test_body_nodes_of_ones_own_are_carried_along(paths) -> None:
+    nodes = np.array([[0.0, 0.0, 0.0], [0.01, 0.1, -0.1]])
+    run = FullSpaceRun(paths[0], nodes)
+    with Run(paths[0]) as file:
+        expected = in_world_frame(file.pose, nodes)
+    np.testing.assert_allclose(run.track.position, expected)
+
+
+def test_a_batch_depends_on_seed_and_step_only(paths) -> None:
+    runs = [FullSpaceRun(path) for path in paths]
+    scale = torch.tensor([1e-4, 1e-5, 1e-4], dtype=torch.float64)
+    a, b, other, seeded = (
+        FullSpaceWindows(runs, 3, seed).batch(step, 4, scale)
+        for step, seed in ((7, 0), (7, 0), (8, 0), (7, 1))
+    )
+    assert torch.equal(a.history, b.history) and torch.equal(a.force, b.force)
+    assert not torch.equal(a.history, other.history) and not torch.equal(a.history, seeded.history)
+    # The oldest position is exact, the newest velocity's noise has the stated size.
+    assert float(a.noise[:, 0].abs().max()) == 0.0
+    found = (a.noise[:, -1] - a.noise[:, -2]).square().mean((0, 1)).sqrt()
+    torch.testing.assert_close(found / scale, torch.ones(3, dtype=torch.float64), atol=0.35, rtol=0)
+
+
+def test_runs_that_do_not_belong_together_are_refused(paths, tmp_path) -> None:
+    other = make_run(tmp_path / "other.h5", frames=6, n=21)
+    with pytest.raises(UserError, match="one bed"):
+        FullSpaceWindows([FullSpaceRun(paths[0]), FullSpaceRun(other)], 3)
+    with pytest.raises(UserError, match="no training runs"):
+        FullSpaceWindows([], 3)
+    with pytest.raises(UserError, match="no body points"):
+        FullSpaceRun(make_run(tmp_path / "bare.h5", frames=3, n=5, m=0))

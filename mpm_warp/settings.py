@@ -1,0 +1,252 @@
+"""What a setting is: its type, unit, range, default and one line of help stand in one place, its dataclass.
+
+The checks, what they say, and the help of a class come from there. Pydantic checks each value; relations between values
+are checked by the classes themselves.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable
+from dataclasses import KW_ONLY, MISSING, dataclass, field, fields, is_dataclass, replace
+from functools import cache
+from types import UnionType
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from .state import SceneError
+
+_CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is known of a setting beside its type and default."""
+
+    help: str
+    unit: str = ""
+    _: KW_ONLY
+    gt: float | None = None
+    ge: float | None = None
+    lt: float | None = None
+    le: float | None = None
+    choices: tuple[str, ...] = ()
+    note: str = ""
+    """Follows the range in an error, to say why it is so."""
+    words: str = ""
+    """Stands after the value in an error, in place of unit, range and note."""
+
+    @property
+    def range(self) -> str:
+        """The values that are allowed, in words; empty: all."""
+        if self.ge is not None and self.le is not None:
+            return f"{self.ge:g} to {self.le:g}"
+        limits = {
+            "above {:g}": self.gt,
+            "{:g} or more": self.ge,
+            "below {:g}": self.lt,
+            "at most {:g}": self.le,
+        }
+        given = [words.format(limit) for words, limit in limits.items() if limit is not None]
+        return ", ".join([*self.choices, *given])
+
+    @property
+    def refusal(self) -> str:
+        """What an error says after a value that is not allowed."""
+        unit = self.unit and f" {self.unit}"
+        only_from = self.lt is None and self.le is None and not self.choices
+        return self.words or f"{unit}; {'it must be' if only_from else 'allowed:'} {self.range}{self.note}"
+
+
+def setting(default: Any, *known: str, **limits: Any) -> Any:
+    """A dataclass field; a default that is called makes a new one. The rest as in `Setting`."""
+    kind = "default_factory" if callable(default) else "default"
+    return field(**{kind: default}, metadata={"setting": Setting(*known, **limits)})
+
+
+def same(cls: type, name: str, **default: Any) -> Any:
+    """A dataclass field that is the same setting as one of another group, also its default if no other is given."""
+    (found,) = (one for one in fields(cls) if one.name == name)
+    return field(**({"default": found.default} | default), metadata=found.metadata)
+
+
+def lengths(default: tuple[float, float, float], words: str) -> Any:
+    """A field of three lengths."""
+    return setting(default, words, "m", gt=0, words="; it needs three lengths above 0 m")
+
+
+class _Field(NamedTuple):
+    setting: Setting
+    type: Any
+    adapter: TypeAdapter | None
+    """None: a group of settings, or a choice of such groups."""
+
+
+class Settings:
+    """Base of the groups of settings. Their values are checked when they are made."""
+
+    group: ClassVar[str]
+    """Where its settings stand, as errors name it."""
+
+    def __post_init__(self) -> None:
+        for name in _fields_of(type(self)):
+            object.__setattr__(self, name, _checked(type(self), name, getattr(self, name)))
+
+
+def settings(cls: type) -> type:
+    """An immutable dataclass of settings, which its documentation lists."""
+    cls = dataclass(frozen=True)(cls)
+    lines = [inspect.cleandoc(cls.__doc__), "", "Settings and their defaults:"]
+    for name, default, allowed, meaning in described(cls):
+        lines.append(f"    {name} = {default}: {meaning}{allowed and f' ({allowed})'}")
+    cls.__doc__ = "\n".join(lines)
+    return cls
+
+
+def described(cls: type) -> list[tuple[str, str, str, str]]:
+    """Of each setting of a class its name, its default with the unit, what is allowed, and its meaning."""
+    found = []
+    for one in fields(cls):
+        known = _fields_of(cls)[one.name].setting
+        default = _short(one.default if one.default_factory is MISSING else one.default_factory())
+        found.append((one.name, f"{default} {known.unit}".rstrip(), known.range, known.help))
+    return found
+
+
+def reference(groups: Iterable[type]) -> str:
+    """The page of the documentation that lists the settings of some classes, in Markdown."""
+    lines = ["# Settings of scenes, soil and physics", "", "Python and the command line have the same names."]
+    for cls in groups:
+        shared = described(cls.__base__) if is_dataclass(cls.__base__) else []
+        also = f" It has the settings of {cls.__base__.__name__}, too." if shared else ""
+        lines += ["", f"## {cls.__name__}", "", cls.__doc__.splitlines()[0] + also, ""]
+        lines += ["| setting | default | allowed | meaning |", "|---|---|---|---|"]
+        for name, *known in described(cls):
+            if (name, *known) not in shared:
+                lines.append(f"| `{name}` | {' | '.join(known)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _short(value: Any) -> str:
+    """A default; of a group of settings only those that are not the group's own."""
+    if not is_dataclass(value):
+        return repr(value)
+    changed = {f.name: getattr(value, f.name) for f in fields(value)}
+    own = type(value)()
+    words = [f"{name}={_short(v)}" for name, v in changed.items() if v != getattr(own, name)]
+    return f"{type(value).__name__}({', '.join(words)})"
+
+
+def build(cls: type, data: Any, where: str, make: Callable[..., Any] | None = None) -> Any:
+    """A group of settings from nested plain data.
+
+    Args:
+        cls: the group.
+        data: values by name, or less.
+        where: the data stand, for errors.
+        make: what is called with the values in place of the class.
+
+    Raises:
+        SceneError: the data have other keys, or values that are not of their type or not allowed.
+    """
+    if not isinstance(data, dict):
+        raise SceneError(f"{where} is {data!r}; it must be a group of keys")
+    known = _fields_of(cls)
+    if unknown := sorted(set(data) - set(known)):
+        raise SceneError(f"{where} has no key {unknown[0]!r}; allowed: {', '.join(sorted(known))}")
+    values = {}
+    for key, value in data.items():
+        kind, place = known[key].type, f"{where}.{key}"
+        groups = [part for part in (kind, *get_args(kind)) if is_dataclass(part)]
+        if not groups or isinstance(value, tuple(groups)):
+            values[key] = _checked(cls, key, value, place)
+        else:
+            values[key] = build(_chosen(groups, value, place), value, place)
+    return (make or cls)(**values)
+
+
+def _chosen(groups: list[type], value: Any, where: str) -> type:
+    """The one of some groups that plain data name by their key `shape`."""
+    if len(groups) == 1:
+        return groups[0]
+    shapes = {group.shape: group for group in groups}
+    shape = value.get("shape") if isinstance(value, dict) else None
+    if not isinstance(shape, str) or shape not in shapes:
+        raise SceneError(f"{where}.shape is {shape!r}; allowed: {', '.join(shapes)}")
+    return shapes[shape]
+
+
+@cache
+def _fields_of(cls: type) -> dict[str, _Field]:
+    hints = get_type_hints(cls, localns={cls.__name__: cls})  # its module does not have it yet
+    found = {}
+    for one in fields(cls):
+        hint = hints[one.name]
+        # A class that changes only a default has the setting of its base.
+        bases = (base.__dict__.get("__dataclass_fields__", {}).get(one.name) for base in cls.__mro__)
+        known = next((f.metadata["setting"] for f in bases if f and "setting" in f.metadata), Setting(""))
+        choices = [get_args(part) for part in (hint, *get_args(hint)) if get_origin(part) is Literal]
+        known = replace(known, choices=sum(choices, ()))
+        group = any(map(is_dataclass, (hint, *get_args(hint))))
+        adapter = None if group else TypeAdapter(_limited(hint, known), config=_CONFIG)
+        found[one.name] = _Field(known, hint, adapter)
+    return found
+
+
+def _limited(hint: Any, known: Setting) -> Any:
+    """A type whose numbers keep to the range of a setting, and are not made of text or of each other."""
+    if hint in (bool, str):
+        return Annotated[hint, Field(strict=True)]
+    if hint in (int, float):
+        return Annotated[hint, Field(strict=True, gt=known.gt, ge=known.ge, lt=known.lt, le=known.le)]
+    parts = tuple(_limited(part, known) for part in get_args(hint))
+    if get_origin(hint) in (Union, UnionType):
+        return Union[parts]  # noqa: UP007
+    return tuple[parts] if get_origin(hint) is tuple else hint
+
+
+def _checked(cls: type, name: str, value: Any, place: str = "") -> Any:
+    """A value of the right type and in its range; `place` is where it stands if it comes from plain data."""
+    known, kind, adapter = _fields_of(cls)[name]
+    if adapter is None:
+        return value
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if kind is int and isinstance(value, float) and value.is_integer():
+        value = int(value)
+    elif type(value) is int and float in (kind, *get_args(kind)) and get_origin(kind) is not tuple:
+        value = float(value)
+    try:
+        return adapter.validate_python(value)
+    except ValidationError as error:
+        problem = error.errors(include_url=False, include_context=False)[0]
+    own = f"{cls.group}.{name}"
+    wrong_type = _wrong_type(problem, kind)
+    # To somebody who writes Python the range says more than that a number must be finite.
+    if wrong_type and (
+        place or (not known.words and not (known.range and problem["type"] == "finite_number"))
+    ):
+        index = "" if problem["type"] == "missing" else "".join(f"[{i}]" for i in problem["loc"])
+        raise SceneError(f"{place or own}{index} is {problem['input']!r}; {wrong_type}")
+    if isinstance(value, list):
+        value = tuple(float(v) if type(v) is int and float in get_args(kind) else v for v in value)
+    raise SceneError(f"{own} is {value!r}{known.refusal}")
+
+
+def _wrong_type(problem: Any, kind: Any) -> str:
+    """What a value must be that is not of its type; empty for one that is, but is not allowed."""
+    match problem["type"]:
+        case "int_type" if isinstance(problem["input"], float):
+            return "it must be a whole number"
+        case "float_type" | "finite_number" | "int_type":
+            return "it must be a finite number"
+        case "bool_type":
+            return "allowed: true, false"
+        case "string_type":
+            return "it must be text"
+        case "tuple_type" | "missing" | "too_long":
+            count = "some" if get_origin(kind) is not tuple else len(get_args(kind))
+            return f"it must be a list of {count} values"
+    return ""
