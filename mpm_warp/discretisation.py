@@ -73,10 +73,9 @@ def _part_in_bin(distance: float) -> float:
 
 
 # --- Mirror symmetry about the vertical plane at mid-width, y = Ly / 2 ----------------------------------
-# Where a scene has it, the half with y >= Ly / 2 is computed and the whole is put together from it. Ghost
-# nodes across
-# the plane are images of nodes on this side, so half and whole agree to round-off. Particles on the plane
-# are their own images: they come first and count half.
+# Where a scene has it, the half with y >= Ly / 2 is computed and the whole is put together from it. Ghost nodes
+# across the plane are images of nodes on this side, so half and whole agree to round-off. Particles on the
+# plane are their own images: they come first and count half.
 
 _SAME = 1e-6  # positions closer than this are the same [grid spacings]
 

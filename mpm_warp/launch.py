@@ -135,11 +135,10 @@ def _unwritable(error: OSError) -> str:
 
 
 # --- Kernels that work for one scene or, in one launch, for many ----------------------------------------
-# What a scene asks of the device is a fixed order of kernels with fixed arguments. Where several scenes ask
-# for the same
-# kernels, one launch of each serves them all: a table holds every scene's arguments, and thread (s, i) does
-# in scene s
-# what thread i does where the scene is alone. Each scene keeps arrays, sizes, a material and a time step of its own.
+# What a scene asks of the device is a fixed order of kernels with fixed arguments. Where several scenes ask for
+# the same kernels, one launch of each serves them all: a table holds every scene's arguments, and thread (s, i)
+# does in scene s what thread i does where the scene is alone. Each scene keeps arrays, sizes, a material and a
+# time step of its own.
 
 
 class SceneKernel:

@@ -25,11 +25,10 @@ if TYPE_CHECKING:
 
 
 # --- A body whose height is free: it carries a load and rests on the soil -------------------------------
-# One thread on the device moves it once per substep with the impulse the soil gave it, so nothing waits for
-# the host and
-# the step can be part of a captured graph. Height and speed are kept in double precision whatever the solver's: in
-# single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that sinks slower than one such step per
-# substep would hang in the air.
+# One thread on the device moves it once per substep with the impulse the soil gave it, so nothing waits for the
+# host and the step can be part of a captured graph. Height and speed are kept in double precision whatever the
+# solver's: in single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that sinks slower
+# than one such step per substep would hang in the air.
 
 
 def stable_step(mass: float, contacts: float, stiffness: float, damping: float) -> float:

@@ -46,10 +46,10 @@ def splines(real: type) -> SimpleNamespace:
 
 
 # --- Rows of grid nodes: the three nodes along z that a particle touches, handled as one wide vector ----
-# The transfers are sums over 27 nodes of four numbers. Warp turns the arithmetic of its vectors into single numbers,
-# and the C++ compiler does not put them together again. On the CPU these few operations therefore use the compiler's
-# own vector type, which it maps to whatever registers the processor has. On a GPU a thread works on single numbers
-# anyway, so plain Warp code does the same there.
+# The transfers are sums over 27 nodes of four numbers. Warp turns the arithmetic of its vectors into single
+# numbers, and the C++ compiler does not put them together again. On the CPU these few operations therefore use
+# the compiler's own vector type, which it maps to whatever registers the processor has. On a GPU a thread works
+# on single numbers anyway, so plain Warp code does the same there.
 
 
 @cache

@@ -23,12 +23,9 @@ from sgns.config import UserError
 
 # --- Settings run nothing and open no file: what Hydra's own settings may hold --------------------------
 # Hydra makes objects by their names: `_target_` in its launchers, sweepers and callbacks, classes in its
-# logging. It sets
-# environment variables, and launchers of clusters run shell commands. A file of settings that somebody
-# passes on could
-# so run anything. What is allowed is listed here; everything else is refused. What may run a command, but
-# is of use, is
-# taken from the command line only.
+# logging. It sets environment variables, and launchers of clusters run shell commands. A file of settings that
+# somebody passes on could so run anything. What is allowed is listed here; everything else is refused. What may
+# run a command, but is of use, is taken from the command line only.
 
 # Logging: sections with the keys that an entry of theirs may have.
 _SECTIONS = {

@@ -164,8 +164,8 @@ def _sign(descriptor: int) -> None:
 
 
 # --- Small files that anybody may have written, read whole within bounds --------------------------------
-# What cannot be read is a `UserError` of one line with the file, what is wrong and what to do. Pipes and devices are
-# refused without waiting for them, larger files than asked for before they are read.
+# What cannot be read is a `UserError` of one line with the file, what is wrong and what to do. Pipes and
+# devices are refused without waiting for them, larger files than asked for before they are read.
 
 MOST_BYTES = 1 << 22
 """Of text; a thousand times what this package writes of most."""

@@ -21,8 +21,9 @@ from sgns import __version__
 from sgns.config import UserError
 
 # --- Parts of an HDF5 file that anybody may have written ------------------------------------------------
-# HDF5 can point out of a file: links, virtual datasets and raw data may lie in any other file that the reader may
-# open. And a file of a few kilobytes can claim arrays of any size. This package writes neither, and refuses both.
+# HDF5 can point out of a file: links, virtual datasets and raw data may lie in any other file that the reader
+# may open. And a file of a few kilobytes can claim arrays of any size. This package writes neither, and refuses
+# both.
 
 BROKEN = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError)
 """What h5py raises on damaged files, and this module on those that are not plain."""

@@ -235,8 +235,8 @@ def _sequence_example(record: bytes) -> tuple[dict[str, bytes], dict[str, list[b
 
 
 # --- The published reduced runs as a dataset to learn from ----------------------------------------------
-# The authors' basis is not published, only the modes' positions. So the basis here is the unit matrix: what is called
-# soil are the modes themselves, and the mean over all particles follows from how many there were.
+# The authors' basis is not published, only the modes' positions. So the basis here is the unit matrix: what is
+# called soil are the modes themselves, and the mean over all particles follows from how many there were.
 #
 # Shapes: T frames, M body points, r modes.
 

@@ -30,9 +30,9 @@ _STREAMED = ("position", "velocity")
 
 
 # --- A view of the soil for ParaView and VTK ------------------------------------------------------------
-# The group /VTKHDF describes a point cloud that changes with time (VTKHDF 2.0, PolyData with one vertex per particle).
-# `Points` and `PointData/velocity` are HDF5 virtual datasets: they show the H5MD arrays, reshaped from (T, n, 3) to
-# (T n, 3), and hold no copy. Format: docs.vtk.org, "VTKHDF file format".
+# The group /VTKHDF describes a point cloud that changes with time (VTKHDF 2.0, PolyData with one vertex per
+# particle). `Points` and `PointData/velocity` are HDF5 virtual datasets: they show the H5MD arrays, reshaped
+# from (T, n, 3) to (T n, 3), and hold no copy. Format: docs.vtk.org, "VTKHDF file format".
 
 VIEW_ATTRIBUTES = {
     "Version": np.array((2, 0), dtype="<i8"),  # the first with PolyData in time; newer readers take every 2.x

@@ -103,8 +103,8 @@ def height_map(positions: np.ndarray, grid: SurfaceGrid) -> np.ndarray:
 
 
 # --- How far a predicted run is from a simulated one: positions, surface, force and torque --------------
-# Both runs are files of the same kind and are read in chunks of frames, so memory does not grow with the
-# length of a run. The frames of the history, which the prediction was given, count in no metric.
+# Both runs are files of the same kind and are read in chunks of frames, so memory does not grow with the length
+# of a run. The frames of the history, which the prediction was given, count in no metric.
 
 # Reported names of the world axes x, y, z. Draft is −F_x; every relative metric is the same for −F_x and F_x.
 FORCE_COMPONENTS = {"draft": 0, "lateral": 1, "vertical": 2}

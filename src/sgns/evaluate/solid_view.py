@@ -19,8 +19,8 @@ from sgns.evaluate.metrics import particle_spacing
 from sgns.evaluate.side_view import SPEED, STEEL, body_corners, draw_force, hull, nice
 
 # --- Particles and a convex body in space, drawn into a depth buffer: what is nearer hides the rest -----
-# Parallel projection, so that lengths along an axis are the same everywhere in the picture.
-# Letters: n particles, k corners of the body, (h, w) rows and columns of the picture.
+# Parallel projection, so that lengths along an axis are the same everywhere in the picture. Letters: n
+# particles, k corners of the body, (h, w) rows and columns of the picture.
 
 # Where the light comes from, seen from the camera: right, up, towards it.
 LIGHT = np.array([-0.35, 0.55, 0.76])

@@ -149,8 +149,9 @@ def timed_run(overrides: list[str]) -> tuple[Observation, list[float], float, in
 
 
 # --- Reductions: what r modes leave out of runs that the basis has not seen, and what coding costs ------
-# An entry of `study.scenes.<scene>.reduction` has axis, label, `modes` (a list of r) and `centring`, and makes one
-# point for each r. One stream over the dataset's training runs serves all entries; held out are its other runs.
+# An entry of `study.scenes.<scene>.reduction` has axis, label, `modes` (a list of r) and `centring`, and makes
+# one point for each r. One stream over the dataset's training runs serves all entries; held out are its other
+# runs.
 
 
 def reduction_points(scene: StudyScene) -> Iterator[PointSettings]:

@@ -21,8 +21,8 @@ from sgns.data.files import read_arrays, whole_file
 from sgns.evaluate.metrics import SurfaceGrid, VectorErrors, height_error, height_map, rms_mm
 
 # --- What is kept of a run ------------------------------------------------------------------------------
-# Forces, torques and poses are kept in every frame. The soil is kept a few times a second, in two forms that do not
-# depend on which particles stand for it:
+# Forces, torques and poses are kept in every frame. The soil is kept a few times a second, in two forms that do
+# not depend on which particles stand for it:
 #
 # - its displacement around the points of a lattice: the mean displacement of the particles that started there, each
 #   weighted with its nearness (1 at the point, 0 one lattice spacing away along any axis);
@@ -165,9 +165,9 @@ def observe_arrays(
 
 
 # --- How far observed runs are from reference runs of the same scenes, on whatever particles --------------
-# Definitions are those of docs/conventions.md where it has them. Frame 0, at rest, does not count. Forces, torques and
-# poses of a run with another frame rate are interpolated in time at the reference's frames, its soil at the times at
-# which the reference's soil was observed.
+# Definitions are those of docs/conventions.md where it has them. Frame 0, at rest, does not count. Forces,
+# torques and poses of a run with another frame rate are interpolated in time at the reference's frames, its
+# soil at the times at which the reference's soil was observed.
 
 
 @dataclass(frozen=True)

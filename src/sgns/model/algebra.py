@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from sgns.model.network import MLP, EncodeProcessDecode
 
 # --- A linear layer, with or without ReLU, through the faster of torch's two matrix libraries on the CPU --
-# torch multiplies float32 matrices with the BLAS it was built with. oneDNN, which it also holds, applies bias and ReLU
-# on the way. torch gives it no public function: `nn.functional.linear` and ReLU take 1.04 times as long for 4096 rows
-# and 1.24 times for 9000 on one processor, twice as long on another (experiments/rollout_speed);
-# `torch.mkldnn` tensors, copied there and back, take 4 times as long.
+# torch multiplies float32 matrices with the BLAS it was built with. oneDNN, which it also holds, applies bias
+# and ReLU on the way. torch gives it no public function: `nn.functional.linear` and ReLU take 1.04 times as
+# long for 4096 rows and 1.24 times for 9000 on one processor, twice as long on another
+# (experiments/rollout_speed); `torch.mkldnn` tensors, copied there and back, take 4 times as long.
 
 # Below this many multiplications a product is over before oneDNN has begun.
 _WORTH_IT = 2**22

@@ -93,8 +93,8 @@ def build_graph(
 
 
 # --- What the network is told about the body: where it is and how it moves, frame by frame --------------
-# A tool's motion is prescribed. A wheel's height follows from the soil: of the node "pose" the network then predicts
-# the height, of the nodes "points" everything.
+# A tool's motion is prescribed. A wheel's height follows from the soil: of the node "pose" the network then
+# predicts the height, of the nodes "points" everything.
 #
 # Shapes: T frames, M body points, N body nodes (1 for "pose", M for "points"), K motion components (6 or 3).
 
@@ -235,9 +235,10 @@ def _value(scene: Mapping[str, Any], key: str) -> float | None:
 
 
 # --- Rate independence: slow dry soil follows the way a tool goes, not the time that it takes -----------
-# Dynamics learn from tools that move by so much per frame, and in every step they err a little: along a path much
-# slower than that, or at rest, the errors of thousands of steps add up to soil that flows on its own. There the soil
-# takes a step only each time that the tool has gone as far as the slowest trained one does in a frame.
+# Dynamics learn from tools that move by so much per frame, and in every step they err a little: along a path
+# much slower than that, or at rest, the errors of thousands of steps add up to soil that flows on its own.
+# There the soil takes a step only each time that the tool has gone as far as the slowest trained one does in a
+# frame.
 #
 # Shapes: T frames, M body points.
 

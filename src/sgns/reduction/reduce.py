@@ -118,9 +118,10 @@ def _shown(value: float, limit: float) -> str:
 #     <dataset>/reduced/<key>/basis.h5               fitted on the training split only
 #     <dataset>/reduced/<key>/<content hash>.h5      one reduced run each
 #
-# The key is made of the training runs' content and of the settings that the basis depends on, not of how many of
-# its modes are used: a basis of `max_modes` modes is kept and its first `num_modes` are used, so that a sweep over
-# them fits once. Every file appears complete or not at all, so several processes may do this at the same time.
+# The key is made of the training runs' content and of the settings that the basis depends on, not of how many
+# of its modes are used: a basis of `max_modes` modes is kept and its first `num_modes` are used, so that a
+# sweep over them fits once. Every file appears complete or not at all, so several processes may do this at the
+# same time.
 #
 # Letters: T frames, n particles, M body points, r modes.
 
