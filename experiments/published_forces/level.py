@@ -21,9 +21,8 @@ from pathlib import Path
 import numpy as np
 from run import HERE, campaign_of, compared, first_third, smoothed
 
-from mpm_warp import Excavation
+from mpm_warp import Excavation, Push
 from mpm_warp.poses import rotate
-from mpm_warp.scenes import Push
 from sgns.data.published import excavation_case
 from sgns.data.run import Run
 from sgns.simulate.command import simulate_campaign
