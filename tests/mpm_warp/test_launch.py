@@ -1,6 +1,4 @@
-"""Kernels that are damaged in Warp's cache."""
-
-from __future__ import annotations
+"""Kernels in Warp's cache, launches for one scene or many, and the work that scenes ask of the device."""
 
 import os
 import subprocess
