@@ -328,7 +328,7 @@ def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) ->
 
 
 def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
-    """The same for the network on modes, with `sgns.learning`."""
+    """The same for the network on modes, with `sgns.train`."""
     plain = settings(path)
     reduced = reduce_dataset(Dataset.open(path), plain["reduction"], progress=False)
     modes = plain["reduction"]["num_modes"]

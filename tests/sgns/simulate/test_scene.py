@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import yaml
 
-from mpm_warp import Decision, Effects, Material, SceneError, Tolerances, Wheel
-from sgns import conf
+from mpm_warp import Decision, Effects, SceneError, Tolerances, Wheel
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run
@@ -139,41 +137,6 @@ def test_summary_of_a_dataset():
     assert decision_summary([{"yielding": on}, {"yielding": off}]) == [
         "yielding on in 1 of 2 runs; else off: it rests"
     ]
-
-
-# --- Soils in conf/material ------------------------------------------------------------------------------
-
-SOILS = sorted(file.stem for file in (Path(conf.__path__[0]) / "material").glob("*.yaml"))
-
-
-def soil(name: str, *overrides: str) -> Material:
-    return scene_from_config(composed(f"material={name}", *overrides)).material
-
-
-@pytest.mark.parametrize("name", SOILS)
-def test_only_what_is_stated_is_warned_of(name: str) -> None:
-    """Glass beads of both sizes are below the K0 condition; nothing else is odd about any of them."""
-    warnings = soil(name).warnings()
-    assert ["K0" in w for w in warnings] == ([True] if "beads" in name else [])
-
-
-def test_default_soil_is_the_default_material() -> None:
-    assert soil("sand") == Material()
-
-
-@pytest.mark.parametrize(("angle", "friction"), [(30, 0.5774), (37, 0.7536), (43, 0.9325)])
-def test_the_papers_wheel_soils(angle: int, friction: float) -> None:
-    found = soil("wheel_sand", f"material.friction_angle={angle}")
-    assert found.static_friction == pytest.approx(friction, abs=1e-4)
-    assert found.limit_friction == 0.9616
-    assert found.youngs_modulus == 15e6
-
-
-def test_lunar_simulant_has_the_density_and_friction_of_its_source() -> None:
-    found = soil("lunar_simulant")
-    assert found.bulk_density == pytest.approx(1653.0)
-    assert found.static_friction == pytest.approx(1.0)
-    assert found.limit_friction == pytest.approx(1.2016)
 
 
 # --- Wheels and other bodies ------------------------------------------------------------------------------
