@@ -11,13 +11,26 @@ from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from types import UnionType
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from typing_extensions import dataclass_transform  # in `typing` from Python 3.11
 
 from .state import SceneError
 
+T = TypeVar("T")
 _CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True)
 
 
@@ -95,7 +108,8 @@ class Settings:
             object.__setattr__(self, name, _checked(type(self), name, getattr(self, name)))
 
 
-def settings(cls: type) -> type:
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+def settings(cls: type[T]) -> type[T]:
     """An immutable dataclass of settings, which its documentation lists."""
     cls = dataclass(frozen=True)(cls)
     lines = [inspect.cleandoc(cls.__doc__), "", "Settings and their defaults:"]
