@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from .effects import Effects
 from .limits import scene_size
 from .scene import Scene
 from .scenes import Column
+from .settings import Settings, setting, settings
 from .state import SceneError
 
 # --- How soil is expected to flow in a scene: an estimate from the scene alone, before anything is computed
@@ -117,25 +118,16 @@ EFFECTS = (*(f.name for f in fields(Effects)), "free_body")
 """What can be asked for: the switches of `Effects`, and whether the body's height is free."""
 
 
-@dataclass(frozen=True)
-class Tolerances:
+@settings
+class Tolerances(Settings):
     """How little an effect may do before it is left out."""
 
-    friction: float = 0.005
-    """Rate dependence: what mu(I) adds to the friction, as a share of mu_s [-]."""
-    grid: float = 0.03
-    """Nonlocality: A d, as a share of the grid spacing [-]."""
-    reach: float = 0.02
-    """Nonlocality: the cooperativity length, as a share of the thickness of the flowing layer [-]."""
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not (number and math.isfinite(value) and value >= 0.0):
-                raise SceneError(
-                    f"effects.tolerance.{field.name} is {value!r}; it must be a number, 0 or more"
-                )
+    group: ClassVar[str] = "effects.tolerance"
+    friction: float = setting(
+        0.005, "rate_dependence: what mu(I) adds to the friction, as a share of mu_s", ge=0
+    )
+    grid: float = setting(0.03, "nonlocality: A d, as a share of the grid spacing", ge=0)
+    reach: float = setting(0.02, "nonlocality: cooperativity length, as a share of the flowing layer", ge=0)
 
 
 class Decision(NamedTuple):

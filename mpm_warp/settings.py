@@ -9,7 +9,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, MISSING, dataclass, field, fields, is_dataclass, replace
-from functools import cache
 from types import UnionType
 from typing import (
     Annotated,
@@ -26,11 +25,12 @@ from typing import (
 
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
-from typing_extensions import dataclass_transform  # in `typing` from Python 3.11
+from typing_extensions import Self, dataclass_transform  # in `typing` from Python 3.11
 
 from .state import SceneError
 
 T = TypeVar("T")
+_FIELDS: dict[type, dict[str, _Field]] = {}
 _CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True)
 
 
@@ -45,7 +45,7 @@ class Setting:
     ge: float | None = None
     lt: float | None = None
     le: float | None = None
-    choices: tuple[str, ...] = ()
+    choices: tuple[Any, ...] = ()
     note: str = ""
     """Follows the range in an error, to say why it is so."""
     words: str = ""
@@ -63,7 +63,7 @@ class Setting:
             "at most {:g}": self.le,
         }
         given = [words.format(limit) for words, limit in limits.items() if limit is not None]
-        return ", ".join([*self.choices, *given])
+        return ", ".join([*("false" if one is False else str(one) for one in self.choices), *given])
 
     @property
     def refusal(self) -> str:
@@ -75,14 +75,16 @@ class Setting:
 
 def setting(default: Any, *known: str, **limits: Any) -> Any:
     """A dataclass field; a default that is called makes a new one. The rest as in `Setting`."""
-    kind = "default_factory" if callable(default) else "default"
-    return field(**{kind: default}, metadata={"setting": Setting(*known, **limits)})
+    metadata = {"setting": Setting(*known, **limits)}
+    if callable(default):
+        return field(default_factory=default, metadata=metadata)
+    return field(default=default, metadata=metadata)
 
 
 def same(cls: type, name: str, **default: Any) -> Any:
     """A dataclass field that is the same setting as one of another group, also its default if no other is given."""
     (found,) = (one for one in fields(cls) if one.name == name)
-    return field(**({"default": found.default} | default), metadata=found.metadata)
+    return field(default=default.get("default", found.default), metadata=found.metadata)
 
 
 def lengths(default: tuple[float, float, float], words: str) -> Any:
@@ -101,18 +103,26 @@ class Settings:
     """Base of the groups of settings. Their values are checked when they are made."""
 
     group: ClassVar[str]
-    """Where its settings stand, as errors name it."""
+    """Where its settings stand, as errors name it; empty: at the top."""
+    raises: ClassVar[type[Exception]] = SceneError
+    """What is raised for a value that is not allowed."""
 
     def __post_init__(self) -> None:
-        for name in _fields_of(type(self)):
-            object.__setattr__(self, name, _checked(type(self), name, getattr(self, name)))
+        cls = type(self)
+        for name in _fields_of(cls):
+            object.__setattr__(self, name, _checked(cls, name, getattr(self, name)))
+
+    @classmethod
+    def from_dict(cls, data: Any) -> Self:
+        """From plain data; what they do not name has its default. Errors as `build`."""
+        return build(cls, data, cls.group)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def settings(cls: type[T]) -> type[T]:
     """An immutable dataclass of settings, which its documentation lists."""
     cls = dataclass(frozen=True)(cls)
-    lines = [inspect.cleandoc(cls.__doc__), "", "Settings and their defaults:"]
+    lines = [inspect.cleandoc(cls.__doc__ or ""), "", "Settings and their defaults:"]
     for name, default, allowed, meaning in described(cls):
         lines.append(f"    {name} = {default}: {meaning}{allowed and f' ({allowed})'}")
     cls.__doc__ = "\n".join(lines)
@@ -133,9 +143,10 @@ def reference(groups: Iterable[type]) -> str:
     """The page of the documentation that lists the settings of some classes, in Markdown."""
     lines = ["# Settings of scenes, soil and physics", "", "Python and the command line have the same names."]
     for cls in groups:
-        shared = described(cls.__base__) if is_dataclass(cls.__base__) else []
-        also = f" It has the settings of {cls.__base__.__name__}, too." if shared else ""
-        lines += ["", f"## {cls.__name__}", "", cls.__doc__.splitlines()[0] + also, ""]
+        base = cls.__base__
+        shared = described(base) if base and is_dataclass(base) else []
+        also = f" It has the settings of {base.__name__}, too." if base and shared else ""
+        lines += ["", f"## {cls.__name__}", "", inspect.getdoc(cls).splitlines()[0] + also, ""]  # type: ignore[union-attr]
         lines += ["| setting | default | allowed | meaning |", "|---|---|---|---|"]
         for name, *known in described(cls):
             if (name, *known) not in shared:
@@ -145,7 +156,7 @@ def reference(groups: Iterable[type]) -> str:
 
 def _short(value: Any) -> str:
     """A default; of a group of settings only those that are not the group's own."""
-    if not is_dataclass(value):
+    if not is_dataclass(value) or isinstance(value, type):
         return repr(value)
     changed = {f.name: getattr(value, f.name) for f in fields(value)}
     own = type(value)()
@@ -153,7 +164,7 @@ def _short(value: Any) -> str:
     return f"{type(value).__name__}({', '.join(words)})"
 
 
-def build(cls: type, data: Any, where: str, make: Callable[..., Any] | None = None) -> Any:
+def build(cls: type[Settings], data: Any, where: str, make: Callable[..., Any] | None = None) -> Any:
     """A group of settings from nested plain data.
 
     Args:
@@ -163,17 +174,17 @@ def build(cls: type, data: Any, where: str, make: Callable[..., Any] | None = No
         make: what is called with the values in place of the class.
 
     Raises:
-        SceneError: the data have other keys, or values that are not of their type or not allowed.
+        cls.raises: the data have other keys, or values that are not of their type or not allowed.
     """
     if not isinstance(data, dict):
-        raise SceneError(f"{where} is {data!r}; it must be a group of keys")
+        raise cls.raises(f"{where} is {data!r}; it must be a group of keys")
     known = _fields_of(cls)
-    if unknown := sorted(set(data) - set(known)):
-        raise SceneError(f"{where} has no key {unknown[0]!r}; allowed: {', '.join(sorted(known))}")
+    if unknown := sorted(set(map(str, data)) - set(known)):
+        raise cls.raises(f"{where} has no key {unknown[0]!r}; allowed: {', '.join(sorted(known))}")
     values = {}
     for key, value in data.items():
-        kind, place = known[key].type, f"{where}.{key}"
-        groups = [part for part in (kind, *get_args(kind)) if is_dataclass(part)]
+        kind, place = known[key].type, f"{where}.{key}".lstrip(".")
+        groups = _groups(kind)
         if not groups or isinstance(value, tuple(groups)):
             values[key] = _checked(cls, key, value, place)
         else:
@@ -181,7 +192,12 @@ def build(cls: type, data: Any, where: str, make: Callable[..., Any] | None = No
     return (make or cls)(**values)
 
 
-def _chosen(groups: list[type], value: Any, where: str) -> type:
+def _groups(kind: Any) -> list[Any]:
+    """The classes of settings in a type."""
+    return [part for part in (kind, *get_args(kind)) if is_dataclass(part)]
+
+
+def _chosen(groups: list[Any], value: Any, where: str) -> Any:
     """The one of some groups that plain data name by their key `shape`."""
     if len(groups) == 1:
         return groups[0]
@@ -192,8 +208,13 @@ def _chosen(groups: list[type], value: Any, where: str) -> type:
     return shapes[shape]
 
 
-@cache
 def _fields_of(cls: type) -> dict[str, _Field]:
+    if cls not in _FIELDS:
+        _FIELDS[cls] = _read_fields(cls)
+    return _FIELDS[cls]
+
+
+def _read_fields(cls: Any) -> dict[str, _Field]:
     hints = get_type_hints(cls, localns={cls.__name__: cls})  # its module does not have it yet
     found = {}
     for one in fields(cls):
@@ -203,8 +224,7 @@ def _fields_of(cls: type) -> dict[str, _Field]:
         known = next((f.metadata["setting"] for f in bases if f and "setting" in f.metadata), Setting(""))
         choices = [get_args(part) for part in (hint, *get_args(hint)) if get_origin(part) is Literal]
         known = replace(known, choices=sum(choices, ()))
-        group = any(map(is_dataclass, (hint, *get_args(hint))))
-        adapter = None if group else TypeAdapter(_limited(hint, known), config=_CONFIG)
+        adapter = None if _groups(hint) else TypeAdapter(_limited(hint, known), config=_CONFIG)
         found[one.name] = _Field(known, hint, adapter)
     return found
 
@@ -218,10 +238,10 @@ def _limited(hint: Any, known: Setting) -> Any:
     parts = tuple(_limited(part, known) for part in get_args(hint))
     if get_origin(hint) in (Union, UnionType):
         return Union[parts]  # noqa: UP007
-    return tuple[parts] if get_origin(hint) is tuple else hint
+    return get_origin(hint)[parts] if get_origin(hint) in (tuple, list) else hint
 
 
-def _checked(cls: type, name: str, value: Any, place: str = "") -> Any:
+def _checked(cls: type[Settings], name: str, value: Any, place: str = "") -> Any:
     """A value of the right type and in its range; `place` is where it stands if it comes from plain data."""
     known, kind, adapter = _fields_of(cls)[name]
     if adapter is None:
@@ -236,25 +256,25 @@ def _checked(cls: type, name: str, value: Any, place: str = "") -> Any:
         return adapter.validate_python(value)
     except ValidationError as error:
         problem = error.errors(include_url=False, include_context=False)[0]
-    own = f"{cls.group}.{name}"
-    wrong_type = _wrong_type(problem, kind)
+    own = f"{cls.group}.{name}".lstrip(".")
+    wrong_type = "" if known.choices else _wrong_type(problem, kind)
     # To somebody who writes Python the range says more than that a number must be finite.
     if wrong_type and (
         place or (not known.words and not (known.range and problem["type"] == "finite_number"))
     ):
         index = "" if problem["type"] == "missing" else "".join(f"[{i}]" for i in problem["loc"])
-        raise SceneError(f"{place or own}{index} is {problem['input']!r}; {wrong_type}")
-    if isinstance(value, list):
+        raise cls.raises(f"{place or own}{index} is {problem['input']!r}; {wrong_type}")
+    if isinstance(value, list) and get_origin(kind) is tuple:
         value = tuple(float(v) if type(v) is int and float in get_args(kind) else v for v in value)
-    raise SceneError(f"{own} is {value!r}{known.refusal}")
+    raise cls.raises(f"{own} is {value!r}{known.refusal}")
 
 
 def _wrong_type(problem: Any, kind: Any) -> str:
     """What a value must be that is not of its type; empty for one that is, but is not allowed."""
     match problem["type"]:
-        case "int_type" if isinstance(problem["input"], float):
+        case "int_type":
             return "it must be a whole number"
-        case "float_type" | "finite_number" | "int_type":
+        case "float_type" | "finite_number":
             return "it must be a finite number"
         case "bool_type":
             return "allowed: true, false"

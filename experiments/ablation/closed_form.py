@@ -28,8 +28,8 @@ from sgns.data.published import PARTICLES, published_dataset
 from sgns.model.checkpoint import load_surrogate
 from sgns.model.dynamics import Dynamics
 from sgns.model.features import moves_freely, varying_context
-from sgns.model.settings import FitSettings, PolynomialSettings
 from sgns.reduction.reduce import ReducedRun, reduce_dataset
+from sgns.settings import FitSettings, PolynomialSettings
 from sgns.train.callbacks import RolloutScore, ValidationRollouts
 from sgns.train.polynomial import best_polynomial, candidates, moments, select, unfitted
 from sgns.train.windows import TrainingWindows

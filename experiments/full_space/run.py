@@ -36,11 +36,11 @@ from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceW
 from sgns.evaluate.metrics import VectorErrors, mean_prediction, skill
 from sgns.model.features import BodyTrack
 from sgns.model.network import Standardiser
-from sgns.model.settings import ModelSettings
 from sgns.reduction.reduce import reduce_dataset
+from sgns.settings import ModelSettings, TrainingSettings
 from sgns.simulator import Simulator
 from sgns.train.command import train as train_subspace
-from sgns.train.lightning_module import SurrogateTraining, TrainingSettings, prepared
+from sgns.train.lightning_module import SurrogateTraining, prepared
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -28,7 +28,7 @@ from sgns.evaluate.costs import cpu_model
 from sgns.model.algebra import GraphStepper, product
 from sgns.model.features import BodyTrack
 from sgns.model.network_dynamics import LatentDynamics
-from sgns.model.settings import ModelSettings
+from sgns.settings import ModelSettings
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -269,8 +269,6 @@ def main(cfg: DictConfig) -> float:
     from sgns.simulate.scene import scene_from_config
     from sgns.simulator import Simulator
 
-    if not isinstance(cfg.rate_independent, bool):
-        raise UserError(f"rate_independent is {cfg.rate_independent!r}; it must be true or false")
     output = Path(cfg.output)
     require_run_place(output)
     scene = scene_from_config(cfg)

@@ -20,7 +20,7 @@ def campaign(folder: Path, seed: int = 0, **change: Any) -> Campaign:
     """Ten small cuts; keyword arguments change the settings of the dataset."""
     settings = {
         "name": "tiny",
-        "path": folder / "tiny",
+        "path": str(folder / "tiny"),
         "draw": {"rake": [0.0, 10.0], "depth": [0.02, 0.04, 0.05], "blade.friction": [0.1, 0.3]},
         "runs": 10,
     }

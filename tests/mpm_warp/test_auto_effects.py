@@ -139,7 +139,7 @@ def test_tolerances_decide():
     assert not effects_for(scene, tolerances=Tolerances(reach=0.2, friction=0.5))[0].rate_dependence
     none = Tolerances(friction=0.0, grid=0.0, reach=0.0)
     assert effects_for(cut(duration=0.5), tolerances=none)[0].nonlocality
-    with pytest.raises(SceneError, match=r"effects.tolerance.grid is -1; it must be a number, 0 or more"):
+    with pytest.raises(SceneError, match=r"effects.tolerance.grid is -1.0; it must be 0 or more"):
         Tolerances(grid=-1)
 
 

@@ -17,9 +17,10 @@ import torch
 from torch import nn
 
 from sgns.model.network_dynamics import LatentDynamics
+from sgns.settings import TrainingSettings
 from sgns.simulator import Simulator
 from sgns.train.callbacks import StepProgress
-from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
+from sgns.train.lightning_module import SurrogateTraining
 from sgns.train.windows import TrainingWindows
 
 from .case import Case

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields
 from typing import Any, ClassVar
 
 from hydra.core.config_loader import ConfigLoader
@@ -17,6 +18,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from sgns import settings as typed
 from sgns.cli.help import groups_of, options_of
 from sgns.cli.setting_errors import describe
 from sgns.config import UserError
@@ -335,7 +337,7 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
         what = "a value is" if len(missing) == 1 else "values are"
         give = "run files, as in sgns check run.h5" if command == "check" else keys
         raise UserError(f"{what} missing for {', '.join(missing)}; give {give}; see sgns {command} --help")
-    OmegaConf.to_container(cfg, resolve=True)
+    plain: Any = OmegaConf.to_container(cfg, resolve=True)
     for group, default in groups_of(command).items():
         if default is not None and cfg.get(group) is None:
             allowed = ", ".join(options_of(group))
@@ -344,24 +346,20 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
         value = OmegaConf.select(cfg, key)
         if not isinstance(value, str) or not value:
             raise UserError(f"{key} is {_shown(value)}; it must be a path; see sgns {command} --help")
-    if cfg.get("checkpoint") is not None and not isinstance(cfg.checkpoint, str):
-        raise UserError(f"checkpoint is {_shown(cfg.checkpoint)}; it must be a path")
-    if "seed" in cfg and (not isinstance(cfg.seed, int) or isinstance(cfg.seed, bool) or cfg.seed < 0):
-        raise UserError(f"seed is {_shown(cfg.seed)}; it must be a whole number, 0 or more")
-    modes = cfg.get("num_modes")
-    if modes is not None and (not isinstance(modes, int) or isinstance(modes, bool) or modes < 1):
-        raise UserError(f"num_modes is {_shown(modes)}; it must be a whole number, 1 or more, or null")
-    if isinstance(cfg.get("dataset"), DictConfig) and cfg.dataset.get("name") is None:
+    if isinstance(plain.get("dataset"), dict) and plain["dataset"].get("name") is None:
         raise UserError(
             "dataset.name is missing; choose a dataset, as in dataset=quick, or give this one a name"
         )
-    where = OmegaConf.select(cfg, "dataset.where")
-    if where is not None and not isinstance(where, DictConfig):
-        raise UserError(
-            f"dataset.where is {_shown(where)}; it must be keys of the scene with their values, or null"
-        )
-    if "device" in cfg and not isinstance(cfg.device, str):
-        raise UserError(f"device is {_shown(cfg.device)}; allowed: cpu, cuda")
+    own = typed.COMMANDS[command]
+    own.from_dict({one.name: plain[one.name] for one in fields(own) if one.name in plain})
+    if plain.get("dataset") is not None:
+        typed.dataset_settings(plain["dataset"])
+    if "reduction" in plain:
+        typed.ReductionSettings.from_dict(plain["reduction"])
+    if "model" in plain:
+        typed.training_settings(plain["model"], plain["training"])
+    if "solver" in plain:
+        typed.SolverSettings.from_dict(plain["solver"])
 
 
 def _shown(value: Any) -> str:

@@ -321,8 +321,6 @@ def main(cfg: DictConfig) -> float:
         UserError: A path is missing or a file has a problem; all problems have been listed before.
     """
     named = [cfg.files] if isinstance(cfg.files, str) else OmegaConf.to_container(cfg, resolve=True)["files"]
-    if not isinstance(named, list) or not all(isinstance(path, str) for path in named):
-        raise UserError(f"files is {named!r}; it must be paths of run files, as in sgns check run.h5")
     files = run_files(named)
     bad = 0
     for path in files:

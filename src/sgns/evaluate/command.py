@@ -39,9 +39,9 @@ from sgns.evaluate.results import (
 )
 from sgns.evaluate.tables import write_tables
 from sgns.evaluate.words import describe, forward_name, short_names
-from sgns.model.settings import ModelSettings, model_settings
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout
+from sgns.settings import ModelSettings, model_settings
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -248,12 +248,6 @@ def main(cfg: DictConfig) -> float:
     from sgns.simulator import Simulator
 
     new_rollouts = [cfg.new_rollouts] if isinstance(cfg.new_rollouts, str) else cfg.new_rollouts or []
-    if not isinstance(new_rollouts, Sequence):
-        raise UserError(f"new_rollouts is {new_rollouts!r}; it must be a list of run files, as [a.h5,b.h5]")
-    if not isinstance(cfg.timing_repeats, int) or cfg.timing_repeats < 3:
-        raise UserError(f"timing_repeats is {cfg.timing_repeats!r}; it must be a whole number, at least 3")
-    if not isinstance(cfg.full_space, bool):
-        raise UserError(f"full_space is {cfg.full_space!r}; it must be true or false")
     checkpoint, output = Path(cfg.checkpoint), Path(cfg.output)
     published = cfg.dataset.get("format") == "published"
     if not published:
@@ -270,7 +264,7 @@ def main(cfg: DictConfig) -> float:
             output,
             split=cfg.split,
             checkpoint=checkpoint,
-            new_rollouts=[Path(str(path)) for path in new_rollouts],
+            new_rollouts=[Path(path) for path in new_rollouts],
             repeats=cfg.timing_repeats,
             full_space=cfg.full_space,
             made=provenance(simulator, checkpoint),

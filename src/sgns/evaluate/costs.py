@@ -23,8 +23,8 @@ from sgns.data.run import Run
 from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
 from sgns.evaluate.results import Costs, FullSpaceCost
 from sgns.model.checkpoint import SUMMARY, load_surrogate, read_summary
-from sgns.model.settings import ModelSettings
 from sgns.rollout import single_thread
+from sgns.settings import ModelSettings
 
 if TYPE_CHECKING:
     from sgns.simulator import Simulator

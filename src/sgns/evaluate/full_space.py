@@ -22,7 +22,7 @@ from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.model.features import BodyTrack, body_track
 from sgns.model.network import EncodeProcessDecode, Standardiser
-from sgns.model.settings import ModelSettings
+from sgns.settings import ModelSettings
 from sgns.train.windows import random_walk
 
 # --- Body nodes close enough together that soil particles cannot pass between them unseen ---------------

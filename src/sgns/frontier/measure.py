@@ -43,15 +43,15 @@ from sgns.frontier.study import (
     one_core,
     stopwatch,
 )
-from sgns.model.settings import ModelSettings, model_settings
 from sgns.reduction.basis import CENTRINGS, Basis, reconstruction_curve
 from sgns.reduction.reduce import ReducedDataset, ReducedRun, fit_runs, reduce_dataset
 from sgns.rollout import finite_frames, single_thread
+from sgns.settings import ModelSettings, TrainingSettings, model_settings
 from sgns.simulate.scene import asked_effects, decided
 from sgns.simulator import Simulator
 from sgns.states import Rollout
 from sgns.train.command import train
-from sgns.train.lightning_module import SurrogateTraining, TrainingSettings, prepared
+from sgns.train.lightning_module import SurrogateTraining, prepared
 
 log = logging.getLogger(__name__)
 

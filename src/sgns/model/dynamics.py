@@ -17,7 +17,7 @@ from sgns.arrays import is_whole
 from sgns.config import UserError
 from sgns.model.features import BodyTrack
 from sgns.model.network import Standardiser
-from sgns.model.settings import ModelSettings, PolynomialSettings
+from sgns.settings import ModelSettings, PolynomialSettings
 
 # No latent position goes further than this from its mean, in deviations; training runs stay within about half of it. It
 # keeps a rollout finite that has left everything the dynamics know.

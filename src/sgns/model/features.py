@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 # --- The graph the network sees: one node per mode, one or more for the body, and edges between them ----
 # Shapes: B batch, V nodes, E edges, d history positions, r modes.
 
-EDGES = ("complete", "star")
-
 
 class Graph(NamedTuple):
     """A batch of graphs that share one set of edges.
@@ -97,8 +95,6 @@ def build_graph(
 # predicts the height, of the nodes "points" everything.
 #
 # Shapes: T frames, M body points, N body nodes (1 for "pose", M for "points"), K motion components (6 or 3).
-
-BODY_NODES = ("pose", "points")
 
 
 class BodyTrack(NamedTuple):

@@ -18,7 +18,7 @@ from sgns.model.algebra import GraphStepper
 from sgns.model.dynamics import Dynamics, Path, Prediction, Step, Stepper, unrolled
 from sgns.model.features import BodyTrack, build_graph, edge_indices, free_axes, nearest_rigid
 from sgns.model.network import EncodeProcessDecode, Standardiser
-from sgns.model.settings import ModelSettings
+from sgns.settings import ModelSettings
 
 
 class LatentDynamics(Dynamics):

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from sgns.model.dynamics import Dynamics, Step
 from sgns.model.features import BodyTrack, free_axes
 from sgns.model.network import Standardiser
-from sgns.model.settings import PolynomialSettings
+from sgns.settings import PolynomialSettings
 
 
 def normalised(statistics: Standardiser, groups: Sequence[Tensor]) -> Tensor:

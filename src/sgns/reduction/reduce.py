@@ -10,20 +10,21 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from sgns.arrays import require_shapes
-from sgns.config import UserError, check_fields
+from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
 from sgns.data.files import new_hdf5, parse_json, require_replaceable
 from sgns.data.layout import BROKEN, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
-from sgns.reduction.basis import CENTRINGS, Basis, reconstruction_curve
+from sgns.reduction.basis import Basis, reconstruction_curve
 from sgns.reduction.pca import IncrementalPCA, checked_device
+from sgns.settings import ReductionSettings
 
 log = logging.getLogger(__name__)
 
@@ -208,7 +209,7 @@ def reduce_dataset(
         UserError: No training runs, runs of different beds, more modes asked than the data has, or no
             number of modes good enough.
     """
-    settings = check_settings(reduction)
+    settings = ReductionSettings.from_dict(dict(reduction)).to_dict()
     checked_device(device)
     paths = {split: dataset.runs(split) for split in SPLITS}
     everything = [path for split in SPLITS for path in paths[split]]
@@ -239,39 +240,6 @@ def reduce_dataset(
         start = run.positions(slice(0, 1))[0].astype(np.float64)
     runs = {split: [reduced[path] for path in paths[split]] for split in SPLITS}
     return ReducedDataset(basis, num_modes, folder, frame_rate, start, runs)
-
-
-class ReductionSettings(TypedDict):
-    """What `conf/reduction` says; see there for the meaning of each key."""
-
-    num_modes: int | str
-    max_modes: int
-    centring: str
-    choose: str
-    tolerance: float
-    share: float
-
-
-def check_settings(reduction: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings as plain values, refused where they make no sense."""
-    check_fields(ReductionSettings, reduction, "reduction")
-    settings = dict(reduction)
-    for key, allowed in (("centring", CENTRINGS), ("choose", MEASURES)):
-        if settings[key] not in allowed:
-            raise UserError(f"reduction.{key} is {settings[key]!r}; allowed: {', '.join(allowed)}")
-    num_modes, max_modes = settings["num_modes"], settings["max_modes"]
-    if isinstance(num_modes, str) and num_modes != "auto":
-        raise UserError(f"reduction.num_modes is {num_modes!r}; it must be a whole number or auto")
-    if not 1 <= (1 if num_modes == "auto" else num_modes) <= max_modes:
-        raise UserError(
-            f"reduction.num_modes is {num_modes}; allowed: 1 to reduction.max_modes "
-            f"({max_modes}); raise reduction.max_modes to keep more"
-        )
-    if settings["tolerance"] <= 0:
-        raise UserError(f"reduction.tolerance is {settings['tolerance']}; it must be more than 0 [mm]")
-    if not 0 < settings["share"] <= 1:
-        raise UserError(f"reduction.share is {settings['share']}; it must be more than 0 and at most 1")
-    return settings
 
 
 def check_one_bed(paths: Sequence[Path]) -> tuple[dict[Path, str], float]:

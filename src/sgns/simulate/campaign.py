@@ -19,6 +19,7 @@ from mpm_warp import Decision, Effects, Scene, SceneError, substeps_per_frame
 from sgns.config import UserError, flattened
 from sgns.data.dataset import SPLITS, read_description
 from sgns.data.files import file_lock, write_whole
+from sgns.settings import DatasetSettings
 from sgns.simulate.scene import decided
 
 # --- What runs cost in work, time and disk, before and while they are made ------------------------------
@@ -227,11 +228,12 @@ def plan(
         precision: float32 or float64.
         seed: of the drawn combinations and the split.
     """
+    asked = DatasetSettings.from_dict(settings)
     for key in ("name", "path", "draw"):
-        if settings.get(key) is None:
+        if not getattr(asked, key):
             raise UserError(f"dataset.{key} is missing; a campaign needs name, path and draw")
-    combinations = _combinations(settings["draw"])
-    count = settings.get("runs") or len(combinations)
+    combinations = _combinations(asked.draw)
+    count = asked.runs or len(combinations)
     if not 3 <= count <= len(combinations):
         raise UserError(
             f"dataset.runs is {count}; allowed: 3 to {len(combinations)}, the combinations of dataset.draw"
@@ -252,10 +254,10 @@ def plan(
         scenes[name] = Scene.from_dict(plain)
         grids.setdefault(grid, []).append(name)
     return Campaign(
-        name=settings["name"],
-        path=Path(settings["path"]),
+        name=asked.name,
+        path=Path(asked.path),
         scenes=scenes,
-        split=_split(list(grids.values()), settings.get("split", [0.8, 0.1, 0.1]), rng),
+        split=_split(list(grids.values()), asked.split, rng),
         effects=effects,
         precision=precision,
         seed=seed,
@@ -278,12 +280,8 @@ def _combinations(draw: Any) -> list[tuple[int, dict[str, Any]]]:
     return combinations
 
 
-def _split(grids: list[list[str]], shares: list[float], rng: np.random.Generator) -> dict[str, str]:
+def _split(grids: list[list[str]], shares: tuple[float, ...], rng: np.random.Generator) -> dict[str, str]:
     """Each name's part, by chance within each grid, so that every part has its share of every grid."""
-    if len(shares) != 3 or min(shares) < 0 or abs(sum(shares) - 1.0) > 1e-6:
-        raise UserError(
-            f"dataset.split is {shares}; it needs three shares (train, validation, test) that sum to 1"
-        )
     part = {}
     for names in grids:
         validation, test = (max(round(s * len(names)), 1 if s > 0 else 0) for s in shares[1:])

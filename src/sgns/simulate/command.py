@@ -34,8 +34,6 @@ def _base_scene(settings: dict[str, Any]) -> dict[str, Any]:
     if any(o.startswith("scene=") for o in overrides):
         raise UserError(f"dataset={settings['name']} brings its own scene; leave out scene=")
     kept = [o for o in overrides if not o.lstrip("+~").startswith("dataset")]
-    if not isinstance(settings.get("change") or {}, dict):
-        raise UserError(f"dataset.change is {settings['change']!r}; it must be a group of keys of the scene")
     change = [f"scene.{key}={json.dumps(value)}" for key, value in (settings.get("change") or {}).items()]
     cfg = compose("simulate", [f"scene={settings['scene']}", *change, *kept])
     return scene_from_config(cfg).to_dict()
@@ -53,9 +51,7 @@ def main(cfg: DictConfig) -> float | None:
         restart = restart_from(cfg, HydraConfig.get().overrides.task)
         same = {name: getattr(restart, name) for name in ("effects", "reasons", "seed", "precision")}
         return _simulate_one(restart.scene, cfg, **same, restart=restart)
-    asked, batch = asked_effects(cfg), cfg.solver.batch
-    if type(batch) is not int or batch < 1:
-        raise UserError(f"solver.batch is {batch!r}; it must be a whole number, 1 or more")
+    asked = asked_effects(cfg)
     if cfg.get("dataset") is not None:  # `dataset: null` in a defaults list leaves no key
         settings = OmegaConf.to_container(cfg.dataset, resolve=True)
         if settings.get("where"):
@@ -63,7 +59,7 @@ def main(cfg: DictConfig) -> float | None:
                 "dataset.where picks among runs that are there; to simulate fewer change dataset.draw"
             )
         campaign = plan(settings, _base_scene(settings), asked, cfg.solver.precision, cfg.seed)
-        batch = 1 if cfg.device == "cpu" else batch
+        batch = 1 if cfg.device == "cpu" else cfg.solver.batch
         simulate_campaign(campaign, device=cfg.device, batch=batch, shard=cfg.shard, shards=cfg.shards)
         return None
     if (cfg.shard, cfg.shards) != (0, 1):

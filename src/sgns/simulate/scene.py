@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mpm_warp import Decision, Effects, Scene, Tolerances, effects_for
 from mpm_warp.inputs import read_text
-from sgns.config import UserError, check_fields
+from sgns.config import UserError
 
 # --- From conf to a scene of mpm_warp -------------------------------------------------------------------
 
@@ -70,17 +70,11 @@ def decided(scene: Scene, asked: Mapping[str, Any]) -> tuple[Effects, dict[str, 
     """The effects of a scene, and the decision about each, for effects asked for as `asked_effects` gives them.
 
     Raises:
-        UserError: the tolerances are not what they should be.
-        SceneError: the effects are not, or the scene cannot have them.
+        SceneError: effects or tolerances are not what they should be, or the scene cannot have them.
     """
     switches = dict(asked)
     tolerance = switches.pop("tolerance", None)
-    if tolerance is None:
-        return effects_for(scene, switches)
-    if not isinstance(tolerance, Mapping):
-        raise UserError(f"effects.tolerance is {tolerance!r}; it must be a group of keys")
-    check_fields(Tolerances, tolerance, "effects.tolerance")
-    return effects_for(scene, switches, Tolerances(**tolerance))
+    return effects_for(scene, switches, Tolerances.from_dict({} if tolerance is None else tolerance))
 
 
 def recorded(decisions: Mapping[str, Decision]) -> dict[str, dict[str, Any]]:

@@ -70,9 +70,7 @@ def simulate_campaign(
         UserError: before anything is made, when the disk is too full; after all other runs are done, when some could
             not be made.
     """
-    if type(shards) is not int or shards < 1:
-        raise UserError(f"shards is {shards!r}; it must be a whole number, 1 or more")
-    if type(shard) is not int or not 0 <= shard < shards:
+    if not 0 <= shard < shards:
         raise UserError(
             f"shard is {shard!r}; with shards={shards} it must be a whole number from 0 to {shards - 1}"
         )

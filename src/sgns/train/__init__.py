@@ -1,11 +1,12 @@
 """`sgns train`: windows, loss, validation, and the fit of every kind of model.
 
-A kind of model is its `Dynamics` (`sgns.model`), a file here with a `Fit`, and a line in `command.FITS`.
+A kind of model is its settings (`sgns.settings`), its `Dynamics` (`sgns.model`), a file here with a `Fit`, and a line
+in `command.FITS`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,7 +26,7 @@ class Task(NamedTuple):
         validation_runs: What the result is chosen by.
         num_modes: r, modes used of the basis.
         model: Settings of the model.
-        settings: Of the training, what `Fit.settings` gave.
+        settings: Of the training.
         output: Folder, there, in which `best.ckpt` is to be written.
         seed: Of weights, noise and order.
         device: "cpu" or "cuda".
@@ -69,11 +70,9 @@ class Fit(NamedTuple):
     """How one kind of model is fitted.
 
     Attributes:
-        settings: Checks the values of `conf/training`.
         stand_ins: Training runs that do what validation runs would.
         run: Fits; raises a UserError for bad settings and losses that are not finite.
     """
 
-    settings: Callable[[Mapping[str, Any]], Any]
     stand_ins: Callable[[list[ReducedRun]], list[ReducedRun]]
     run: Callable[[Task], Fitted]

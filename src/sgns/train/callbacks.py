@@ -25,7 +25,8 @@ from sgns.train.windows import filled, pad_start, require_finite
 
 if TYPE_CHECKING:
     from sgns.reduction.reduce import ReducedRun
-    from sgns.train.lightning_module import SurrogateTraining, TrainingSettings
+    from sgns.settings import TrainingSettings
+    from sgns.train.lightning_module import SurrogateTraining
 
 log = logging.getLogger(__name__)
 

@@ -22,8 +22,8 @@ import sgns
 from sgns.config import UserError, differences, flattened
 from sgns.data.files import only_here, require_replaceable, write_whole
 from sgns.model.checkpoint import SUMMARY, read_checkpoint, read_summary
-from sgns.model.settings import ModelSettings, PolynomialSettings, model_settings
 from sgns.reduction.reduce import ReducedDataset, reduce_dataset
+from sgns.settings import model_settings, training_settings
 from sgns.train import Fit, Task
 from sgns.train.callbacks import quiet_writer
 from sgns.train.lightning_module import NETWORK
@@ -47,7 +47,7 @@ def main(cfg: DictConfig) -> float:
     from sgns.data.published import published_dataset
 
     plain = OmegaConf.to_container(cfg, resolve=True)
-    _, settings = checked_settings(plain["model"], plain["training"])
+    settings = training_settings(plain["model"], plain["training"])
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)  # for the reduction, too
     output = Path(cfg.output)
@@ -103,16 +103,16 @@ def train(
     Raises:
         UserError: Bad settings, a loss that is not finite, or an `output` of another training, there or under way.
     """
-    settings, training_settings = checked_settings(model, training)
-    if training_settings.threads is not None:
-        torch.set_num_threads(training_settings.threads)
+    settings, how = model_settings(model), training_settings(model, training)
+    if how.threads is not None:
+        torch.set_num_threads(how.threads)
     fit = FITS[settings.kind]
     validation_runs = reduced.runs("validation") or fit.stand_ins(reduced.runs("train"))
     card = {
         "settings": {
             "num_modes": num_modes,
             "model": settings.to_dict(),
-            "training": {k: v for k, v in training_settings.to_dict().items() if k not in _NO_MATTER},
+            "training": {k: v for k, v in how.to_dict().items() if k not in _NO_MATTER},
             "seed": seed,
             "basis": reduced.folder.name,
             "validation_runs": [run.name for run in validation_runs],
@@ -124,7 +124,7 @@ def train(
         "package_version": sgns.__version__,
     }
     with only_here(output / "best.ckpt"):
-        resumed = what_is_there(output, card["settings"], training_settings.resume)
+        resumed = what_is_there(output, card["settings"], how.resume)
         if resumed == "complete":
             summary = read_summary(output)
             log.info("%s is complete: validation skill %.3f", output, summary["skill"])
@@ -139,7 +139,7 @@ def train(
                 validation_runs=validation_runs,
                 num_modes=num_modes,
                 model=settings,
-                settings=training_settings,
+                settings=how,
                 output=output,
                 seed=seed,
                 device=device,
@@ -181,14 +181,6 @@ def hyperparameters(settings: Mapping[str, Any]) -> dict[str, bool | int | float
         key: value if isinstance(value, (bool, int, float, str)) else str(value)
         for key, value in flattened(settings).items()
     }
-
-
-def checked_settings(
-    model: Mapping[str, Any], training: Mapping[str, Any]
-) -> tuple[ModelSettings | PolynomialSettings, Any]:
-    """Of model and training, of the kind that `model.kind` says; refuses those of another."""
-    settings = model_settings(model)
-    return settings, FITS[settings.kind].settings(training)
 
 
 def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> str:

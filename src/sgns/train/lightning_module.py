@@ -11,9 +11,8 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,16 +23,14 @@ from lightning.pytorch.plugins import TorchCheckpointIO
 from torch import Tensor
 
 from sgns.clock import elapsed
-from sgns.config import UserError, check_fields
+from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate, read_checkpoint, write_checkpoint
 from sgns.model.features import BodyTrack, moves_freely, varying_context
 from sgns.model.network_dynamics import LatentDynamics
-from sgns.model.settings import ModelSettings
+from sgns.settings import ModelSettings, TrainingSettings
 from sgns.train import Fit, Fitted, Task
 from sgns.train.callbacks import RolloutValidation, StepProgress, ValidationRollouts
 from sgns.train.windows import (
-    NOISE_UNITS,
-    SCALES,
     Batch,
     TrainingWindows,
     WindowLoader,
@@ -45,108 +42,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SCHEDULES = ("cosine", "exponential")
-LOSSES = ("change", "force", "torque")
-CHANGE_OF = ("free", "all")
 # A training whose loss is this many times that of its first step learns no more.
 _DIVERGED = 1e4
 _ANEW = "train anew with training.resume=false, or into another output"
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # what AdamW keeps of each weight
-
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """What `conf/training` says; see there for the meaning of each key."""
-
-    max_steps: int
-    batch_size: int
-    learning_rate: float
-    final_learning_rate: float
-    warmup_steps: int
-    schedule: str
-    decades: float
-    weight_decay: float
-    gradient_clip: float | None
-    noise: float
-    noise_unit: str
-    scales: str
-    normalisation_floor: float
-    horizon: int
-    fewer_modes: float
-    change_of: str
-    loss: dict[str, float]
-    validate_every: int
-    log_every: int
-    resume: str | bool
-    threads: int | None
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> TrainingSettings:
-        """From plain values, checked.
-
-        Raises:
-            UserError: A value is out of range; the line names the key.
-        """
-        check_fields(cls, values, "training")
-        settings = cls(**values)
-        if not isinstance(settings.loss, dict) or set(settings.loss) != set(LOSSES):
-            raise UserError(f"training.loss is {settings.loss!r}; it needs a weight for {', '.join(LOSSES)}")
-        for key, low in (
-            ("max_steps", 1),
-            ("batch_size", 1),
-            ("warmup_steps", 0),
-            ("weight_decay", 0),
-            ("noise", 0),
-            ("normalisation_floor", 0),
-            ("decades", 0),
-            ("horizon", 1),
-            ("fewer_modes", 0),
-            ("validate_every", 1),
-            ("log_every", 1),
-            ("threads", 1),
-        ):
-            value = getattr(settings, key)
-            if value is not None and value < low:
-                raise UserError(f"training.{key} is {value}; it must be at least {low}")
-        for key in ("learning_rate", "final_learning_rate", "gradient_clip"):
-            value = getattr(settings, key)
-            if value is not None and value <= 0:
-                raise UserError(f"training.{key} is {value}; it must be above 0")
-        for key, weight in settings.loss.items():
-            if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not 0 <= weight < math.inf:
-                raise UserError(f"training.loss.{key} is {weight!r}; it must be a number, 0 or more")
-        if settings.fewer_modes > 1:
-            raise UserError(
-                f"training.fewer_modes is {settings.fewer_modes}; allowed: 0 to 1, a share of the steps"
-            )
-        for key, allowed in (
-            ("schedule", SCHEDULES),
-            ("noise_unit", NOISE_UNITS),
-            ("scales", SCALES),
-            ("change_of", CHANGE_OF),
-        ):
-            if getattr(settings, key) not in allowed:
-                raise UserError(
-                    f"training.{key} is {getattr(settings, key)!r}; allowed: {', '.join(allowed)}"
-                )
-        if settings.resume not in ("auto", False):
-            raise UserError(f"training.resume is {settings.resume!r}; allowed: auto, false")
-        return settings
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for a checkpoint."""
-        return asdict(self)
-
-    def rate(self, step: int) -> float:
-        """Learning rate of a step (from 0) as a share of the highest: a linear rise, then the fall of the
-        schedule."""
-        if step < self.warmup_steps:
-            return (step + 1) / (self.warmup_steps + 1)
-        done = min(1.0, (step - self.warmup_steps) / max(1, self.max_steps - self.warmup_steps))
-        end = self.final_learning_rate / self.learning_rate
-        if self.schedule == "exponential":
-            return max(end, 10.0 ** (-self.decades * done))
-        return end + (1 - end) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 class SurrogateTraining(L.LightningModule):
@@ -174,7 +73,7 @@ class SurrogateTraining(L.LightningModule):
             batch.following[:, :, :modes],
         )
         seen = track.frames(slice(0, dynamics.history))
-        found: dict[str, list[Tensor]] = {name: [] for name in LOSSES}
+        found: dict[str, list[Tensor]] = {name: [] for name in ("change", "force", "torque")}
         for k in range(batch.horizon):
             prediction = dynamics(latent, seen, batch.context)
             step = dynamics.taken(prediction, latent, seen)
@@ -214,7 +113,7 @@ class SurrogateTraining(L.LightningModule):
     def training_step(self, batch: Batch, _: int) -> Tensor:
         """The weighted loss; stops the training when it is not finite or has grown beyond measure."""
         losses = self.losses(batch)
-        loss = sum(self.settings.loss[name] * value for name, value in losses.items())
+        loss = sum(getattr(self.settings.loss, name) * value for name, value in losses.items())
         assert isinstance(loss, Tensor)
         total = float(loss.detach())
         if self.first_loss is None:
@@ -491,4 +390,4 @@ def stand_ins(runs: list[ReducedRun]) -> list[ReducedRun]:
     return runs[:4]
 
 
-NETWORK = Fit(TrainingSettings.from_dict, stand_ins, fit_network)
+NETWORK = Fit(stand_ins, fit_network)

@@ -24,7 +24,7 @@ from sgns.model.checkpoint import Surrogate
 from sgns.model.features import moves_freely, varying_context
 from sgns.model.network import Standardiser
 from sgns.model.polynomial import PolynomialDynamics, normalised
-from sgns.model.settings import FitSettings, PolynomialSettings
+from sgns.settings import FitSettings, PolynomialSettings
 from sgns.train import Fit, Fitted, Task
 from sgns.train.callbacks import RolloutScore, ValidationRollouts
 from sgns.train.windows import Batch, TrainingWindows, generator, random_walk
@@ -345,4 +345,4 @@ def stand_ins(runs: list[ReducedRun]) -> list[ReducedRun]:
     return runs[::3]
 
 
-POLYNOMIAL = Fit(FitSettings.from_dict, stand_ins, fit_polynomial)
+POLYNOMIAL = Fit(stand_ins, fit_polynomial)

@@ -264,9 +264,6 @@ class WindowLoader:
 # --- Scales of all quantities, from the training windows, and of the noise that is added to them --------
 # Shapes: r modes, N body nodes, F stacked frames of all runs.
 
-SCALES = ("per_mode", "pooled")
-NOISE_UNITS = ("velocity", "metre")
-
 
 def fit_normalisation(
     dynamics: LatentDynamics,

@@ -11,7 +11,7 @@ import torch
 from sgns.config import UserError
 from sgns.evaluate import costs
 from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory
-from sgns.model.settings import ModelSettings
+from sgns.settings import ModelSettings
 from sgns_testing.runs import make_run
 from sgns_testing.tiny import MODEL
 

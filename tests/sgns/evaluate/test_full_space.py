@@ -21,8 +21,7 @@ from sgns.evaluate.full_space import (
     radius_graph,
 )
 from sgns.model.features import BodyTrack
-from sgns.model.settings import ModelSettings
-from sgns.train.lightning_module import TrainingSettings
+from sgns.settings import ModelSettings, TrainingSettings
 from sgns_testing.runs import PLATE, make_run
 from sgns_testing.tiny import MODEL, TRAINING
 

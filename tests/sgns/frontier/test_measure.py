@@ -33,9 +33,9 @@ from sgns.frontier.measure import (
 )
 from sgns.frontier.study import Study, composed_scene
 from sgns.model.checkpoint import read_checkpoint
-from sgns.model.settings import ModelSettings
 from sgns.reduction.pca import IncrementalPCA
 from sgns.reduction.reduce import fit_runs
+from sgns.settings import ModelSettings
 from sgns_testing.surrogates import FakeSimulator, fitted, frozen_latent, small_dataset
 from sgns_testing.tiny import FIT, MODEL, POLYNOMIAL, REDUCTION, TRAINING, make_dataset, reduced
 

@@ -14,7 +14,7 @@ from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
 from sgns.model.features import BodyTrack, body_track
 from sgns.model.network_dynamics import LatentDynamics
-from sgns.model.settings import ModelSettings
+from sgns.settings import ModelSettings
 from sgns.train.windows import TrainingWindows, fit_normalisation
 from sgns_testing.tiny import MODEL
 

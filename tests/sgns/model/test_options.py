@@ -8,9 +8,9 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns.model.network_dynamics import LatentDynamics
-from sgns.model.settings import ModelSettings
+from sgns.settings import ModelSettings, TrainingSettings
 from sgns.train.command import train
-from sgns.train.lightning_module import TrainingSettings, prepared
+from sgns.train.lightning_module import prepared
 from sgns_testing.tiny import MODEL, TRAINING
 
 OPTIONS = {

@@ -11,7 +11,7 @@ import torch
 from sgns.config import UserError
 from sgns.model.features import BodyTrack
 from sgns.model.polynomial import PolynomialDynamics, normalised, polynomial_terms
-from sgns.model.settings import PolynomialSettings
+from sgns.settings import PolynomialSettings
 from sgns.train.callbacks import ValidationRollouts
 from sgns.train.polynomial import (
     Selection,

@@ -125,7 +125,7 @@ def test_all_combinations_when_no_number_is_given(tmp_path):
         ({"draw": {"rake": 3.0}}, "dataset.draw.rake is 3.0"),
         ({"draw": None}, "dataset.draw is missing"),
         ({"draw": [3]}, "must be a grid"),
-        ({"split": [0.8, 0.1]}, "three shares"),
+        ({"split": [0.8, 0.1]}, "list of 3 values"),
         ({"split": [0.8, 0.1, 0.2]}, "sum to 1"),
     ],
 )
@@ -237,7 +237,7 @@ def test_every_scene_reads_the_mesh_that_the_settings_name(tmp_path):
     tool = {"shape": "mesh", "file": files[0]}
     base = Scene.from_dict({"kind": "body", "bed": BASE["bed"], "duration": 0.05, "path": rows, "tool": tool})
     draw = {"tool.file": files, "tool.friction": [0.1, 0.3]}
-    settings = {"name": "tiny", "path": tmp_path / "tiny", "draw": draw}
+    settings = {"name": "tiny", "path": str(tmp_path / "tiny"), "draw": draw}
     c = plan(settings, base.to_dict(), EFFECTS, "float32", 0)
     assert {scene.tool.digest for scene in c.scenes.values()} > {base.tool.digest}
     c.record()

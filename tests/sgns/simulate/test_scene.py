@@ -70,8 +70,12 @@ def test_all_physics():
     [
         ({"symmetry": "maybe"}, SceneError, "effects.symmetry is 'maybe'; allowed: auto, true, false"),
         ({"colour": True}, SceneError, "effects has no key 'colour'"),
-        ({"tolerance": 3}, UserError, "effects.tolerance is 3; it must be a group of keys"),
-        ({"tolerance": {"grid": 1.0}}, UserError, "effects.tolerance.friction is missing"),
+        ({"tolerance": 3}, SceneError, "effects.tolerance is 3; it must be a group of keys"),
+        (
+            {"tolerance": {"grd": 1.0}},
+            SceneError,
+            "effects.tolerance has no key 'grd'; allowed: friction, grid",
+        ),
         ({"tolerance": {"grid": -1.0, "reach": 0.1, "friction": 0.1}}, SceneError, "tolerance.grid is -1.0"),
     ],
 )
@@ -91,7 +95,7 @@ def fast_and_slow(tmp_path, asked):
         "blade": {"length": 0.1, "width": 0.1, "thickness": 0.08},
         "bed": {"size": [0.4, 0.2, 0.16], "spacing": 0.04},
     }
-    settings = {"name": "tiny", "path": tmp_path / "tiny", "draw": {"speed": [0.05, 0.06, 0.07, 4.0]}}
+    settings = {"name": "tiny", "path": str(tmp_path / "tiny"), "draw": {"speed": [0.05, 0.06, 0.07, 4.0]}}
     return plan(settings, base, asked, "float32", 0)
 
 

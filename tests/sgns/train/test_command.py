@@ -15,11 +15,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sgns.config import UserError
 from sgns.model.network_dynamics import Path
+from sgns.settings import TrainingSettings
 from sgns.simulator import Simulator
 from sgns.train import lightning_module as module
 from sgns.train.callbacks import ValidationRollouts
 from sgns.train.command import main, train
-from sgns.train.lightning_module import TrainingSettings
 from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset
 
 
@@ -178,30 +178,6 @@ def test_schedule() -> None:
         assert rates[2] == pytest.approx(1.0) and rates[0] < rates[1] < rates[2]
         assert all(a >= b for a, b in itertools.pairwise(rates[2:]))
         assert rates[50] == pytest.approx(1e-2)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("batch_size", 0),
-        ("learning_rate", -1.0),
-        ("schedule", "steps"),
-        ("resume", "yes"),
-        ("noise", -0.1),
-        ("learning_rate", "fast"),
-        ("learning_rate", float("nan")),
-        ("max_steps", 1.5),
-        ("max_steps", True),
-        ("threads", 0),
-        ("gradient_clip", 0.0),
-        ("loss", {"change": 1.0, "force": "x", "torque": 1.0}),
-        ("loss", None),
-        ("x", 1),
-    ],
-)
-def test_wrong_settings_name_their_key(key, value) -> None:
-    with pytest.raises(UserError, match=f"training.{key}"):
-        TrainingSettings.from_dict(TRAINING | {key: value})
 
 
 def test_the_command(tmp_path) -> None:

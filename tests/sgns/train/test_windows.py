@@ -10,7 +10,7 @@ import torch
 
 from sgns.config import UserError
 from sgns.model.network_dynamics import LatentDynamics
-from sgns.model.settings import ModelSettings
+from sgns.settings import ModelSettings
 from sgns.train.windows import (
     NoiseScales,
     TrainingWindows,

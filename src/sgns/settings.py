@@ -1,0 +1,480 @@
+"""Every setting outside scenes: its type, range, default and one line of help, as the groups of `conf/` have them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any, ClassVar, Literal
+
+from mpm_warp.settings import Settings, setting, settings
+from sgns.config import UserError
+
+Device = Literal["cpu", "cuda"]
+_MOST_SEED = 2**63 - 1
+
+
+class Group(Settings):
+    """Base of the groups: what is not allowed is a `UserError`, and they are plain data in checkpoints."""
+
+    raises = UserError
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for a checkpoint."""
+        return asdict(self)  # type: ignore[call-overload]  # every group is a dataclass
+
+
+# --- conf/dataset ---------------------------------------------------------------------------------------
+
+
+@settings
+class DatasetSettings(Group):
+    """A campaign of runs that are simulated here."""
+
+    group: ClassVar[str] = "dataset"
+    name: str = setting("", "what it is called")
+    path: str = setting("", "its folder")
+    scene: str | None = setting(None, "option of the group `scene` that every run starts from")
+    change: dict[str, Any] | None = setting(
+        None, "values in that scene", words="; it must be a group of keys of the scene"
+    )
+    draw: dict[str, Any] | list[Any] | None = setting(
+        None,
+        "grids; every run takes one combination of one of them",
+        words="; it must be a grid, key: [values], or a list of such grids",
+    )
+    runs: int | None = setting(
+        None, "combinations drawn without repetition; null: all of them", ge=3, le=1_000_000
+    )
+    split: tuple[float, float, float] = setting(
+        (0.8, 0.1, 0.1),
+        "shares of train, validation and test runs of every grid",
+        ge=0,
+        words="; it needs three shares (train, validation, test) that sum to 1",
+    )
+    where: dict[str, Any] | None = setting(
+        None,
+        "of the runs that are there, use those of a scene with these values",
+        words="; it must be keys of the scene with their values, or null",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not math.isclose(sum(self.split), 1, abs_tol=1e-6):
+            raise UserError(
+                f"dataset.split is {list(self.split)}; it needs three shares (train, validation, test) that sum to 1"
+            )
+
+
+@settings
+class PublishedSettings(Group):
+    """The reduced runs that the paper's authors published."""
+
+    group: ClassVar[str] = "dataset"
+    name: str = setting("published", "what it is called")
+    format: Literal["published"] = setting("published", "TFRecord files, which are not part of this package")
+    path: str | None = setting(None, "folder with metadata.json and *.tfrecord, excavation or wheel")
+    folds: int | None = setting(
+        None, "so many folds, one of which is left out of the training; null: none", ge=2, le=1_000_000
+    )
+    fold: int = setting(0, "which one", ge=0)
+
+
+# --- conf/reduction -------------------------------------------------------------------------------------
+
+
+@settings
+class ReductionSettings(Group):
+    """How the soil is reduced to a few modes."""
+
+    group: ClassVar[str] = "reduction"
+    num_modes: int | Literal["auto"] = setting(8, "modes used; auto: the fewest that are good enough", ge=1)
+    max_modes: int = setting(64, "modes fitted and cached once", ge=1, le=100_000)
+    centring: Literal["scalar", "particle", "particle_axis"] = setting(
+        "particle_axis", "what is subtracted first"
+    )
+    choose: Literal["position", "energy", "displacement_energy"] = setting("position", "by what auto chooses")
+    tolerance: float = setting(3.0, "with choose=position: largest RMSE", "mm", gt=0)
+    share: float = setting(0.99, "with the energies: least share of the variance", gt=0, le=1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.num_modes != "auto" and self.num_modes > self.max_modes:
+            raise UserError(
+                f"reduction.num_modes is {self.num_modes}; allowed: 1 to reduction.max_modes ({self.max_modes}); "
+                "raise reduction.max_modes to keep more"
+            )
+
+
+# --- conf/model -----------------------------------------------------------------------------------------
+
+_CONTEXT = ("gravity", "friction_angle", "load", "diameter", "width", "slip")
+
+
+def _context(words: str) -> Any:
+    return setting(lambda: list(_CONTEXT), words, words="; it must be a list of keys of the scene")
+
+
+@settings
+class ModelSettings(Group):
+    """The graph network on modes and body."""
+
+    group: ClassVar[str] = "model"
+    history: int = setting(3, "positions of history; one velocity fewer", ge=2, le=100)
+    body_nodes: Literal["pose", "points"] = setting(
+        "pose", "one node with the body's pose, or one per body point"
+    )
+    positions: bool = setting(True, "nodes know where they are, not only how they move")
+    next_motion: bool = setting(
+        True, "the body's motion into the next frame is told, as far as it is prescribed"
+    )
+    identity: Literal["mode", "type"] = setting(
+        "mode", "a learned vector for each mode, or one for all modes"
+    )
+    identity_width: int = setting(8, "width of these vectors", ge=0, le=10_000)
+    context: list[str] = _context(
+        "numbers of the scene told to every node, where they vary between training runs"
+    )
+    edges: Literal["complete", "star"] = setting("complete", "every pair of nodes, or modes and body only")
+    self_loops: bool = setting(False, "every node has an edge to itself")
+    edge_scale: float | None = setting(
+        None,
+        "unit of the relative positions on edges; null: normalised as on nodes",
+        "m",
+        gt=0,
+        words="; it must be a length above 0 [m], or null",
+    )
+    edge_length: bool = setting(True, "edges hold their length beside the relative position")
+    hidden_width: int = setting(128, "width of every layer", ge=1, le=10_000)
+    hidden_layers: int = setting(2, "hidden layers of each MLP", ge=1, le=100)
+    message_passing_steps: int = setting(
+        1, "steps of the interaction network, each with two MLPs", ge=1, le=100
+    )
+    layer_norm: bool = setting(False, "layer normalisation after every MLP but the decoder")
+    residual: bool = setting(False, "message passing adds to nodes and edges instead of replacing them")
+    activation: Literal["relu", "silu", "gelu", "tanh"] = setting("relu", "of every hidden layer")
+    predicts: Literal["acceleration", "velocity"] = setting("velocity", "what the decoder says of every mode")
+    rigid: bool = setting(True, "predicted body points are moved to the nearest place of a rigid body")
+    force: Literal["sum", "mean"] = setting(
+        "sum", "the force is the sum, or the mean, of what the nodes contribute"
+    )
+    torque: bool = setting(True, "predict the torque, too")
+    kind: Literal["network"] = setting("network", "of the model")
+
+
+@settings
+class PolynomialSettings(Group):
+    """Polynomials of what the network is shown, in its place."""
+
+    group: ClassVar[str] = "model"
+    history: int = setting(3, "positions of history; one velocity fewer", ge=2, le=100)
+    degree: Literal[1, 2] = setting(2, "1 (linear), or 2 (and all products of two inputs)")
+    context: list[str] = _context(
+        "numbers of the scene that are inputs, where they vary between training runs"
+    )
+    kind: Literal["polynomial"] = setting("polynomial", "of the model")
+
+    @property
+    def body_nodes(self) -> str:
+        """The body is always shown as its pose."""
+        return "pose"
+
+
+# --- conf/training --------------------------------------------------------------------------------------
+
+
+@settings
+class LossWeights(Group):
+    """Weights of the squared errors of normalised quantities."""
+
+    group: ClassVar[str] = "training.loss"
+    change: float = setting(1.0, "of the predicted accelerations (or velocities), mean over nodes", ge=0)
+    force: float = setting(1.0, "of the force", ge=0)
+    torque: float = setting(0.1, "of the torque", ge=0)
+
+
+def _resume(words: str) -> Any:
+    return setting("auto", words)
+
+
+def _threads() -> Any:
+    return setting(2, "CPU threads of torch; null: torch's own choice", ge=1, le=1024)
+
+
+@settings
+class TrainingSettings(Group):
+    """How the network is trained."""
+
+    group: ClassVar[str] = "training"
+    max_steps: int = setting(6000, "optimiser steps", ge=1)
+    batch_size: int = setting(32, "windows of one step", ge=1)
+    learning_rate: float = setting(2e-3, "highest, after the warm-up", gt=0)
+    final_learning_rate: float = setting(1e-6, "at max_steps", gt=0)
+    warmup_steps: int = setting(200, "steps of linear rise", ge=0)
+    schedule: Literal["cosine", "exponential"] = setting("cosine", "fall to final_learning_rate")
+    decades: float = setting(2.0, "of the exponential fall: powers of ten until max_steps", ge=0, le=300)
+    weight_decay: float = setting(0.0, "AdamW's", ge=0)
+    gradient_clip: float | None = setting(1.0, "largest norm of the gradient; null: none", gt=0)
+    noise: float = setting(1.0, "deviation of the random-walk noise on the history", ge=0)
+    noise_unit: Literal["velocity", "metre"] = setting(
+        "velocity", "of noise: share of each mode's velocity scale, or m"
+    )
+    scales: Literal["per_mode", "pooled"] = setting(
+        "per_mode", "quantities are scaled per mode and axis, or per axis"
+    )
+    normalisation_floor: float = setting(
+        0.01, "smallest scale, share of the largest one of that quantity", ge=0
+    )
+    horizon: int = setting(1, "steps predicted one after another for the loss", ge=1, le=1000)
+    fewer_modes: float = setting(0.0, "share of the steps that use the first few modes only", ge=0, le=1)
+    change_of: Literal["free", "all"] = setting(
+        "free", "whose change counts: of modes and what is free of the body, or all"
+    )
+    loss: LossWeights = setting(LossWeights, "weights of the parts of the loss")
+    validate_every: int = setting(500, "steps between rollouts of the validation runs", ge=1)
+    log_every: int = setting(50, "steps between points in TensorBoard", ge=1)
+    resume: Literal["auto", False] = _resume(
+        "go on from last.ckpt in `output`; false: start anew and overwrite"
+    )
+    threads: int | None = _threads()
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step (from 0) as a share of the highest: a linear rise, then the fall."""
+        if step < self.warmup_steps:
+            return (step + 1) / (self.warmup_steps + 1)
+        done = min(1.0, (step - self.warmup_steps) / max(1, self.max_steps - self.warmup_steps))
+        end = self.final_learning_rate / self.learning_rate
+        if self.schedule == "exponential":
+            return max(end, 10.0 ** (-self.decades * done))
+        return end + (1 - end) * 0.5 * (1 + math.cos(math.pi * done))
+
+
+@settings
+class FitSettings(Group):
+    """How polynomials are fitted."""
+
+    group: ClassVar[str] = "training"
+    noises: list[float] = setting(
+        lambda: [0.1, 0.3, 1.0],
+        "deviations of the noise on the history, shares of each mode's velocity scale, to choose from",
+        ge=0,
+        words="; it must be a list of numbers, 0 or more",
+    )
+    penalties: list[float] = setting(
+        lambda: [1e-4, 1e-3, 1e-2, 1e-1, 1.0],
+        "of the squares of coefficients, to choose from",
+        ge=0,
+        words="; it must be a list of numbers, 0 or more",
+    )
+    linear: bool = setting(True, "with model.degree=2, fits without products of inputs may be chosen, too")
+    draws: int = setting(2, "how often all windows are taken, each time with other noise", ge=1, le=1000)
+    normalisation_floor: float = setting(
+        0.01, "smallest scale, share of the largest one of that quantity", ge=0
+    )
+    resume: Literal["auto", False] = _resume("answer from what is complete in `output`; false: start anew")
+    threads: int | None = _threads()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for key in ("noises", "penalties"):
+            if not getattr(self, key):
+                raise UserError(f"training.{key} is []; it must be a list of numbers, 0 or more")
+
+
+# --- The commands' own keys -----------------------------------------------------------------------------
+
+
+@settings
+class _Command(Group):
+    group: ClassVar[str] = ""
+
+
+def _seed(words: str) -> Any:
+    return setting(0, words, ge=0, le=_MOST_SEED, words="; it must be a whole number, 0 or more")
+
+
+def _device() -> Any:
+    return setting("cpu", "where it is computed")
+
+
+def _num_modes() -> Any:
+    return setting(
+        None,
+        "fewer modes than it was trained with, the first ones; null: all",
+        ge=1,
+        words="; it must be a whole number, 1 or more, or null",
+    )
+
+
+@settings
+class SolverSettings(Group):
+    """How the material point method computes."""
+
+    group: ClassVar[str] = "solver"
+    precision: Literal["float32", "float64"] = setting("float32", "of the numbers")
+    batch: int = setting(32, "with a dataset on a GPU: runs under way at once", ge=1, le=100_000)
+
+
+@settings
+class Simulate(_Command):
+    """`sgns simulate`."""
+
+    output: str = setting("run.h5", "run file to write")
+    continue_from: str | None = setting(None, "a *.stopped.h5: goes on from its last frame")
+    seed: int = _seed("of the particle arrangement and of a campaign's draws")
+    device: str = _device()
+    shard: int = setting(0, "with a dataset: which share of its runs this command makes", ge=0)
+    shards: int = setting(1, "into how many shares the runs are divided", ge=1)
+
+
+@settings
+class Reduce(_Command):
+    """`sgns reduce`."""
+
+    output: str = setting("", "folder for energy.csv; the basis is kept in the dataset's own folder")
+    device: str = _device()
+
+
+@settings
+class Train(_Command):
+    """`sgns train`."""
+
+    checkpoint: str | None = setting(
+        None, "file.ckpt to start from; null: new weights, or what `output` holds"
+    )
+    output: str = setting("", "folder for checkpoints and TensorBoard logs; one that exists is continued")
+    seed: int = _seed("of weights, noise and order of the samples")
+    device: str = _device()
+
+
+@settings
+class Rollout(_Command):
+    """`sgns rollout`."""
+
+    checkpoint: str = setting("", "file.ckpt of `sgns train`")
+    num_modes: int | None = _num_modes()
+    rate_independent: bool = setting(
+        True, "under a tool slower than all trained ones soil follows its travel"
+    )
+    output: str = setting("rollout.h5", "run file to write, of the same kind as the solver's")
+    seed: int = _seed("of the particle arrangement")
+    device: str = _device()
+
+
+@settings
+class Evaluate(_Command):
+    """`sgns evaluate`."""
+
+    checkpoint: str = setting("", "file.ckpt of `sgns train`")
+    num_modes: int | None = _num_modes()
+    split: Literal["train", "validation", "test"] = setting("test", "which runs")
+    new_rollouts: list[str] | str | None = setting(
+        list,
+        "run files of `sgns rollout` to show, too",
+        words="; it must be a list of run files, as [a.h5,b.h5]",
+    )
+    timing_repeats: int = setting(3, "warm repeats of the timing; their median is reported", ge=3, le=1000)
+    full_space: bool = setting(False, "also measure what the same network would cost on every particle")
+    output: str = setting("", "folder for the report, its tables, figures and rollouts")
+    device: str = _device()
+
+
+@settings
+class Frontier(_Command):
+    """`sgns frontier`."""
+
+    axis: Literal["solver", "reduction", "surrogate", "all", "none"] = setting(
+        "all", "which points are measured; none: only gather what is there"
+    )
+    output: str = setting("", "folder of points, table, figures and page; one that exists is continued")
+
+
+def _error(words: str, unit: str = "") -> Any:
+    return setting(
+        None, f"largest {words}; null: do not care", unit, gt=0, words="; it must be a number above 0"
+    )
+
+
+@settings
+class Errors(Group):
+    """Largest errors against the most accurate run."""
+
+    group: ClassVar[str] = "error"
+    force: float | None = _error("NRMSE of the force")
+    position: float | None = _error("RMSE of the soil's displacement", "m")
+    surface: float | None = _error("RMSE of the surface at the end", "m")
+    sinkage: float | None = _error("mean absolute error of a wheel's height", "m")
+
+
+@settings
+class Advise(_Command):
+    """`sgns advise`."""
+
+    task: str = setting("cut", "what the body does, the column `scene` of the table")
+    error: Errors = setting(Errors, "largest errors")
+    time: float | None = setting(
+        None,
+        "longest wall time of one step of 1/60 s on one core",
+        "s",
+        gt=0,
+        words="; it must be a number above 0",
+    )
+    particles: bool = setting(False, "the positions of all particles are needed in every step")
+    against: Literal["reference", "training"] = setting(
+        "reference", "the most accurate run, or the solver that made the training runs"
+    )
+    table: str | None = setting(
+        None, "points.csv of sgns frontier; null: the one that ships with the package"
+    )
+
+
+@settings
+class Check(_Command):
+    """`sgns check`."""
+
+    files: list[str] | str = setting(
+        list,
+        "run files; a folder stands for the run files in it",
+        words="; it must be paths of run files, as in sgns check run.h5",
+    )
+
+
+# --- All of them, by the place where `conf` has them ----------------------------------------------------
+
+COMMANDS: dict[str, type[Group]] = {
+    "simulate": Simulate,
+    "reduce": Reduce,
+    "train": Train,
+    "rollout": Rollout,
+    "evaluate": Evaluate,
+    "frontier": Frontier,
+    "advise": Advise,
+    "check": Check,
+}
+MODELS: dict[Any, tuple[Any, Any]] = {
+    "network": (ModelSettings, TrainingSettings),
+    "polynomial": (PolynomialSettings, FitSettings),
+}
+"""Settings of the model and of its training, by `model.kind`."""
+
+
+def model_settings(model: Mapping[str, Any]) -> ModelSettings | PolynomialSettings:
+    """The settings in the values of `conf/model`, checked.
+
+    Raises:
+        UserError: A value is unknown or not allowed for this kind; the line names its key.
+    """
+    kind = model.get("kind")
+    if not isinstance(kind, str) or kind not in MODELS:
+        raise UserError(f"model.kind is {kind!r}; allowed: {', '.join(MODELS)}")
+    return MODELS[kind][0].from_dict(model)
+
+
+def training_settings(model: Mapping[str, Any], training: Mapping[str, Any]) -> Any:
+    """The settings in the values of `conf/training`, checked: those that go with the kind of model."""
+    return MODELS[model_settings(model).kind][1].from_dict(training)
+
+
+def dataset_settings(dataset: Mapping[str, Any]) -> DatasetSettings | PublishedSettings:
+    """The settings in the values of `conf/dataset`, checked; errors as `model_settings`."""
+    return (PublishedSettings if "format" in dataset else DatasetSettings).from_dict(dataset)

@@ -1,0 +1,141 @@
+"""The groups of conf and the keys of the commands are those of the typed settings, with their defaults."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+import sgns.settings as typed
+from sgns.config import UserError
+from sgns.settings import (
+    DatasetSettings,
+    FitSettings,
+    Group,
+    ModelSettings,
+    PolynomialSettings,
+    PublishedSettings,
+    ReductionSettings,
+    TrainingSettings,
+)
+
+
+def composed(command: str, *overrides: str) -> dict[str, Any]:
+    with initialize_config_module("sgns.conf", version_base="1.3"):
+        cfg = compose(command, list(overrides))
+    return OmegaConf.to_container(cfg)
+
+
+@pytest.mark.parametrize(
+    ("settings", "overrides", "group"),
+    [
+        (ReductionSettings(), [], "reduction"),
+        (ModelSettings(), [], "model"),
+        (TrainingSettings(), [], "training"),
+        (PolynomialSettings(), ["model=polynomial"], "model"),
+        (FitSettings(), ["model=polynomial"], "training"),
+        (PublishedSettings(), ["dataset=published"], "dataset"),
+    ],
+)
+def test_a_group_is_the_class_with_its_defaults(settings: Group, overrides: list[str], group: str) -> None:
+    assert composed("train", *overrides)[group] == settings.to_dict()
+
+
+def test_the_solver_is_the_class_with_its_defaults() -> None:
+    assert composed("simulate")["solver"] == typed.SolverSettings().to_dict()
+
+
+@pytest.mark.parametrize("name", ["quick", "quick_wheel", "paper_excavation", "desktop_wheel"])
+def test_a_campaign_states_only_what_the_class_knows(name: str) -> None:
+    found = composed("simulate", f"dataset={name}")["dataset"]
+    assert (
+        DatasetSettings.from_dict(found).to_dict() | {"split": found["split"]}
+        == DatasetSettings().to_dict() | found
+    )
+
+
+@pytest.mark.parametrize("name", typed.COMMANDS)
+def test_a_command_has_the_keys_of_its_class_with_their_defaults(name: str) -> None:
+    cls = typed.COMMANDS[name]
+    found = composed(name)
+    groups = {"dataset", "reduction", "model", "training", "preset", "scene", "material", "effects", "solver"}
+    assert set(found) - groups - {"study", "numerics"} == {one.name for one in fields(cls)}
+    for key, default in cls().to_dict().items():
+        own = found[key] in ("???",) or (key == "output" and name not in ("simulate", "rollout"))
+        assert own or found[key] == default, key
+
+
+def test_presets_state_only_what_is_allowed() -> None:
+    for preset in ("default", "fast", "paper", "released"):
+        found = composed("train", f"preset={preset}")
+        typed.training_settings(found["model"], found["training"])
+        ReductionSettings.from_dict(found["reduction"])
+
+
+@pytest.mark.parametrize(
+    ("cls", "values", "line"),
+    [
+        (ReductionSettings, {"num_modes": "x"}, "reduction.num_modes is 'x'; allowed: auto, 1 or more"),
+        (ReductionSettings, {"num_modes": 0}, "reduction.num_modes is 0; allowed: auto, 1 or more"),
+        (
+            ReductionSettings,
+            {"num_modes": 65},
+            "reduction.num_modes is 65; allowed: 1 to reduction.max_modes (64); ",
+        ),
+        (TrainingSettings, {"schedule": "flat"}, "training.schedule is 'flat'; allowed: cosine, exponential"),
+        (TrainingSettings, {"max_steps": 2.5}, "training.max_steps is 2.5; it must be a whole number"),
+        (TrainingSettings, {"max_steps": True}, "training.max_steps is True; it must be a whole number"),
+        (TrainingSettings, {"threads": 100000}, "training.threads is 100000; allowed: 1 to 1024"),
+        (TrainingSettings, {"resume": True}, "training.resume is True; allowed: auto, false"),
+        (TrainingSettings, {"noise": float("nan")}, "training.noise is nan; it must be a finite number"),
+        (TrainingSettings, {"loss": {"force": -1}}, "training.loss.force is -1.0; it must be 0 or more"),
+        (
+            TrainingSettings,
+            {"loss": {"frce": 1}},
+            "training.loss has no key 'frce'; allowed: change, force, torque",
+        ),
+        (TrainingSettings, {"stps": 1}, "training has no key 'stps'; allowed: batch_size, "),
+        (
+            ModelSettings,
+            {"context": "load"},
+            "model.context is 'load'; it must be a list of keys of the scene",
+        ),
+        (ModelSettings, {"context": [1]}, "model.context[0] is 1; it must be text"),
+        (ModelSettings, {"history": 100000}, "model.history is 100000; allowed: 2 to 100"),
+        (
+            ModelSettings,
+            {"edge_scale": 0},
+            "model.edge_scale is 0.0; it must be a length above 0 [m], or null",
+        ),
+        (FitSettings, {"noises": []}, "training.noises is []; it must be a list of numbers, 0 or more"),
+        (
+            FitSettings,
+            {"penalties": [-1]},
+            "training.penalties is [-1]; it must be a list of numbers, 0 or more",
+        ),
+        (
+            DatasetSettings,
+            {"split": [0.5, 0.5]},
+            "dataset.split is [0.5, 0.5]; it must be a list of 3 values",
+        ),
+        (DatasetSettings, {"split": [1, 1, 0]}, "dataset.split is [1.0, 1.0, 0.0]; it needs three shares"),
+        (DatasetSettings, {"draw": 5}, "dataset.draw is 5; it must be a grid"),
+        (DatasetSettings, {"runs": 10.5}, "dataset.runs is 10.5; it must be a whole number"),
+        (typed.Simulate, {"seed": -1}, "seed is -1; it must be a whole number, 0 or more"),
+        (typed.Evaluate, {"new_rollouts": 5}, "new_rollouts is 5; it must be a list of run files"),
+        (typed.Advise, {"error": 5}, "error is 5; it must be a group of keys"),
+        (typed.Advise, {"error": {"force": "x"}}, "error.force is 'x'; it must be a finite number"),
+    ],
+)
+def test_a_value_that_is_not_allowed(cls: type[Group], values: dict[str, Any], line: str) -> None:
+    with pytest.raises(UserError) as error:
+        cls.from_dict(values)
+    assert str(error.value).startswith(line)
+
+
+def test_an_unknown_kind_of_model() -> None:
+    with pytest.raises(UserError, match=r"model\.kind is \[\]; allowed: network, polynomial"):
+        typed.model_settings({"kind": []})
