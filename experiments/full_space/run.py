@@ -134,7 +134,7 @@ def train(
     record = []
     for step in range(settings.max_steps):
         acceleration, force = losses(dynamics, windows.batch(step, settings.batch_size, noise_scale))
-        loss = settings.loss["change"] * acceleration + settings.loss["force"] * force
+        loss = settings.loss.change * acceleration + settings.loss.force * force
         if not bool(torch.isfinite(loss)):
             raise ValueError(
                 f"the loss is {float(loss.detach())} at step {step}; lower training.learning_rate"
@@ -225,7 +225,7 @@ def cost_subspace(path: Path, name: str, repeats: int) -> dict[str, Any]:
     def step() -> None:
         losses = module.losses(data.training_windows.batch(0, BATCH, data.noise))
         optimiser.zero_grad()
-        sum(training.loss[key] * value for key, value in losses.items()).backward()
+        sum(getattr(training.loss, key) * value for key, value in losses.items()).backward()
         torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
         optimiser.step()
 

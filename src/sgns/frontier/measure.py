@@ -410,7 +410,7 @@ def seconds_per_step(
         watch = stopwatch()
         losses = module.losses(data.training_windows.batch(step, settings.batch_size, data.noise))
         optimiser.zero_grad()
-        sum(settings.loss[name] * value for name, value in losses.items()).backward()
+        sum(getattr(settings.loss, name) * value for name, value in losses.items()).backward()
         torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
         optimiser.step()
         times.append(watch()[1])
