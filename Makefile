@@ -54,9 +54,10 @@ stability: setup ## hard cases, kills, full disks and random input (most of an h
 	$(BIN)/python -m pytest -m long tests/stability
 	SGNS_FUZZ=20 $(BIN)/python -m pytest -s --timeout 1200 tests/stability/fuzz
 
-lint: setup ## check the code's style and format
+lint: setup ## check the code's style, format and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 
 docs: setup ## build the documentation's site in build/site
 	$(BIN)/python -m pip install --quiet --editable '.[docs]'

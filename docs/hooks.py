@@ -27,6 +27,37 @@ def setting_files() -> dict[str, list[Path]]:
     return pages
 
 
+def reference_page() -> str:
+    """The page of all settings with default, unit, range and meaning, from the classes that define them."""
+    import mpm_warp as mpm
+    import sgns.settings as typed
+    from mpm_warp.settings import reference
+
+    soil = [
+        mpm.Scene,
+        mpm.Excavation,
+        mpm.Wheel,
+        mpm.Body,
+        mpm.Column,
+        mpm.Incline,
+        mpm.Bed,
+        mpm.Walls,
+        mpm.Plate,
+    ]
+    soil += [
+        mpm.Box,
+        mpm.Cylinder,
+        mpm.MeshBody,
+        mpm.Material,
+        mpm.Effects,
+        mpm.Tolerances,
+        typed.SolverSettings,
+    ]
+    groups = [typed.DatasetSettings, typed.PublishedSettings, typed.ReductionSettings]
+    groups += [one for kind in typed.MODELS.values() for one in kind] + [typed.LossWeights, typed.Errors]
+    return reference([*soil, *groups, *typed.COMMANDS.values()])
+
+
 def settings_page(name: str, files: list[Path]) -> str:
     """The Markdown of one page of settings: a heading and a table for each file."""
     parts = [f"# Settings: {name}", "", "Made from the files in `conf/` and their comments.", ""]
@@ -124,6 +155,7 @@ def on_files(files: Any, config: Any) -> Any:
     """Add the pages of settings and the pictures of experiments that pages show."""
     from mkdocs.structure.files import File
 
+    files.append(File.generated(config, "settings.md", content=reference_page()))
     for name, sources in setting_files().items():
         content = settings_page(name, sources)
         files.append(File.generated(config, f"settings/{name}.md", content=content))

@@ -139,14 +139,16 @@ def described(cls: type) -> list[tuple[str, str, str, str]]:
     return found
 
 
-def reference(groups: Iterable[type]) -> str:
+def reference(groups: Iterable[type[Settings]]) -> str:
     """The page of the documentation that lists the settings of some classes, in Markdown."""
-    lines = ["# Settings of scenes, soil and physics", "", "Python and the command line have the same names."]
+    lines = ["# Every setting", "", "Python and the command line have the same names."]
     for cls in groups:
         base = cls.__base__
         shared = described(base) if base and is_dataclass(base) else []
         also = f" It has the settings of {base.__name__}, too." if base and shared else ""
-        lines += ["", f"## {cls.__name__}", "", inspect.getdoc(cls).splitlines()[0] + also, ""]  # type: ignore[union-attr]
+        place = f" (`{cls.group}`)" if cls.group else ""
+        first = (cls.__doc__ or "").splitlines()[0]
+        lines += ["", f"## {cls.__name__}{place}", "", first + also, ""]
         lines += ["| setting | default | allowed | meaning |", "|---|---|---|---|"]
         for name, *known in described(cls):
             if (name, *known) not in shared:

@@ -149,6 +149,7 @@ def run_command(cfg: DictConfig) -> float | None:
 
     hydra_cfg = HydraConfig.get()
     name = hydra_cfg.job.config_name
+    assert name is not None and hydra_cfg.mode is not None
     in_sweep = hydra_cfg.mode.name == "MULTIRUN"
     label = f"job {hydra_cfg.job.num} ({_one_line(hydra_cfg.job.override_dirname)}): " if in_sweep else ""
     interrupted = False

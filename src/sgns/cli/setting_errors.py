@@ -13,7 +13,7 @@ from hydra.errors import (
     OverrideParseException,
 )
 from hydra.plugins.config_source import ConfigLoadError
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import Container, DictConfig, OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
@@ -104,8 +104,7 @@ def _unknown_key(cause: ConfigAttributeError | ConfigKeyError) -> str:
     parent = cause.parent_node
     if not isinstance(parent, DictConfig):
         return f"{key}: no such key"
-    root = parent._get_root()
-    known = _keys(root)
+    known = _keys(parent._get_root())
     name = key.rpartition(".")[2]
     near = [other for other in known if other.rpartition(".")[2] == name]
     near += [other for other in difflib.get_close_matches(key, known, n=3, cutoff=0.7) if other not in near]
@@ -117,7 +116,7 @@ def _unknown_key(cause: ConfigAttributeError | ConfigKeyError) -> str:
     return line + _allowed(f"keys of {where}" if where else "keys", name, siblings)
 
 
-def _keys(cfg: DictConfig) -> list[str]:
+def _keys(cfg: Container) -> list[str]:
     """Dotted names of all settings, without Hydra's own."""
     plain = OmegaConf.to_container(cfg, resolve=False)
     names: list[str] = []

@@ -139,7 +139,8 @@ def _is_plain_logging(path: Keys, value: Any) -> bool:
 def _check_plugin(hydra: DictConfig, group: str, typed: Sequence[Override]) -> None:
     """Check the settings of the launcher or the sweeper against those that its own code has registered."""
     where = ("hydra", group)
-    plain = OmegaConf.to_container(hydra, resolve=False)[group]
+    everything: Any = OmegaConf.to_container(hydra, resolve=False)
+    plain = everything[group]
     target = plain.get("_target_") if isinstance(plain, dict) else None
     registered = [node for node in _registered(group) if node.get("_target_") == target]
     if not registered:
@@ -350,7 +351,7 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
         raise UserError(
             "dataset.name is missing; choose a dataset, as in dataset=quick, or give this one a name"
         )
-    own = typed.COMMANDS[command]
+    own: Any = typed.COMMANDS[command]
     own.from_dict({one.name: plain[one.name] for one in fields(own) if one.name in plain})
     if plain.get("dataset") is not None:
         typed.dataset_settings(plain["dataset"])

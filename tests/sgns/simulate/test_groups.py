@@ -12,9 +12,8 @@ from omegaconf import OmegaConf
 
 import mpm_warp
 import sgns.conf
-from mpm_warp import Bed, Box, Cylinder, Effects, Material, MeshBody, Plate, Scene, Walls
+from mpm_warp import Box, Cylinder, Effects, Material, MeshBody, Scene
 from mpm_warp.auto_effects import EFFECTS
-from mpm_warp.settings import reference
 from sgns.simulate.scene import scene_from_config
 
 CONF = Path(sgns.conf.__path__[0])
@@ -25,13 +24,7 @@ def options(group: str) -> list[str]:
     return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
 
 
-def page() -> str:
-    scenes = (getattr(mpm_warp, kind.title()) for kind in KINDS)
-    return reference([Scene, *scenes, Bed, Walls, Plate, Box, Cylinder, MeshBody, Material, Effects])
-
-
 SOILS = options("material")
-PAGE = Path(__file__).parents[3] / "docs" / "settings.md"
 PATH = [[0.0, 0.3, 0.3, 0.2, 0, 0, 0, 1]]
 
 
@@ -112,11 +105,6 @@ def test_the_help_of_a_scene_lists_every_setting(cls: type) -> None:
     assert all(line.split(": ")[1:] for line in cls.__doc__.splitlines() if line.startswith("    "))
 
 
-def test_the_reference_page_lists_every_setting() -> None:
-    """To write it again: `python tests/sgns/simulate/test_groups.py`."""
-    assert PAGE.read_text() == page()
-
-
 @pytest.mark.parametrize("name", SOILS)
 def test_only_what_is_stated_is_warned_of(name: str) -> None:
     """Glass beads of both sizes are below the K0 condition; nothing else is odd about any of them."""
@@ -137,7 +125,3 @@ def test_lunar_simulant_has_the_density_and_friction_of_its_source() -> None:
     assert found.bulk_density == pytest.approx(1653.0)
     assert found.static_friction == pytest.approx(1.0)
     assert found.limit_friction == pytest.approx(1.2016)
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page())

@@ -144,7 +144,10 @@ def test_yaml_of_settings(empty_folder, good, nothing_long) -> None:
             ["simulate", "scene=body", "scene.path=path.csv", "scene.tool.shape={}"],
             "tool.shape is {}; allowed",
         ),
-        (["rollout", "checkpoint=a.ckpt", "rate_independent=nope"], "rate_independent is 'nope'; allowed: true, false"),
+        (
+            ["rollout", "checkpoint=a.ckpt", "rate_independent=nope"],
+            "rate_independent is 'nope'; allowed: true, false",
+        ),
     ],
 )
 def test_what_was_once_a_traceback_or_taken_for_something_else(arguments, words, empty_folder) -> None:
