@@ -179,5 +179,5 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         return f"`{text}`" if text.startswith("experiments/") else text
 
     return re.sub(
-        r"(!?)\[([^]]*)\]\((?:\.\./)+((?:experiments|conf|src|mpm_warp)/[^)]*)\)", replaced, markdown
+        r"(!?)\[([^]]*)\]\((?:\.\./)+((?:examples|experiments|conf|src|mpm_warp)/[^)]*)\)", replaced, markdown
     )
