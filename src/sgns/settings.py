@@ -40,12 +40,10 @@ class DatasetSettings(Group):
     )
     draw: dict[str, Any] | list[Any] | None = setting(
         None,
-        "grids; every run takes one combination of one of them",
+        "every run takes one combination of a grid",
         words="; it must be a grid, key: [values], or a list of such grids",
     )
-    runs: int | None = setting(
-        None, "combinations drawn without repetition; null: all of them", ge=3, le=1_000_000
-    )
+    runs: int | None = setting(None, "combinations that are drawn; null: all", ge=3, le=1_000_000)
     split: tuple[float, float, float] = setting(
         (0.8, 0.1, 0.1),
         "shares of train, validation and test runs of every grid",
@@ -54,7 +52,7 @@ class DatasetSettings(Group):
     )
     where: dict[str, Any] | None = setting(
         None,
-        "of the runs that are there, use those of a scene with these values",
+        "use only runs of scenes with these values",
         words="; it must be keys of the scene with their values, or null",
     )
 
@@ -74,9 +72,7 @@ class PublishedSettings(Group):
     name: str = setting("published", "what it is called")
     format: Literal["published"] = setting("published", "TFRecord files, which are not part of this package")
     path: str | None = setting(None, "folder with metadata.json and *.tfrecord, excavation or wheel")
-    folds: int | None = setting(
-        None, "so many folds, one of which is left out of the training; null: none", ge=2, le=1_000_000
-    )
+    folds: int | None = setting(None, "folds, one of which is left out; null: none", ge=2, le=1_000_000)
     fold: int = setting(0, "which one", ge=0)
 
 
@@ -90,9 +86,7 @@ class ReductionSettings(Group):
     group: ClassVar[str] = "reduction"
     num_modes: int | Literal["auto"] = setting(8, "modes used; auto: the fewest that are good enough", ge=1)
     max_modes: int = setting(64, "modes fitted and cached once", ge=1, le=100_000)
-    centring: Literal["scalar", "particle", "particle_axis"] = setting(
-        "particle_axis", "what is subtracted first"
-    )
+    centring: Literal["scalar", "particle", "particle_axis"] = setting("particle_axis", "what is subtracted")
     choose: Literal["position", "energy", "displacement_energy"] = setting("position", "by what auto chooses")
     tolerance: float = setting(3.0, "with choose=position: largest RMSE", "mm", gt=0)
     share: float = setting(0.99, "with the energies: least share of the variance", gt=0, le=1)
@@ -121,25 +115,17 @@ class ModelSettings(Group):
 
     group: ClassVar[str] = "model"
     history: int = setting(3, "positions of history; one velocity fewer", ge=2, le=100)
-    body_nodes: Literal["pose", "points"] = setting(
-        "pose", "one node with the body's pose, or one per body point"
-    )
+    body_nodes: Literal["pose", "points"] = setting("pose", "one node, or one per body point")
     positions: bool = setting(True, "nodes know where they are, not only how they move")
-    next_motion: bool = setting(
-        True, "the body's motion into the next frame is told, as far as it is prescribed"
-    )
-    identity: Literal["mode", "type"] = setting(
-        "mode", "a learned vector for each mode, or one for all modes"
-    )
+    next_motion: bool = setting(True, "the prescribed motion into the next frame is told")
+    identity: Literal["mode", "type"] = setting("mode", "a learned vector per mode, or one")
     identity_width: int = setting(8, "width of these vectors", ge=0, le=10_000)
-    context: list[str] = _context(
-        "numbers of the scene told to every node, where they vary between training runs"
-    )
+    context: list[str] = _context("numbers of the scene told to every node, where they vary")
     edges: Literal["complete", "star"] = setting("complete", "every pair of nodes, or modes and body only")
     self_loops: bool = setting(False, "every node has an edge to itself")
     edge_scale: float | None = setting(
         None,
-        "unit of the relative positions on edges; null: normalised as on nodes",
+        "unit of positions on edges; null: as on nodes",
         "m",
         gt=0,
         words="; it must be a length above 0 [m], or null",
@@ -147,17 +133,13 @@ class ModelSettings(Group):
     edge_length: bool = setting(True, "edges hold their length beside the relative position")
     hidden_width: int = setting(128, "width of every layer", ge=1, le=10_000)
     hidden_layers: int = setting(2, "hidden layers of each MLP", ge=1, le=100)
-    message_passing_steps: int = setting(
-        1, "steps of the interaction network, each with two MLPs", ge=1, le=100
-    )
+    message_passing_steps: int = setting(1, "each with two MLPs of its own", ge=1, le=100)
     layer_norm: bool = setting(False, "layer normalisation after every MLP but the decoder")
     residual: bool = setting(False, "message passing adds to nodes and edges instead of replacing them")
     activation: Literal["relu", "silu", "gelu", "tanh"] = setting("relu", "of every hidden layer")
     predicts: Literal["acceleration", "velocity"] = setting("velocity", "what the decoder says of every mode")
     rigid: bool = setting(True, "predicted body points are moved to the nearest place of a rigid body")
-    force: Literal["sum", "mean"] = setting(
-        "sum", "the force is the sum, or the mean, of what the nodes contribute"
-    )
+    force: Literal["sum", "mean"] = setting("sum", "of what the nodes contribute")
     torque: bool = setting(True, "predict the torque, too")
     kind: Literal["network"] = setting("network", "of the model")
 
@@ -169,9 +151,7 @@ class PolynomialSettings(Group):
     group: ClassVar[str] = "model"
     history: int = setting(3, "positions of history; one velocity fewer", ge=2, le=100)
     degree: Literal[1, 2] = setting(2, "1 (linear), or 2 (and all products of two inputs)")
-    context: list[str] = _context(
-        "numbers of the scene that are inputs, where they vary between training runs"
-    )
+    context: list[str] = _context("numbers of the scene that are inputs, where they vary")
     kind: Literal["polynomial"] = setting("polynomial", "of the model")
 
     @property
@@ -216,20 +196,12 @@ class TrainingSettings(Group):
     weight_decay: float = setting(0.0, "AdamW's", ge=0)
     gradient_clip: float | None = setting(1.0, "largest norm of the gradient; null: none", gt=0)
     noise: float = setting(1.0, "deviation of the random-walk noise on the history", ge=0)
-    noise_unit: Literal["velocity", "metre"] = setting(
-        "velocity", "of noise: share of each mode's velocity scale, or m"
-    )
-    scales: Literal["per_mode", "pooled"] = setting(
-        "per_mode", "quantities are scaled per mode and axis, or per axis"
-    )
-    normalisation_floor: float = setting(
-        0.01, "smallest scale, share of the largest one of that quantity", ge=0
-    )
+    noise_unit: Literal["velocity", "metre"] = setting("velocity", "share of a mode's velocity, or m")
+    scales: Literal["per_mode", "pooled"] = setting("per_mode", "scales of quantities")
+    normalisation_floor: float = setting(0.01, "smallest scale, share of the largest", ge=0)
     horizon: int = setting(1, "steps predicted one after another for the loss", ge=1, le=1000)
     fewer_modes: float = setting(0.0, "share of the steps that use the first few modes only", ge=0, le=1)
-    change_of: Literal["free", "all"] = setting(
-        "free", "whose change counts: of modes and what is free of the body, or all"
-    )
+    change_of: Literal["free", "all"] = setting("free", "nodes whose change counts")
     loss: LossWeights = setting(LossWeights, "weights of the parts of the loss")
     validate_every: int = setting(500, "steps between rollouts of the validation runs", ge=1)
     log_every: int = setting(50, "steps between points in TensorBoard", ge=1)
@@ -256,7 +228,7 @@ class FitSettings(Group):
     group: ClassVar[str] = "training"
     noises: list[float] = setting(
         lambda: [0.1, 0.3, 1.0],
-        "deviations of the noise on the history, shares of each mode's velocity scale, to choose from",
+        "of the noise on the history, shares of a mode's velocity",
         ge=0,
         words="; it must be a list of numbers, 0 or more",
     )
@@ -268,9 +240,7 @@ class FitSettings(Group):
     )
     linear: bool = setting(True, "with model.degree=2, fits without products of inputs may be chosen, too")
     draws: int = setting(2, "how often all windows are taken, each time with other noise", ge=1, le=1000)
-    normalisation_floor: float = setting(
-        0.01, "smallest scale, share of the largest one of that quantity", ge=0
-    )
+    normalisation_floor: float = setting(0.01, "smallest scale, share of the largest", ge=0)
     resume: Literal["auto", False] = _resume("answer from what is complete in `output`; false: start anew")
     threads: int | None = _threads()
 
@@ -300,7 +270,7 @@ def _device() -> Any:
 def _num_modes() -> Any:
     return setting(
         None,
-        "fewer modes than it was trained with, the first ones; null: all",
+        "the first modes; null: all",
         ge=1,
         words="; it must be a whole number, 1 or more, or null",
     )
@@ -339,9 +309,7 @@ class Reduce(_Command):
 class Train(_Command):
     """`sgns train`."""
 
-    checkpoint: str | None = setting(
-        None, "file.ckpt to start from; null: new weights, or what `output` holds"
-    )
+    checkpoint: str | None = setting(None, "file.ckpt to start from; null: none")
     output: str = setting("", "folder for checkpoints and TensorBoard logs; one that exists is continued")
     seed: int = _seed("of weights, noise and order of the samples")
     device: str = _device()
@@ -353,9 +321,7 @@ class Rollout(_Command):
 
     checkpoint: str = setting("", "file.ckpt of `sgns train`")
     num_modes: int | None = _num_modes()
-    rate_independent: bool = setting(
-        True, "under a tool slower than all trained ones soil follows its travel"
-    )
+    rate_independent: bool = setting(True, "under a slow tool soil follows its way")
     output: str = setting("rollout.h5", "run file to write, of the same kind as the solver's")
     seed: int = _seed("of the particle arrangement")
     device: str = _device()
@@ -384,7 +350,7 @@ class Frontier(_Command):
     """`sgns frontier`."""
 
     axis: Literal["solver", "reduction", "surrogate", "all", "none"] = setting(
-        "all", "which points are measured; none: only gather what is there"
+        "all", "points to measure; none: only gather"
     )
     output: str = setting("", "folder of points, table, figures and page; one that exists is continued")
 
