@@ -92,28 +92,6 @@ def test_help_of_a_command(command: str, empty_folder: Path) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_settings_of_a_command(command: str) -> None:
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        cfg = compose(command, return_hydra_config=True)
-    keys = (
-        "scene material effects solver dataset reduction model training preset checkpoint output seed device"
-    )
-    own = {
-        "simulate": {"continue_from", "shard", "shards"},
-        "rollout": {"num_modes", "rate_independent"},
-        "evaluate": {"split", "num_modes", "new_rollouts", "timing_repeats", "full_space"},
-        "frontier": {"study", "axis"},
-        "advise": {"task", "error", "time", "particles", "against", "table"},
-        "check": {"files"},
-    }
-    assert set(cfg) - {"hydra"} <= {*keys.split(), "experiment"} | own.get(command, set())
-    assert ("output" in cfg) == (COMMANDS[command].output is not None)
-    assert cfg.hydra.job.chdir is False
-    if command == "simulate":
-        assert cfg.dataset is None
-
-
-@pytest.mark.parametrize("command", COMMANDS)
 def test_every_option_of_every_group_composes(command: str) -> None:
     with initialize_config_module("sgns.conf", version_base="1.3"):
         for group in groups_of(command):
