@@ -35,10 +35,9 @@ from sgns.evaluate.results import (
     aggregate,
     run_scores,
     seen_before,
-    seen_warning,
+    write_tables,
 )
-from sgns.evaluate.tables import write_tables
-from sgns.evaluate.words import describe, forward_name, short_names
+from sgns.evaluate.words import describe, forward_name, seen_warning, short_names
 from sgns.model.settings import ModelSettings, model_settings
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout
@@ -75,8 +74,10 @@ def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTimin
                 simulator.basis.inverse(latent)
             per_second = float(rollout.wall_time_s) / simulated
             times.append((per_second, per_second + elapsed(began, time.perf_counter()) / simulated))
-        medians = (statistics.median(kind) for kind in zip(*times[1:], strict=True))
-        return NetworkTiming(*medians, repeats, path.stem, rollout_bytes, peak_memory())
+        rollout_time, decoded_time = (statistics.median(kind) for kind in zip(*times[1:], strict=True))
+        return NetworkTiming(
+            rollout_time, decoded_time, repeats, path.stem, rollout_bytes, decoded_bytes=peak_memory()
+        )
 
 
 def full_basis(dataset: Dataset, basis: Basis) -> Basis:
@@ -87,10 +88,9 @@ def full_basis(dataset: Dataset, basis: Basis) -> Basis:
             other = Basis.load(path)
         except UserError:  # another version's cache: the report then shows the network's modes only
             continue
-        shared = other.num_modes > best.num_modes and other.modes.shape[0] == basis.modes.shape[0]
-        if shared and torch.allclose(
-            other.modes[:, : basis.num_modes].double(), basis.modes.double(), atol=1e-5
-        ):
+        first = other.modes[:, : basis.num_modes].double()
+        larger = other.num_modes > best.num_modes and first.shape == basis.modes.shape
+        if larger and torch.allclose(first, basis.modes.double(), atol=1e-5):
             best = other
     return best
 
@@ -114,7 +114,7 @@ def require_known_run(simulator: Simulator, run: Run, checkpoint: Path) -> None:
             f"{run.path} has another particle arrangement ({run.arrangement_hash}) than {checkpoint} was "
             f"trained on ({simulator.arrangement_hash}); evaluate it on its own dataset"
         )
-    if abs(run.frame_rate - float(simulator.frame_rate)) > 1e-6 * run.frame_rate:
+    if abs(run.frame_rate - simulator.frame_rate) > 1e-6 * run.frame_rate:
         raise UserError(
             f"{run.path} was recorded at {run.frame_rate:g} Hz, {checkpoint} steps at "
             f"{simulator.frame_rate:g} Hz; evaluate it on its own dataset"
@@ -139,11 +139,11 @@ def evaluate(
     what the same network would cost on every particle; `made` says how the evaluation was made, for the report.
     """
     network = model_settings(simulator.card["model"]) if full_space else None
-    if full_space and not isinstance(network, ModelSettings):
+    if network is not None and not isinstance(network, ModelSettings):
         raise UserError(
             f"full_space=true: {checkpoint} holds polynomials; only a network has a counterpart in full space"
         )
-    paths = [Path(path) for path in dataset.runs(split)]
+    paths = dataset.runs(split)
     if not paths:
         raise UserError(
             f"dataset {dataset.name} has no complete run in its split {split!r}; allowed: train, "
@@ -165,24 +165,28 @@ def evaluate(
         raise UserError(
             f"cannot write to output={output}: {error.strerror}; give a folder that you may write to"
         ) from error
-    history = int(simulator.history)
+    history = simulator.history
     means = training_means(dataset.runs("train"), history)
     start = np.asarray(simulator.start_positions, dtype=np.float64)
     grid = surface_grid(start)
 
-    runs = []
-    labels = short_names([path.stem for path in paths])
-    for path, label in zip(tqdm(paths, desc="rolling out", unit="run", disable=None), labels, strict=True):
+    runs, names = [], [path.stem for path in paths]
+    progress = tqdm(paths, desc="rolling out", unit="run", disable=None)
+    for path, label in zip(progress, short_names(names), strict=True):
         target = output / "rollouts" / f"{path.stem}.h5"
         with Run(path) as truth:
             rollout = roll_out(simulator, truth)
-            recorded = {
-                "effects": truth.effects,
-                "seed": truth.seed,
-                "mesh": truth.mesh,
-                "given_frames": history,
-            }
-            write_rollout(target, simulator, truth.scene, rollout, checkpoint=checkpoint, **recorded)
+            write_rollout(
+                target,
+                simulator,
+                truth.scene,
+                rollout,
+                effects=truth.effects,
+                seed=truth.seed,
+                checkpoint=checkpoint,
+                mesh=truth.mesh,
+                given_frames=history,
+            )
             with Run(target) as prediction:
                 errors = position_errors(truth, prediction, simulator.basis, history, grid)
                 body = body_errors(truth, prediction, history)
@@ -190,7 +194,7 @@ def evaluate(
             words, wheel = describe(truth.scene), is_wheel(truth.scene)
         runs.append(EvaluatedRun(path.stem, label, words, path, target, errors, scores, wheel))
 
-    trained_on, chosen_by = seen_before(simulator, [run.name for run in runs])
+    trained_on, chosen_by = seen_before(simulator, names)
     evaluation = Evaluation(
         dataset=str(dataset.name),
         split=split,
@@ -206,12 +210,12 @@ def evaluate(
         chosen_by=chosen_by,
         curves=reduction_curves(full_basis(dataset, simulator.basis), paths),
         basis=simulator.basis,
-        num_modes=int(simulator.num_modes),
+        num_modes=simulator.num_modes,
         history=history,
         particle_count=len(start),
         start=start,
-        new_rollouts=[Path(path) for path in new_rollouts],
-        made=dict(made or {}),
+        new_rollouts=new_rollouts,
+        made=made or {},
     )
     write_tables(evaluation, output)
     return evaluation

@@ -15,8 +15,6 @@ from sgns.model.settings import ModelSettings
 from sgns_testing.runs import make_run
 from sgns_testing.tiny import MODEL
 
-# ---  ---------------------------------------------------------------------------------------------------
-
 CARD = {"settings": {"training": {"batch_size": 32}}}
 
 
@@ -64,16 +62,10 @@ def test_systems_that_do_not_count_it(monkeypatch):
     assert math.isnan(peak_memory())
 
 
-# ---  ---------------------------------------------------------------------------------------------------
-
-SETTINGS = ModelSettings(**MODEL)
-
-
-@pytest.mark.parametrize("n", [200, 2000])
-def test_cost_of_a_network_on_every_particle(tmp_path, n):
-    run = make_run(tmp_path / "run.h5", n=n)
-    cost = full_space_cost(run, SETTINGS, 3)
+def test_cost_of_a_network_on_every_particle(tmp_path):
+    run, settings = make_run(tmp_path / "run.h5", n=500), ModelSettings(**MODEL)
+    cost = full_space_cost(run, settings, 3)
     assert cost.training_step > cost.rollout / 60.0 > 0.0
     assert cost.peak_bytes > 1e7 and cost.batch_size == 2
-    wider = full_space_cost(run, replace(SETTINGS, hidden_width=2 * SETTINGS.hidden_width), 1)
+    wider = full_space_cost(run, replace(settings, hidden_width=2 * settings.hidden_width), 1)
     assert wider.parameters > 2 * cost.parameters
