@@ -16,8 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
+from mpm_warp.inputs import open_file
 from mpm_warp.poses import in_body_frame
 from sgns.clock import elapsed
 from sgns.config import UserError
@@ -25,7 +27,7 @@ from sgns.data.files import only_here, require_replaceable
 from sgns.data.layout import scene_problems
 from sgns.data.run import Run
 from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory, provenance
-from sgns.evaluate.figures import read_log
+from sgns.evaluate.figures import VALIDATION
 from sgns.evaluate.metrics import body_errors, is_wheel, mean_prediction, position_errors, surface_grid
 from sgns.evaluate.report import write_report
 from sgns.evaluate.results import (
@@ -50,6 +52,8 @@ if TYPE_CHECKING:
     from sgns.states import Rollout
 
 log = logging.getLogger(__name__)
+
+MOST_BYTES = 1 << 26  # of a training's log, all files together; a day of training writes a tenth of that
 
 
 def roll_out(simulator: Simulator, run: Run) -> Rollout:
@@ -103,6 +107,35 @@ def training_means(paths: Sequence[Path], history: int) -> tuple[np.ndarray, np.
             forces.append(run.force)
             torques.append(run.torque)
     return mean_prediction(forces, history), mean_prediction(torques, history)
+
+
+def read_log(folder: Path) -> dict[str, np.ndarray]:
+    """Scalars of a TensorBoard folder: name → steps and values, shape (k, 2); empty if there is no log.
+
+    Raises:
+        UserError: It holds what is no log.
+    """
+    if not folder.is_dir():
+        return {}
+    advice = "remove it: only a figure of the report needs it"
+    left = MOST_BYTES
+    for file in sorted(folder.glob("*tfevents*")):  # what TensorBoard would read
+        try:
+            with open_file(file, left) as content:
+                left -= os.fstat(content.fileno()).st_size
+        except (OSError, ValueError) as error:
+            raise UserError(f"{file} is no log of TensorBoard ({error}); {advice}") from error
+    try:
+        events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
+    except Exception as error:  # whatever bytes do to a reader that is not ours
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"{folder} holds no log of TensorBoard ({reason:.200}); {advice}") from error
+    # A training that was killed logs some steps again, and its files are out of order if the clock went back.
+    return {
+        name: np.array(sorted({e.step: e.value for e in events.Scalars(name)}.items()), dtype=np.float64)
+        for name in events.Tags()["scalars"]
+        if name.startswith("loss/") or name in VALIDATION
+    }
 
 
 def require_known_run(simulator: Simulator, run: Run, checkpoint: Path) -> None:

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import io
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import matplotlib
@@ -22,11 +20,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from mpm_warp.inputs import open_file
 from mpm_warp.scenes import sinkage
-from sgns.config import UserError
 from sgns.evaluate.metrics import (
     NEGLIGIBLE_SHARE,
     ParticleErrors,
@@ -121,7 +116,7 @@ def profile_figure(runs: Mapping[str, Any], frames: Sequence[int], grid: Surface
 def middle_line(run: Any, frame: int, grid: SurfaceGrid) -> np.ndarray:
     """Surface height along x, mean over the columns next to mid-width that hold particles [mm], shape (nx,)."""
     count = grid.shape[1]
-    heights = height_map(run.positions(slice(frame, frame + 1))[0], grid)
+    heights = height_map(run.positions(frame)[0], grid)
     middle = heights[:, (count - 1) // 2 : count // 2 + 1]
     filled = np.isfinite(middle)
     total = np.where(filled, middle, 0.0).sum(axis=1)
@@ -341,8 +336,7 @@ def limits(panel: Panel) -> tuple[float, float]:
     return low - 0.5 * missing - room, high + 0.5 * missing + room
 
 
-# --- How the position errors are spread over the particles ---------------------------------------
-# The paper's Fig. "Distribution of … position MSE".
+# --- How the position errors are spread over the particles: the paper's "Distribution of … position MSE" -
 
 BINS_PER_DECADE = 4
 # An error below a micrometre counts as one [m²]: particles that rest would fill decades with rounding.
@@ -351,10 +345,8 @@ SMALLEST = 1e-12
 
 def error_bins(values: Sequence[np.ndarray]) -> np.ndarray:
     """Borders [m²] of bins, equally wide on a logarithmic axis, that hold all of the values."""
-    everything = np.concatenate([np.maximum(v, SMALLEST) for v in values])
-    low = np.floor(BINS_PER_DECADE * np.log10(everything.min())) / BINS_PER_DECADE
-    high = np.floor(BINS_PER_DECADE * np.log10(everything.max()) + 1.0) / BINS_PER_DECADE
-    return 10.0 ** np.linspace(low, high, round((high - low) * BINS_PER_DECADE) + 1)
+    place = BINS_PER_DECADE * np.log10(np.maximum(np.concatenate(values), SMALLEST))
+    return 10.0 ** (np.arange(np.floor(place.min()), np.floor(place.max()) + 2.0) / BINS_PER_DECADE)
 
 
 @styled
@@ -385,7 +377,7 @@ def histogram_figure(runs: Sequence[ParticleErrors]) -> Figure:
     return figure
 
 
-# --- How a network was trained: loss and skill by step, from the log beside its checkpoint --------------
+# --- How a network was trained: loss and skill by step --------------------------------------------------
 
 VALIDATION = {
     "skill/validation": ("position skill", NETWORK),
@@ -395,36 +387,6 @@ VALIDATION = {
 COLOURS = {"total": TRUTH, "force": ACCENT, "torque": BASELINE}
 # Skill and NRMSE beyond these say only that a rollout ran away.
 LOWEST, HIGHEST = -0.5, 1.5
-MOST_BYTES = 1 << 26  # of a log, all files together; a day of training writes a tenth of that
-
-
-def read_log(folder: Path) -> dict[str, np.ndarray]:
-    """Scalars of a TensorBoard folder: name → steps and values, shape (k, 2); empty if there is no log.
-
-    Raises:
-        UserError: It holds what is no log.
-    """
-    if not folder.is_dir():
-        return {}
-    advice = "remove it: only a figure of the report needs it"
-    left = MOST_BYTES
-    for file in sorted(folder.glob("*tfevents*")):  # what TensorBoard would read
-        try:
-            with open_file(file, left) as content:
-                left -= os.fstat(content.fileno()).st_size
-        except (OSError, ValueError) as error:
-            raise UserError(f"{file} is no log of TensorBoard ({error}); {advice}") from error
-    try:
-        events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
-    except Exception as error:  # whatever bytes do to a reader that is not ours
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise UserError(f"{folder} holds no log of TensorBoard ({reason:.200}); {advice}") from error
-    # A training that was killed logs some steps again, and its files are out of order if the clock went back.
-    return {
-        name: np.array(sorted({e.step: e.value for e in events.Scalars(name)}.items()), dtype=np.float64)
-        for name in events.Tags()["scalars"]
-        if name.startswith("loss/") or name in VALIDATION
-    }
 
 
 @styled

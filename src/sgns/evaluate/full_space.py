@@ -119,17 +119,22 @@ class FullSpaceDynamics(nn.Module):
             Second difference of each particle's position, normalised [1], (B, n, 3), and the force that every node
             adds, soil first [N], float64, (B, V, 3).
         """
-        batch, count = soil.shape[0], soil.shape[2]
         where = torch.cat([soil[:, -1], body.position[:, -2]], dim=1)
+        batch, nodes, count = *where.shape[:2], soil.shape[2]
         # The graphs of a batch differ in their edges, so they are one large graph of separate parts.
-        parts = [radius_graph(one, self.radius) + b * where.shape[1] for b, one in enumerate(where)]
+        parts = [radius_graph(one, self.radius) + b * nodes for b, one in enumerate(where)]
         sender, receiver = edge_index = torch.cat(parts, dim=1)
         position = where.flatten(0, 1)
         relative = (position[sender] - position[receiver]).div_(self.radius).float()
         edges = torch.cat([relative, torch.linalg.vector_norm(relative, dim=-1, keepdim=True)], dim=-1)
-        nodes = self.node_features(soil, body, where).flatten(0, 1)
-        decoded = self.network(nodes, edges, edge_index).unflatten(0, (batch, -1))
-        return decoded[:, :count, :3], self.forces(decoded[..., 3:], count)
+        features = self.node_features(soil, body, where).flatten(0, 1)
+        decoded = self.network(features, edges, edge_index).unflatten(0, (batch, -1))
+        # A force is scaled by the number of nodes of its kind: the bed has a thousand times the nodes that touch the
+        # tool, and without this their small errors would add up to more than the force.
+        share = torch.full((nodes, 1), 1 / count, dtype=torch.float64)
+        share[count:] = 1 / (nodes - count)
+        forces = decoded[..., 3:].double() * share * self.force.scale + self.force.mean / nodes
+        return decoded[:, :count, :3], forces
 
     def node_features(self, soil: Tensor, body: BodyTrack, where: Tensor) -> Tensor:
         """Motions, distances to the walls and identity [1], shape (B, V, features), soil first.
@@ -144,17 +149,6 @@ class FullSpaceDynamics(nn.Module):
         walls = (torch.cat([low, high, floor], dim=-1) / self.radius).clamp(-1.0, 1.0).float()
         kind = torch.arange(where.shape[1]) >= soil.shape[2]
         return torch.cat([moving, walls, self.identity(kind.long()).expand(len(soil), -1, -1)], dim=-1)
-
-    def forces(self, decoded: Tensor, count: int) -> Tensor:
-        """Force that each of V nodes, `count` of them soil, adds [N], of what was decoded (B, V, 3).
-
-        A contribution is scaled by the number of nodes of its kind: the bed has a thousand times the nodes that
-        touch the tool, and without this their small errors would add up to more than the force.
-        """
-        nodes = decoded.shape[-2]
-        share = torch.full((nodes, 1), 1 / count, dtype=torch.float64)
-        share[count:] = 1 / (nodes - count)
-        return decoded.double() * share * self.force.scale + self.force.mean / nodes
 
     def advance(self, soil: Tensor, body: BodyTrack) -> tuple[Tensor, Tensor]:
         """Take one step, x+ = x + (x - x-) + a: next positions [m] (B, n, 3) and force [N] (B, 3), float64; arguments

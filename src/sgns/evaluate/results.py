@@ -64,10 +64,7 @@ class Scores:
         row: dict[str, Any] = {"run": self.name, "frames": self.frames}
         row |= {f"mse_{name}_m2": self.mse[name] for name in POSITION_ERRORS}
         row |= {f"rmse_{name}_mm": self.rmse_mm(name) for name in POSITION_ERRORS}
-        row |= {
-            "skill_frozen": self.skill("frozen"),
-            "skill_constant_velocity": self.skill("constant_velocity"),
-        }
+        row |= {f"skill_{name}": self.skill(name) for name in ("frozen", "constant_velocity")}
         row |= {f"{name}_rmse_mm": self.rmse_mm(name) for name in SURFACE_ERRORS}
         for prefix, errors in (("", self.force), ("mean_force_", self.mean_force)):
             row |= columns(errors, FORCE_COMPONENTS, prefix, "force", "N")
@@ -89,7 +86,7 @@ def columns(
         values[f"{prefix}{name}_mae_{unit}"] = float(errors.mae[axis])
         values[f"{prefix}{name}_nrmse"] = float(errors.nrmse[axis])
         values[f"{prefix}{name}_mpe_percent"] = float(errors.mpe[axis])
-    values[f"{prefix}{vector}_nrmse" if not prefix else f"{prefix}nrmse"] = errors.overall_nrmse
+    values[f"{prefix or vector + '_'}nrmse"] = errors.overall_nrmse
     return values
 
 
@@ -154,7 +151,7 @@ def mean_of_known(values: Sequence[float]) -> float:
     return sum(known) / len(known) if known else math.nan
 
 
-# --- What an evaluation found, in numbers: what the tables, the figures and the report are made from ----
+# --- Everything that an evaluation found ------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -233,7 +230,7 @@ class Evaluation:
     full_space: FullSpaceCost | None = None
     # mean torque of the training split [N m], shape (3,)
     mean_torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    # losses and validation scores by step, as `figures.read_log` gives them
+    # losses and validation scores by step, as `read_log` gives them
     training_log: Mapping[str, np.ndarray] = field(default_factory=dict)
     # names of the evaluated runs that the basis and the network were fitted on
     trained_on: Sequence[str] = ()
@@ -242,14 +239,9 @@ class Evaluation:
     made: dict[str, str] = field(default_factory=dict)  # how it was made: name → value, in the order to show
 
 
-# --- Which of the judged runs a checkpoint has already seen: a number for those is no test --------------
-
-
 def seen_before(simulator: Simulator, names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Of some runs' names those that the checkpoint was trained on, and those that chose it.
-
-    A checkpoint knows its runs by name only.
-    """
+    """Of some runs' names those that the checkpoint was trained on, and those that chose it: for these a number is no
+    test. A checkpoint knows its runs by name only."""
     fitted = set(simulator.basis.fitted_on or ())
     judged = set(simulator.card.get("settings", {}).get("validation_runs", ()))
     trained_on = [name for name in names if name in fitted]
@@ -314,10 +306,8 @@ def example_row(scores: Scores) -> dict[str, Any]:
     The signed MPE of several runs together is that of the pooled means, in which runs cancel; beside it the mean
     of |MPE| over runs, in which they do not.
     """
-    row: dict[str, Any] = {"run": scores.name}
-    row |= {
-        f"mse_{name}_m2": scores.mse[name] for name in ("network", "total", "frozen", "constant_velocity")
-    }
+    shown = ("network", "total", "frozen", "constant_velocity")
+    row: dict[str, Any] = {"run": scores.name} | {f"mse_{name}_m2": scores.mse[name] for name in shown}
     for prefix, errors in (("", scores.force), ("mean_force_", scores.mean_force)):
         for name, axis in FORCE_COMPONENTS.items():
             row[f"{prefix}{name}_mpe_percent"] = float(errors.mpe[axis])

@@ -185,23 +185,18 @@ def common_scales(runs: Sequence[Any], frames: Sequence[int], start: np.ndarray)
     low, high = start.min(axis=0), start.max(axis=0)
     x_limits = (low[0] - 1.5 * spacing, high[0] + 1.5 * spacing)
     shown = list(itertools.product(runs, frames))
-    reach = max(float(slice_positions(run, frame, chosen)[:, 2].max()) for run, frame in shown)
+    reach = max(float(run.positions(frame)[0, chosen, 2].max()) for run, frame in shown)
     tool = max(float(body_outline(run, frame)[:, 1].max()) for run, frame in shown)
     top = max(min(tool + spacing, high[2] + TOOL_ABOVE), reach + 2.0 * spacing)
     strongest = max(float(np.linalg.norm(run.force[frame, [0, 2]])) for run, frame in shown)
     arrow = SIDE_ARROW * (x_limits[1] - x_limits[0]) / strongest if strongest > 0.0 else 0.0
-    speed = upper_scale(*(slice_speed(runs[0], frame, chosen) for frame in frames))
+    speed = upper_scale(*(speeds(runs[0], frame, chosen) for frame in frames))
     return Scales(chosen, speed, arrow, x_limits, (low[2] - 1.5 * spacing, top), spacing)
 
 
-def slice_positions(run: Any, frame: int, chosen: np.ndarray) -> np.ndarray:
-    """Positions [m] of the chosen particles, shape (k, 3)."""
-    return run.positions(slice(frame, frame + 1))[0][chosen]
-
-
-def slice_speed(run: Any, frame: int, chosen: np.ndarray) -> np.ndarray:
-    """Speeds [m/s] of the chosen particles, shape (k,)."""
-    return np.linalg.norm(run.velocities(slice(frame, frame + 1))[0][chosen], axis=1)
+def speeds(run: Any, frame: int, chosen: np.ndarray) -> np.ndarray:
+    """Of the chosen particles [m/s], shape (k,)."""
+    return np.linalg.norm(run.velocities(frame)[0, chosen], axis=1)
 
 
 @styled
@@ -241,10 +236,9 @@ def draw_view(axis: Axes, title: str, run: Any, frame: int, scales: Scales, widt
     inches = width / np.ptp(scales.x_limits)  # per metre
     # Diameter of a particle [points]: the room that it has.
     disc = max(1.4, 0.98 * scales.spacing * 72.0 * inches)
-    positions = slice_positions(run, frame, scales.chosen)
-    speed = slice_speed(run, frame, scales.chosen)
+    speed = speeds(run, frame, scales.chosen)
     order = np.argsort(speed)  # the fast ones on top
-    x, _, z = positions[order].T
+    x, _, z = run.positions(frame)[0, scales.chosen][order].T
     axis.scatter(x, z, c=speed[order], s=disc**2, cmap=SPEED, norm=scales.speed, linewidths=0.0)
     outline = body_outline(run, frame)
     if len(outline) >= 3:
@@ -272,7 +266,7 @@ def solid_views(truth: Any, prediction: Any, frame: int, start: np.ndarray) -> M
 
     `start` are the particles at rest [m], shape (n, 3).
     """
-    true, predicted = (run.positions(slice(frame, frame + 1))[0] for run in (truth, prediction))
+    true, predicted = truth.positions(frame)[0], prediction.positions(frame)[0]
     moved, moved_predicted, error = (
         1e3 * np.linalg.norm(difference, axis=1)
         for difference in (true - start, predicted - start, predicted - true)

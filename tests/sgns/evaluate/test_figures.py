@@ -11,6 +11,7 @@ from torch.utils.tensorboard import SummaryWriter
 from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.evaluate import figures
+from sgns.evaluate.command import read_log
 from sgns.evaluate.figures import (
     HIGHEST,
     LOWEST,
@@ -23,7 +24,6 @@ from sgns.evaluate.figures import (
     histogram_figure,
     history_figure,
     limits,
-    read_log,
     torque_panels,
     training_figure,
 )
@@ -75,17 +75,19 @@ def test_complete_energy_and_no_residual_can_be_drawn():
     assert dict(matplotlib.rcParams) == before
 
 
-def test_bins_are_equally_wide_on_the_axis_and_hold_everything():
-    values = 10.0 ** np.random.default_rng(0).uniform(-11.0, -3.0, 500)
+@pytest.mark.parametrize(
+    "values",
+    [
+        10.0 ** np.random.default_rng(0).uniform(-11.0, -3.0, 500),
+        np.zeros(4),
+        np.full(4, 1e-6),
+        np.full(1, 1e-4),
+    ],
+)
+def test_bins_are_equally_wide_on_the_axis_and_hold_everything(values):
     bins = error_bins([values, values[:3]])
-    assert np.diff(np.log10(bins)) == pytest.approx(0.25)
-    assert np.histogram(values, bins)[0].sum() == 500
-
-
-@pytest.mark.parametrize("values", [np.zeros(4), np.full(4, 1e-6), np.full(1, 1e-4)])
-def test_equal_errors_still_have_a_bin(values):
-    bins = error_bins([values])
-    assert len(bins) >= 2 and np.histogram(np.maximum(values, SMALLEST), bins)[0].sum() == len(values)
+    assert len(bins) >= 2 and np.diff(np.log10(bins)) == pytest.approx(0.25)
+    assert np.histogram(np.maximum(values, SMALLEST), bins)[0].sum() == len(values)
 
 
 def test_shares_add_up_to_all_particles_of_all_runs():
@@ -161,6 +163,8 @@ def test_forces_have_their_signs_and_predictions_begin_after_the_history(truth, 
     assert np.array_equal(draft["network"].values, -prediction.force[HISTORY:, 0])
     assert np.array_equal(draft["network"].time, prediction.time[HISTORY:])
     assert draft["training mean"].values == pytest.approx(80.0)
+    # A small component is not blown up.
+    assert np.ptp(limits(panels[1])) > 0.1 * np.ptp(draft["simulated (MPM)"].values)
     pixels(history_figure(panels))
 
 
@@ -186,41 +190,26 @@ def test_path_without_truth(prediction):
     pixels(history_figure(panels))
 
 
-def test_small_component_is_not_blown_up(truth, prediction):
-    draft, lateral, _ = force_panels(truth, prediction, HISTORY, MEAN)
-    assert np.ptp(limits(lateral)) > 0.1 * np.ptp(curves(draft)["simulated (MPM)"].values)
-
-
 def test_torque_about_axes_without_any_is_left_out(truth, prediction):
-    assert [panel.label for panel in torque_panels(truth, prediction, HISTORY, np.zeros(3))] == [
-        "pitch Ty [N m]"
-    ]
-
-
-def test_no_torque_no_panel():
+    (pitch,) = torque_panels(truth, prediction, HISTORY, np.zeros(3))
+    assert pitch.label == "pitch Ty [N m]"
     still = SimpleNamespace(time=np.arange(8.0), torque=np.zeros((8, 3)))
     assert torque_panels(still, still, HISTORY, np.zeros(3)) == []
 
 
 def test_errors_of_soil_force_and_a_body_that_was_predicted(truth, prediction):
     panels = error_panels(errors(), truth, prediction, HISTORY, MEAN)
-    assert [panel.label for panel in panels] == [
-        "position RMSE [mm]",
-        "force error [N]",
-        "body misplaced [mm]",
-    ]
+    labels = ["position RMSE [mm]", "force error [N]", "body misplaced [mm]"]
+    assert [panel.label for panel in panels] == labels
     force = curves(panels[1])
     difference = prediction.force[HISTORY:] - truth.force[HISTORY:]
     assert force["network"].values == pytest.approx(np.sqrt((difference**2).sum(axis=1)))
     assert force["training mean"].values[0] == pytest.approx(np.linalg.norm(MEAN - truth.force[HISTORY]))
     assert curves(panels[0])["network"].values[-1] == pytest.approx(10.0)
     pixels(history_figure(panels))
-
-
-def test_body_on_its_given_path_has_no_error_to_show(truth):
-    panels = error_panels(errors(0.0), truth, truth, HISTORY, MEAN)
-    assert len(panels) == 2
-    pixels(history_figure(panels))
+    given = error_panels(errors(0.0), truth, truth, HISTORY, MEAN)  # the body on its given path
+    assert [panel.label for panel in given] == labels[:2]
+    pixels(history_figure(given))
 
 
 def test_baseline_that_runs_away_does_not_flatten_the_rest():

@@ -116,6 +116,8 @@ def test_page_is_well_formed_and_needs_nothing_from_outside():
     assert page.count('<img alt="Words"') == 1  # for those who do not see it
     assert not {"script", "link", "iframe", "object"} & set(parser.tags)
     assert not re.search(r"https?://|@import|url\(", page)
+    anchors = [link[1:] for link in parser.links if link.startswith("#")]
+    assert anchors == parser.headings and len(set(anchors)) == len(anchors) > 4
 
 
 def test_everything_is_escaped():
@@ -187,14 +189,11 @@ def test_nothing_that_moved_or_pushed_is_said():
 
 
 def test_numbers_as_people_write_them():
-    assert [number(v) for v in (0.0, 1234.5, 3.14159, -0.01234, 2e-7)] == [
-        "0.000",
-        "1230",
-        "3.14",
-        "−0.0123",
-        "2.00e−07",
-    ]
-    assert number(math.nan) == "–" and number(math.inf) == "∞"
+    for value, text in (
+        (0.0, "0.000"), (1234.5, "1230"), (3.14159, "3.14"), (-0.01234, "−0.0123"), (2e-7, "2.00e−07"),
+        (math.nan, "–"), (math.inf, "∞"),
+    ):  # fmt: skip
+        assert number(value) == text
     assert number(22829.0, 2) == "23000"
     assert fixed(-1.255, 1, sign=True) == "−1.3" and fixed(2.0, 1, sign=True) == "+2.0"
     assert fixed(math.nan) == "–" and fixed(-1e-6) == "0.00"
@@ -216,23 +215,22 @@ def test_short_names_still_tell_runs_apart():
     assert short_names(["_x"]) == ["_x"]
 
 
-def test_contents_point_at_every_heading():
-    parser = parsed(render_report(evaluation(), [group()]))
-    anchors = [link[1:] for link in parser.links if link.startswith("#")]
-    assert anchors == parser.headings and len(set(anchors)) == len(anchors) > 4
-
-
-def test_runs_seen_before_are_named_and_only_then():
-    clean = evaluation()
-    assert 'class="warning"' not in render_report(clean, [])
-    page = render_report(replace(clean, trained_on=["run1"]), [])
-    assert (
-        "1 of the 2 evaluated runs bear the names of runs that this checkpoint was trained on (run1)" in page
-    )
-    assert "not all new to it" in summary(replace(clean, trained_on=["run1"]))
-    assert "no test" in summary(replace(clean, trained_on=["run1", "run2"]))
-    assert "chose its checkpoint" in summary(replace(clean, chosen_by=["run1", "run2"]))
-    assert "validation runs that chose" in render_report(replace(clean, chosen_by=["run1"]), [])
+@pytest.mark.parametrize(
+    ("seen", "told", "warning"),
+    [
+        ({}, "that it never saw", ""),
+        ({"trained_on": ["run1"]}, "not all new to it", "1 of the 2 evaluated runs bear the names of runs that this "
+         "checkpoint was trained on (run1): for those"),
+        ({"trained_on": ["run1", "run2"]}, "so this is no test", "trained on (run1, …)"),
+        ({"chosen_by": ["run1", "run2"]}, "chose its checkpoint", "2 of the 2 evaluated runs bear the names of "
+         "validation runs that chose this checkpoint (run1, …)"),
+    ],
+)  # fmt: skip
+def test_runs_seen_before_are_named_and_only_then(seen, told, warning):
+    result = replace(evaluation(), **seen)
+    page = render_report(result, [])
+    assert told in summary(result) and warning in page
+    assert ('class="warning"' in page) == bool(seen)
 
 
 def test_table_of_examples_keeps_the_sign_of_a_run_and_not_of_the_mean():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sgns.evaluate.results import aggregate, example_row, seen_before, write_csv, write_json
-from sgns.evaluate.words import seen_warning
 from sgns_testing.surrogates import made_scores
 
 
@@ -81,9 +80,3 @@ def test_sinkage_is_the_mean_of_the_wheels_only():
 def test_what_was_seen_before(fitted_on, settings, expected):
     simulator = SimpleNamespace(basis=SimpleNamespace(fitted_on=fitted_on), card={"settings": settings})
     assert seen_before(simulator, ["x", "y"]) == expected
-
-
-def test_warning_counts_and_names():
-    judged = SimpleNamespace(runs=[1, 2, 3], trained_on=["x", "y"], chosen_by=[])
-    assert "2 of the 3 evaluated runs" in seen_warning(judged) and "(x, …)" in seen_warning(judged)
-    assert seen_warning(SimpleNamespace(runs=[1], trained_on=[], chosen_by=[])) == ""
