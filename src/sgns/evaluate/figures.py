@@ -141,9 +141,7 @@ def energy_figure(energy: np.ndarray, displacement_energy: np.ndarray, num_modes
         missing = np.maximum(1.0 - np.asarray(values, dtype=np.float64), 1e-12)
         axis.semilogy(r, missing, color=colour, linewidth=width, label=label)
     plain_log_numbers(axis.yaxis)
-    log_modes(axis, len(energy), num_modes)
-    axis.set_ylabel("1 − energy(r), training runs")
-    axis.legend(loc="lower left")
+    finish_modes(axis, len(energy), num_modes, "1 − energy(r), training runs")
     return figure
 
 
@@ -166,10 +164,8 @@ def reconstruction_figure(
     axis.loglog(shown, held_out, color=ACCENT, marker="o", markersize=4, label="test runs")
     if network_rmse_mm is not None and math.isfinite(network_rmse_mm) and network_rmse_mm > 0.0:
         axis.axhline(network_rmse_mm, color=NETWORK, label="rollout of the network")
-    log_modes(axis, last, num_modes)
+    finish_modes(axis, last, num_modes, "reconstruction RMSE [mm]")
     round_numbers(axis.yaxis)
-    axis.set_ylabel("reconstruction RMSE [mm]")
-    axis.legend(loc="lower left")
     return figure
 
 
@@ -185,8 +181,8 @@ def round_numbers(axis: Axis, most: int | None = None) -> None:
     axis.set_major_formatter(lambda value, _: f"{value:g}")
 
 
-def log_modes(axis: Axes, last: int, num_modes: int) -> None:
-    """A logarithmic axis of mode counts with the network's count marked."""
+def finish_modes(axis: Axes, last: int, num_modes: int, label: str) -> None:
+    """A logarithmic axis of mode counts with the network's count marked, a label of the other axis, and the legend."""
     axis.set_xscale("log", base=2)
     ticks = [2**k for k in range(int(math.log2(max(last, 1))) + 1)]
     axis.set_xticks(ticks, [str(t) for t in ticks])
@@ -194,7 +190,8 @@ def log_modes(axis: Axes, last: int, num_modes: int) -> None:
     axis.axvline(num_modes, color=TRUTH, linewidth=0.8, linestyle=":")
     place: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
     axis.annotate(f"r = {num_modes}", (num_modes, 1.0), (3, -10), fontsize=9, **place)
-    axis.set_xlabel("number of modes r")
+    axis.set(xlabel="number of modes r", ylabel=label)
+    axis.legend(loc="lower left")
 
 
 # --- Quantities through time of one run: panels that share their time axis ------------------------------
