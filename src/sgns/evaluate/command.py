@@ -245,7 +245,6 @@ def evaluate(
         basis=simulator.basis,
         num_modes=simulator.num_modes,
         history=history,
-        particle_count=len(start),
         start=start,
         new_rollouts=new_rollouts,
         made=made or {},

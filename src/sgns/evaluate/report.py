@@ -31,7 +31,7 @@ from sgns.evaluate.figures import (
 from sgns.evaluate.metrics import surface_grid
 from sgns.evaluate.results import EvaluatedRun, Evaluation
 from sgns.evaluate.views import common_scales, latent_path, side_views, solid_views, subspace_view, view_times
-from sgns.evaluate.words import describe, fixed, forward_name, number, quantity, seen_warning, titled
+from sgns.evaluate.words import describe, fixed, forward_name, number, quantity, seen_warning
 
 PAGES = Environment(loader=PackageLoader("sgns", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
 """Templates of pages, by their path in the package."""
@@ -186,9 +186,10 @@ def whole_run(evaluation: Evaluation, chosen: EvaluatedRun, label: str) -> Figur
         )
         return FigureGroup(
             f"{label}: side view and surface",
-            f"{titled(chosen.label, truth.scene)}. Soil within a slice at mid-width, coloured by speed; the arrow is "
-            "the force by the soil on the tool. Simulated above, predicted below, with the same scales at all times: "
-            "look at the shape of the pile before the tool, at how far the dark zone reaches, and at the arrows.",
+            f"{': '.join(filter(None, (chosen.label, chosen.words)))}. Soil within a slice at mid-width, coloured by "
+            "speed; the arrow is the force by the soil on the tool. Simulated above, predicted below, with the same "
+            "scales at all times: look at the shape of the pile before the tool, at how far the dark zone reaches, and "
+            "at the arrows.",
             [*figures, surface],
         )
 

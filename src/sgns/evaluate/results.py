@@ -223,7 +223,6 @@ class Evaluation:
     basis: Basis  # of the network
     num_modes: int  # modes r that the network uses
     history: int  # frames d that it was given
-    particle_count: int  # particles n of the bed
     start: np.ndarray  # common start of the particles [m], shape (n, 3)
     costs: Costs = field(default_factory=Costs)  # of the network
     # of the same network on every particle; None if it was not asked for
@@ -268,7 +267,7 @@ def write_tables(evaluation: Evaluation, output: Path) -> None:
             "split": evaluation.split,
             "num_modes": evaluation.num_modes,
             "history": evaluation.history,
-            "particles": evaluation.particle_count,
+            "particles": len(evaluation.start),
             "aggregate": evaluation.total.row(),
             "runs": [score.row() for score in scores],
             "mean_training_force_N": evaluation.mean_force,

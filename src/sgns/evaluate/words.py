@@ -54,12 +54,6 @@ def describe(scene: Mapping[str, Any]) -> str:
     return ""
 
 
-def titled(name: str, scene: Mapping[str, Any]) -> str:
-    """A run's name with its scene in a few words."""
-    words = describe(scene)
-    return f"{name}: {words}" if words else name
-
-
 def short_names(names: Sequence[str]) -> list[str]:
     """The part of every name before its first underscore, if that still tells the names apart."""
     short = [name.partition("_")[0] or name for name in names]

@@ -19,7 +19,7 @@ from sgns.evaluate.results import (
     Scores,
     aggregate,
 )
-from sgns.evaluate.words import describe, fixed, number, short_names, titled
+from sgns.evaluate.words import describe, fixed, number, short_names
 from sgns.reduction.basis import Basis, ReductionCurves
 
 EVIL = '<script>alert("run&1")</script>'
@@ -60,7 +60,6 @@ def evaluation(names=("run1", "run2"), split="test", rollout=0.1, words="", whee
         basis=Basis(torch.zeros(4, 3), torch.eye(4)[:, :2], torch.ones(2), 3.0, 3.0, "particle_axis"),
         num_modes=2,
         history=3,
-        particle_count=9600,
         start=np.zeros((9600, 3)),
         made={"command": "sgns evaluate 'a<b'", "machine": "a CPU, 4 cores"},
     )
@@ -205,7 +204,6 @@ def test_description_and_file_name():
     wheel = {"diameter": 0.15, "load": 100.0, "slip": 0.4, "friction_angle": 30.0, "gravity": 3.72}
     assert describe(wheel) == "15 cm wheel, 100 N, slip 40 %, friction angle 30°, gravity 3.72 m/s²"
     assert describe({"kind": "bed"}) == ""
-    assert titled("run", scene) == f"run: {describe(scene)}" and titled("run", {}) == "run"
     assert file_name("../a b/ü.h5") == "-a-b-h5"
 
 
