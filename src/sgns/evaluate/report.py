@@ -62,8 +62,9 @@ class FigureGroup:
     """Pictures under one heading."""
 
     heading: str  # of the group
-    note: str  # what to see in them
+    note: str  # name of the note in the template: what to see in them
     figures: Sequence[ReportFigure]  # the pictures
+    scene: str = ""  # what the note begins with: of which run they are
 
 
 # --- The page -------------------------------------------------------------------------------------------
@@ -105,6 +106,7 @@ def render_report(evaluation: Evaluation, groups: Sequence[FigureGroup]) -> str:
         forward=forward_name(evaluation),
         warning=seen_warning(evaluation),
         nan=math.nan,
+        left_out=len(evaluation.runs[MOST_RUNS:]),
         groups=groups,
     )
 
@@ -184,14 +186,8 @@ def whole_run(evaluation: Evaluation, chosen: EvaluatedRun, label: str) -> Figur
             "Height of the highest particle of every column: black simulated, blue predicted.",
             profile_figure(runs, frames, surface_grid(evaluation.start)),
         )
-        return FigureGroup(
-            f"{label}: side view and surface",
-            f"{': '.join(filter(None, (chosen.label, chosen.words)))}. Soil within a slice at mid-width, coloured by "
-            "speed; the arrow is the force by the soil on the tool. Simulated above, predicted below, with the same "
-            "scales at all times: look at the shape of the pile before the tool, at how far the dark zone reaches, and "
-            "at the arrows.",
-            [*figures, surface],
-        )
+    scene = ": ".join(filter(None, (chosen.label, chosen.words)))
+    return FigureGroup(f"{label}: side view and surface", "whole run", [*figures, surface], scene)
 
 
 def half_way(evaluation: Evaluation, chosen: Sequence[EvaluatedRun]) -> FigureGroup:
@@ -205,11 +201,7 @@ def half_way(evaluation: Evaluation, chosen: Sequence[EvaluatedRun]) -> FigureGr
                 f"Simulated above, predicted below. {run.words}",
             )
             figures += seen_from_the_side(evaluation, runs, frames, f"side_{run.name}", run.label, caption)
-    return FigureGroup(
-        "More runs, half-way",
-        "As above, at one moment of each run. Colours and arrows have scales of their own in every picture.",
-        figures,
-    )
+    return FigureGroup("More runs, half-way", "half-way", figures)
 
 
 def in_space(evaluation: Evaluation, chosen: EvaluatedRun) -> FigureGroup:
@@ -218,27 +210,17 @@ def in_space(evaluation: Evaluation, chosen: EvaluatedRun) -> FigureGroup:
         frame = view_times(truth, evaluation.history)[1]
         views = solid_views(truth, prediction, frame, evaluation.start)
         caption = f"All particles and the tool in three dimensions at {truth.time[frame]:.2f} s."
-    return FigureGroup(
-        f"The whole bed: run {chosen.label}",
-        "Every particle, coloured by how far it has moved, simulated and predicted with one scale; then by how far the "
-        "prediction is from the simulated place: dark spots are where it is wrong. The arrow is the force on "
-        "the tool, from its centre of mass.",
-        [
-            picture(
-                f"solid_{chosen.name}_{count}",
-                f"{chosen.label} in three dimensions: {title}",
-                caption,
-                figure,
-            )
-            for count, (title, figure) in enumerate(views.items(), start=1)
-        ],
-    )
+    figures = [
+        picture(
+            f"solid_{chosen.name}_{count}", f"{chosen.label} in three dimensions: {title}", caption, figure
+        )
+        for count, (title, figure) in enumerate(views.items(), start=1)
+    ]
+    return FigureGroup(f"The whole bed: run {chosen.label}", "whole bed", figures)
 
 
 def histories(evaluation: Evaluation) -> list[FigureGroup]:
     """Force, torque and errors through time of the runs of the split."""
-    left_out = len(evaluation.runs[MOST_RUNS:])
-    more = f" {left_out} more runs are in the tables only." if left_out else ""
     drawn: dict[str, list[ReportFigure]] = {"force": [], "torque": [], "error": []}
     for run in evaluation.runs[:MOST_RUNS]:
         scores = run.scores
@@ -261,40 +243,15 @@ def histories(evaluation: Evaluation) -> list[FigureGroup]:
                 figures.append(
                     picture(f"{name}_{run.name}", title, captions[name], history_figure(panels[name]))
                 )
-    return [
-        FigureGroup(
-            "Force through time",
-            "By the soil on the tool, frame means, not smoothed: black simulated, blue predicted, dashed the mean of "
-            f"the training runs. A wheel's sinkage stands below its forces.{more}",
-            drawn["force"],
-        ),
-        FigureGroup(
-            "Torque through time",
-            "About the tool's centre of mass, likewise; axes about which there is next to none are left out.",
-            drawn["torque"],
-        ),
-        FigureGroup(
-            "Error through time",
-            "Positions: the network should stay near “PCA alone”, the least error any prediction in this subspace can "
-            "have, and far below the grey guesses: nothing moves (dashed), every particle goes on at its last given "
-            "speed (dotted; it may leave the picture). Force: length of the error vector, beside that of the "
-            f"training runs' mean.{more}",
-            drawn["error"],
-        ),
-    ]
+    return [FigureGroup(f"{name.title()} through time", name, figures) for name, figures in drawn.items()]
 
 
 def by_particle(evaluation: Evaluation) -> FigureGroup:
     """How the errors are spread over particles."""
     particles = [run.errors.particles for run in evaluation.runs if run.errors.particles is not None]
     caption = f"{len(particles)} runs together; dotted: the median. Below 1 µm counts as 1 µm."
-    return FigureGroup(
-        "Error by particle",
-        "Mean square over time of every particle's position error, on a logarithmic axis: what the reduction "
-        "leaves out, and what the network adds within the subspace. Most particles hardly move; the bars far to "
-        "the right are the soil that the tool carries.",
-        [picture("particles", "Error by particle", caption, histogram_figure(particles))],
-    )
+    figures = [picture("particles", "Error by particle", caption, histogram_figure(particles))]
+    return FigureGroup("Error by particle", "particles", figures)
 
 
 def in_subspace(evaluation: Evaluation, chosen: EvaluatedRun) -> FigureGroup:
@@ -310,40 +267,29 @@ def in_subspace(evaluation: Evaluation, chosen: EvaluatedRun) -> FigureGroup:
             )
             for count, frame in enumerate(view_times(truth, evaluation.history), start=1)
         ]
-    return FigureGroup(
-        f"What the network steps: the subspace of run {chosen.label}",
-        "Every mode is a point with three coordinates; these points, numbered, and the body are all that the network "
-        "sees. Lines are the ways they have come; where blue dots fill the black rings, the prediction is right. "
-        "Arrows: force on the body, which is drawn at its true place and size.",
-        figures,
-    )
+    heading = f"What the network steps: the subspace of run {chosen.label}"
+    return FigureGroup(heading, "subspace", figures)
 
 
 def reduction(evaluation: Evaluation) -> FigureGroup:
     """Energy of the modes and reconstruction error."""
     curves, modes = evaluation.curves, evaluation.num_modes
     rmse = evaluation.total.rmse_mm("total")
-    return FigureGroup(
-        "What the subspace can hold",
-        "The more modes, the less is lost. If the network's line lies near the curve at its number of modes, "
-        "more modes would help it; if far above, a better network would.",
-        [
-            picture(
-                "energy",
-                "Energy that the modes leave out",
-                "The paper's energy counts the layout of the bed unless every particle is centred; "
-                "displacement energy counts motion only.",
-                energy_figure(curves.energy, curves.displacement_energy, modes),
-            ),
-            picture(
-                "reconstruction",
-                "Reconstruction error",
-                f"Projection of the {evaluation.split} runs on r modes and back; the horizontal line is the "
-                f"rollout's error with {modes} modes.",
-                reconstruction_figure(curves.held_out, curves.training, modes, rmse),
-            ),
-        ],
+    energy = picture(
+        "energy",
+        "Energy that the modes leave out",
+        "The paper's energy counts the layout of the bed unless every particle is centred; "
+        "displacement energy counts motion only.",
+        energy_figure(curves.energy, curves.displacement_energy, modes),
     )
+    reconstruction = picture(
+        "reconstruction",
+        "Reconstruction error",
+        f"Projection of the {evaluation.split} runs on r modes and back; the horizontal line is the "
+        f"rollout's error with {modes} modes.",
+        reconstruction_figure(curves.held_out, curves.training, modes, rmse),
+    )
+    return FigureGroup("What the subspace can hold", "reduction", [energy, reconstruction])
 
 
 def training(evaluation: Evaluation) -> FigureGroup:
@@ -352,12 +298,7 @@ def training(evaluation: Evaluation) -> FigureGroup:
     if evaluation.training_log:
         caption = "Losses of the training batches on a logarithmic axis; skill and force NRMSE of the validation runs."
         figures.append(picture("training", "Training", caption, training_figure(evaluation.training_log)))
-    return FigureGroup(
-        "How it was trained",
-        "The loss is of single steps, the skill of whole rollouts of the validation runs, within the subspace: low "
-        "losses alone are no proof. The checkpoint with the highest skill is kept.",
-        figures,
-    )
+    return FigureGroup("How it was trained", "training", figures)
 
 
 def new_path(evaluation: Evaluation, path: Path) -> FigureGroup:
@@ -369,8 +310,4 @@ def new_path(evaluation: Evaluation, path: Path) -> FigureGroup:
         panels = force_panels(None, run, min(1, run.frame_count - 1), evaluation.mean_force)
     caption = "Frame means; dashed: the mean of the training runs."
     force = picture(f"new_force_{name}", f"{name}: predicted force", caption, history_figure(panels))
-    return FigureGroup(
-        f"A path that was never simulated: {name}",
-        f"{words}. There is no truth to compare with.",
-        [*figures, force],
-    )
+    return FigureGroup(f"A path that was never simulated: {name}", "new path", [*figures, force], words)

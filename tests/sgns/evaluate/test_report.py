@@ -1,3 +1,4 @@
+import html
 import math
 import re
 from dataclasses import replace
@@ -92,7 +93,7 @@ def parsed(page):
 
 
 def group(data=b"", words="Words"):
-    return FigureGroup(words, words, [ReportFigure("a", words, words, data)])
+    return FigureGroup(words, "training", [ReportFigure("a", words, words, data)], words)
 
 
 def section(heading, result):
@@ -103,8 +104,9 @@ def section(heading, result):
 
 
 def summary(result):
-    """The first paragraph of the page."""
-    return " ".join(render_report(result, []).partition("<p>")[2].partition("</p>")[0].split())
+    """The words of the first paragraph of the page."""
+    text = render_report(result, []).partition("<p>")[2].partition("</p>")[0]
+    return " ".join(html.unescape(text).split())
 
 
 def test_page_is_well_formed_and_needs_nothing_from_outside():
