@@ -115,13 +115,9 @@ def profile_figure(runs: Mapping[str, Any], frames: Sequence[int], grid: Surface
 
 def middle_line(run: Any, frame: int, grid: SurfaceGrid) -> np.ndarray:
     """Surface height along x, mean over the columns next to mid-width that hold particles [mm], shape (nx,)."""
-    count = grid.shape[1]
-    heights = height_map(run.positions(frame)[0], grid)
-    middle = heights[:, (count - 1) // 2 : count // 2 + 1]
-    filled = np.isfinite(middle)
-    total = np.where(filled, middle, 0.0).sum(axis=1)
-    mean = np.full(len(total), np.nan)
-    return 1e3 * np.divide(total, filled.sum(axis=1), out=mean, where=filled.any(axis=1))
+    heights, count = height_map(run.positions(frame)[0], grid), grid.shape[1]
+    middle = np.ma.masked_invalid(heights[:, (count - 1) // 2 : count // 2 + 1])
+    return 1e3 * middle.mean(axis=1).filled(np.nan)
 
 
 # --- reduction --------------------------------------------------------------------------------------------
@@ -147,7 +143,7 @@ def energy_figure(energy: np.ndarray, displacement_energy: np.ndarray, num_modes
 
 @styled
 def reconstruction_figure(
-    test: np.ndarray, training: np.ndarray | None, num_modes: int, network_rmse_mm: float | None = None
+    test: np.ndarray, training: np.ndarray, num_modes: int, network_rmse_mm: float
 ) -> Figure:
     """Reconstruction error for r = 1, 2, 4, … modes.
 
@@ -157,12 +153,11 @@ def reconstruction_figure(
     figure, (axis,) = charts(1, 3.4)
     last = len(test) - 1
     shown = sorted({min(2**k, last) for k in range(int(math.log2(max(last, 1))) + 2)})
-    if training is not None:
-        fitted = [1e3 * math.sqrt(max(training[r - 1], 0.0)) for r in shown]
-        axis.loglog(shown, fitted, color=BASELINE, linestyle="--", marker=".", label="training runs")
+    fitted = [1e3 * math.sqrt(max(training[r - 1], 0.0)) for r in shown]
+    axis.loglog(shown, fitted, color=BASELINE, linestyle="--", marker=".", label="training runs")
     held_out = [1e3 * math.sqrt(test[r]) for r in shown]
     axis.loglog(shown, held_out, color=ACCENT, marker="o", markersize=4, label="test runs")
-    if network_rmse_mm is not None and math.isfinite(network_rmse_mm) and network_rmse_mm > 0.0:
+    if 0.0 < network_rmse_mm < math.inf:
         axis.axhline(network_rmse_mm, color=NETWORK, label="rollout of the network")
     finish_modes(axis, last, num_modes, "reconstruction RMSE [mm]")
     round_numbers(axis.yaxis)

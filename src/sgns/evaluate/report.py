@@ -196,10 +196,8 @@ def half_way(evaluation: Evaluation, chosen: Sequence[EvaluatedRun]) -> FigureGr
     for run in chosen:
         with both_runs(run) as (truth, prediction):
             frames = [view_times(truth, evaluation.history)[1]]
-            runs, caption = (
-                {MPM: truth, NETWORK: prediction},
-                f"Simulated above, predicted below. {run.words}",
-            )
+            runs = {MPM: truth, NETWORK: prediction}
+            caption = f"Simulated above, predicted below. {run.words}"
             figures += seen_from_the_side(evaluation, runs, frames, f"side_{run.name}", run.label, caption)
     return FigureGroup("More runs, half-way", "half-way", figures)
 
@@ -210,10 +208,9 @@ def in_space(evaluation: Evaluation, chosen: EvaluatedRun) -> FigureGroup:
         frame = view_times(truth, evaluation.history)[1]
         views = solid_views(truth, prediction, frame, evaluation.start)
         caption = f"All particles and the tool in three dimensions at {truth.time[frame]:.2f} s."
+    name, label = f"solid_{chosen.name}", f"{chosen.label} in three dimensions"
     figures = [
-        picture(
-            f"solid_{chosen.name}_{count}", f"{chosen.label} in three dimensions: {title}", caption, figure
-        )
+        picture(f"{name}_{count}", f"{label}: {title}", caption, figure)
         for count, (title, figure) in enumerate(views.items(), start=1)
     ]
     return FigureGroup(f"The whole bed: run {chosen.label}", "whole bed", figures)
@@ -237,12 +234,10 @@ def histories(evaluation: Evaluation) -> list[FigureGroup]:
                 "torque": torque_panels(*both, evaluation.mean_torque),
                 "error": error_panels(run.errors, *both, evaluation.mean_force),
             }
-        for name, figures in drawn.items():
+        for name in drawn:
             if panels[name]:
-                title = f"{run.label}: {name} through time"
-                figures.append(
-                    picture(f"{name}_{run.name}", title, captions[name], history_figure(panels[name]))
-                )
+                title, figure = f"{run.label}: {name} through time", history_figure(panels[name])
+                drawn[name].append(picture(f"{name}_{run.name}", title, captions[name], figure))
     return [FigureGroup(f"{name.title()} through time", name, figures) for name, figures in drawn.items()]
 
 

@@ -1,5 +1,6 @@
 """Figures of the report."""
 
+import math
 from types import SimpleNamespace
 
 import matplotlib
@@ -71,7 +72,7 @@ def test_complete_energy_and_no_residual_can_be_drawn():
     before = dict(matplotlib.rcParams)
     draw = lambda: figures.png(figures.energy_figure(np.ones(3), np.ones(3), 3))  # noqa: E731
     assert draw() == draw()
-    pixels(figures.reconstruction_figure(np.array([1e-5, 1e-6, 0.0]), None, 2))
+    pixels(figures.reconstruction_figure(np.array([1e-5, 1e-6, 0.0]), np.zeros(2), 2, math.nan))
     assert dict(matplotlib.rcParams) == before
 
 
