@@ -125,9 +125,8 @@ def draw_force(
     force: np.ndarray,
     foot: np.ndarray,
     tip: np.ndarray,
-    *,
     head: str = "-|>",
-    **more: Any,
+    clip: bool | None = None,
 ) -> None:
     """A force [N] as an arrow between two points of the picture, and its size in the corner."""
     colour = TRUTH if run.producer == "mpm" else NETWORK
@@ -135,7 +134,7 @@ def draw_force(
     if not 0.0 < size < math.inf:
         return
     arrow = {"arrowstyle": head, "color": colour, "linewidth": 2.0, "shrinkA": 0.0, "shrinkB": 0.0}
-    axis.annotate("", xy=tuple(tip), xytext=tuple(foot), zorder=4, arrowprops=arrow, **more)
+    axis.annotate("", xy=tuple(tip), xytext=tuple(foot), zorder=4, arrowprops=arrow, annotation_clip=clip)
     axis.text(
         0.99, 0.97, f"{size:.0f} N", color=colour, fontsize=9, ha="right", va="top", transform=axis.transAxes
     )
@@ -320,7 +319,7 @@ def solid_figure(
         scale = SOLID_ARROW * (right_top[0] - left_bottom[0]) / strongest
         foot = project(run.pose[frame, :3])[:2]
         tip = foot + project(run.force[frame])[:2] * scale
-        draw_force(axis, run, run.force[frame], foot, tip, annotation_clip=False)
+        draw_force(axis, run, run.force[frame], foot, tip, clip=False)
     figure.colorbar(colours, ax=axis, label=label, shrink=0.9, **COLOUR_BAR)
     return figure
 

@@ -152,25 +152,6 @@ def test_damage_beside_the_checkpoint_is_refused_before_anything_is_rolled_out(d
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("scene", "words"),
-    [
-        ({"speed": "fast"}, "scene.speed is 'fast'"),
-        ({"blade": {"width": None}}, "scene.blade.thickness is None"),
-    ],
-)
-def test_scenes_without_numbers_are_refused_before_anything_is_rolled_out(
-    dataset, basis, tmp_path, scene, words
-):
-    odd = make_run(tmp_path / "odd.h5", frames=20, n=120)
-    with h5py.File(odd, "r+") as file:
-        write_text(file, "scene", json.dumps(scene))
-    splits = dataset.splits | {"test": [odd]}
-    with pytest.raises(UserError, match=re.escape(words)):
-        evaluate(simulator(dataset, basis), replace(dataset, splits=splits), tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 def test_full_basis_is_found_beside_the_dataset(dataset, tmp_path):
     full = fitted(dataset.runs("train"), 10)
     other = fitted(dataset.runs("test"), 6)
@@ -186,24 +167,34 @@ def test_full_basis_is_found_beside_the_dataset(dataset, tmp_path):
     assert torch.allclose(found.modes, full.modes)
 
 
-def test_empty_split_foreign_runs_and_a_file_for_a_folder_are_refused(dataset, basis, tmp_path):
-    known = simulator(dataset, basis)
+def test_what_cannot_be_evaluated_is_refused_before_anything_is_rolled_out(dataset, basis, tmp_path):
+    known, out = simulator(dataset, basis), tmp_path / "out"
 
-    def of(*runs):
+    def test_split(*runs):
         return replace(dataset, splits=dataset.splits | {"test": list(runs)})
 
-    foreign = make_run(tmp_path / "foreign.h5", frames=20, n=120, arrangement_hash="other")
-    slow = make_run(tmp_path / "slow.h5", frames=20, n=120, frame_rate=30.0)
+    def run(name, scene=None, **kw):
+        path = make_run(tmp_path / f"{name}.h5", frames=20, n=120, **kw)
+        if scene is not None:
+            with h5py.File(path, "r+") as file:
+                write_text(file, "scene", json.dumps(scene))
+        return path
+
+    foreign, slow = run("foreign", arrangement_hash="other"), run("slow", frame_rate=30.0)
+    words, bare = run("words", {"speed": "fast"}), run("bare", {"blade": {"width": None}})
     (tmp_path / "file").write_text("")
-    for judged, output, new, words in (
-        (of(), tmp_path, [], "no complete run in its split 'test'"),
-        (of(foreign), tmp_path, [], "another particle arrangement"),
-        (dataset, tmp_path, [foreign], "another particle arrangement"),
-        (dataset, tmp_path, [slow], "recorded at 30 Hz"),
+    for judged, output, new, told in (
+        (test_split(), out, [], "no complete run in its split 'test'"),
+        (test_split(foreign), out, [], "another particle arrangement"),
+        (dataset, out, [foreign], "another particle arrangement"),
+        (dataset, out, [slow], "recorded at 30 Hz"),
+        (test_split(words), out, [], "scene.speed is 'fast'"),
+        (test_split(bare), out, [], "scene.blade.thickness is None"),
         (dataset, tmp_path / "file", [], "cannot write to output="),
     ):
-        with pytest.raises(UserError, match=words):
+        with pytest.raises(UserError, match=re.escape(told)):
             evaluate(known, judged, output, new_rollouts=new)
+    assert not out.exists()
 
 
 def test_one_thread_and_back():

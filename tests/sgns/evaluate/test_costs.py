@@ -18,12 +18,9 @@ from sgns_testing.tiny import MODEL
 CARD = {"settings": {"training": {"batch_size": 32}}}
 
 
-def test_nothing_is_known_of_a_checkpoint_that_is_not_there(tmp_path):
-    unknown = network_costs(tmp_path / "best.ckpt", {})
-    assert math.isnan(unknown.parameters) and math.isnan(unknown.seconds_per_step)
-
-
 def test_training_is_read_from_beside_the_checkpoint(tmp_path):
+    unknown = network_costs(tmp_path / "best.ckpt", CARD)
+    assert math.isnan(unknown.parameters) and math.isnan(unknown.seconds_per_step)
     (tmp_path / "training.json").write_text(json.dumps({"steps": 50, "seconds": 2.0, "skill": 0.5}))
     known = network_costs(tmp_path / "best.ckpt", CARD)
     assert known.seconds_per_step == pytest.approx(0.04) and known.batch_size == 32

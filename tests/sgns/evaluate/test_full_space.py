@@ -201,7 +201,7 @@ def trained(windows, steps: int) -> tuple[FullSpaceDynamics, torch.Tensor]:
 
 def test_training_learns(windows):
     errors = []
-    for steps in (1, 60):
+    for steps in (1, 90):
         dynamics, scale = trained(windows, steps)
         with torch.inference_mode():
             errors.append(float(losses(dynamics, windows.batch(1000, 20, scale))[0]))

@@ -86,18 +86,17 @@ def test_surface_error_of_a_thinned_bed_is_that_of_the_bed(arrangement):
     assert particle_spacing(thinned) == pytest.approx(5 ** (1 / 3) * particle_spacing(full), rel=0.05)
 
 
-class ArrayRun:
-    """A run in memory."""
-
-    def __init__(self, positions, name="run.h5"):
-        self.values = np.asarray(positions, dtype=np.float32)
-        self.frame_count, self.particle_count, _ = self.values.shape
-        self.time = np.arange(self.frame_count) / 60.0
-        self.arrangement_hash = "same"
-        self.path = name
-
-    def positions(self, frames=slice(None)):
-        return self.values[frames]
+def in_memory(positions):
+    """A run of these positions."""
+    values = np.asarray(positions, dtype=np.float32)
+    return SimpleNamespace(
+        positions=lambda frames: values[frames],
+        frame_count=values.shape[0],
+        particle_count=values.shape[1],
+        time=np.arange(len(values)) / 60.0,
+        arrangement_hash="same",
+        path="run.h5",
+    )
 
 
 def make_basis(n=7, r=2, seed=0):
@@ -114,8 +113,8 @@ def make_basis(n=7, r=2, seed=0):
 
 
 def compared(truth, prediction, basis=None, history=2):
-    truth, prediction = ArrayRun(truth), ArrayRun(prediction)
-    grid = surface_grid(truth.values[0])
+    grid = surface_grid(truth[0])
+    truth, prediction = in_memory(truth), in_memory(prediction)
     return position_errors(truth, prediction, basis or make_basis(truth.particle_count), history, grid)
 
 
