@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from torch.utils.tensorboard import SummaryWriter
 
 from mpm_warp.poses import in_body_frame, in_world_frame
 from sgns.config import UserError
@@ -46,13 +47,23 @@ def test_whole_evaluation(dataset, basis, tmp_path):
     with Run(dataset.runs("test")[0]) as run:
         rollout = known.rollout(run.pose, in_body_frame(run.pose[0], run.body_points[0]))
         new = write_rollout(tmp_path / "new path.h5", known, run.scene, rollout)
-    output = tmp_path / "out"
-    result = evaluate(known, dataset, output, new_rollouts=[new], made={"command": "sgns evaluate"})
+    output, split = tmp_path / "out", dataset.runs("train")[2:] + dataset.runs("test")
+    judged = replace(dataset, splits=dataset.splits | {"test": split})
+    with SummaryWriter(tmp_path / "tensorboard") as log:
+        log.add_scalar("loss/total", 0.5, 10)
+    result = evaluate(
+        known,
+        judged,
+        output,
+        checkpoint=tmp_path / "best.ckpt",
+        new_rollouts=[new],
+        made={"command": "sgns evaluate"},
+    )
     report = write_report(result, output)
 
     with (output / "metrics.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == len(dataset.runs("test")) + 1
+    assert len(rows) == len(split) + 1
     summary = json.loads((output / "metrics.json").read_text())
     assert summary["aggregate"]["skill_frozen"] == pytest.approx(result.total.skill())
     assert summary["wall_s_per_simulated_s"]["solver"] == pytest.approx(60.0 / 19.0)
@@ -65,7 +76,7 @@ def test_whole_evaluation(dataset, basis, tmp_path):
     for run in result.runs:
         assert check_run(run.rollout) == []
         with Run(run.rollout) as written:
-            assert written.extra["checkpoint"] == "best.ckpt"
+            assert written.extra["checkpoint"] == str(tmp_path / "best.ckpt")
             assert written.extra["checkpoint_settings"] == known.card["settings"]
             assert written.extra["history"] == known.history
         assert run.scores.mse["total"] == pytest.approx(
@@ -73,9 +84,15 @@ def test_whole_evaluation(dataset, basis, tmp_path):
         )
     text = report.read_text(encoding="utf-8")
     assert text.count("data:image/png;base64,") == len(list((output / "figures").glob("*.png"))) >= 25
-    for heading in ("Force through time", "Torque through time", "Error by particle", "The whole bed"):
-        assert heading in text
-    assert "never simulated" in text
+    headings = (
+        "More runs",
+        "Force through time",
+        "Torque through time",
+        "Error by particle",
+        "The whole bed",
+    )
+    for heading in (*headings, "How it was trained", "A path that was never simulated"):
+        assert f">{heading}" in text
 
 
 def test_perfect_network_is_limited_by_the_reduction_alone(dataset, basis, tmp_path, caplog):
