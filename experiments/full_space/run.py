@@ -149,6 +149,28 @@ def train(
     return record
 
 
+def unroll(dynamics: FullSpaceDynamics, soil: Tensor, body: BodyTrack) -> tuple[Tensor, Tensor]:
+    """Follow whole tool paths, feeding predictions back.
+
+    Args:
+        dynamics: Trained.
+        soil: The first d positions of each path [m], shape (B, d, n, 3).
+        body: The tool at all T frames, (B, T, N, ...).
+
+    Returns:
+        Positions [m] (B, T, n, 3) whose first d frames are the given ones, and force [N] (B, T, 3), zero in the
+        first d frames; float64.
+    """
+    d, frames = dynamics.history, body.position.shape[1]
+    states = soil.new_empty((soil.shape[0], frames, *soil.shape[2:]))
+    states[:, :d] = soil
+    force = soil.new_zeros((soil.shape[0], frames, 3))
+    for t in range(d, frames):
+        window = body.frames(slice(t - d + 1, t + 1))
+        states[:, t], force[:, t] = dynamics.advance(states[:, t - d : t], window)
+    return states, force
+
+
 def timed(action: Callable[[], object], repeats: int) -> list[float]:
     """Processor times after one call to warm up [s]."""
     action()
@@ -315,7 +337,7 @@ def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) ->
         run = by_path[file]
         body = BodyTrack(*(part[None] for part in run.track))
         with torch.inference_mode():
-            positions, force = dynamics.unroll(run.soil(slice(0, dynamics.history))[None], body)
+            positions, force = unroll(dynamics, run.soil(slice(0, dynamics.history))[None], body)
         return positions[0].numpy(), force[0].numpy()
 
     dataset = Dataset.open(path)

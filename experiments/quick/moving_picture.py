@@ -20,7 +20,7 @@ from PIL import Image
 
 from sgns import Run
 from sgns.evaluate.figures import NETWORK, STYLE, TRUTH
-from sgns.evaluate.side_view import Scales, common_scales, draw_view
+from sgns.evaluate.views import Scales, common_scales, draw_view
 
 HERE = Path(__file__).resolve().parent
 RUN = "0024_motion-curved_rake-3.8_depth-0.08_speed-0.04"

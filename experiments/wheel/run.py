@@ -15,7 +15,7 @@ from hydra import compose, initialize_config_module
 matplotlib.use("Agg")
 
 from sgns.data.run import Run
-from sgns.evaluate.side_view import side_views
+from sgns.evaluate.views import common_scales, side_views
 from sgns.simulate.run import simulate_scene
 from sgns.simulate.scene import asked_effects, decided, scene_from_config
 
@@ -36,7 +36,10 @@ def main() -> None:
         runs[f"slip {100 * slip:.0f} %"] = Run(file)
     for title, run in runs.items():
         print(title, scene.summary(run.force, run.torque, run.pose))
-    figure = side_views(runs, [60, 200, 359], scene.initial_positions())
+    frames = (60, 200, 359)
+    scales = common_scales(list(runs.values()), frames, scene.initial_positions())
+    views = [[(title, run, frame) for title, run in runs.items()] for frame in frames]
+    figure = side_views(views, scales, whole_width=10.8, width=4.95)
     figure.savefig(HERE / "side.png", dpi=90)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -112,5 +111,4 @@ def made_scores(name: str, total: float, frozen: float, force: float = 1.0, rate
     errors = VectorErrors.compare(truth, force * truth)
     mse = dict.fromkeys(("reduction", "network", "surface", "surface_frozen"), 1e-6)
     mse |= {"total": total, "frozen": frozen, "constant_velocity": 2.0 * frozen}
-    mpe = {"draft": 100 * abs(force - 1), "lateral": math.nan, "vertical": 100 * abs(force - 1)}
-    return Scores(name, 4, mse, errors, errors, errors, errors, rate, mpe, mpe)
+    return Scores(name, 4, mse, errors, errors, errors, errors, rate)

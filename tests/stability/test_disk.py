@@ -21,7 +21,7 @@ import pytest
 from kills import broken, same
 
 from sgns.data.files import whole_file, write_whole
-from sgns.evaluate.figures import read_log
+from sgns.evaluate.command import read_log
 from sgns.reduction.reduce import reduce_dataset
 from sgns.train.command import train
 from sgns_testing.commands import REDUCED, SMALL, TRAIN, call, environment, files, refused, small_dataset

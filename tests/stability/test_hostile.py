@@ -32,8 +32,8 @@ from sgns.data.check import check_run
 from sgns.data.dataset import Dataset
 from sgns.data.published import read_published
 from sgns.data.run import Run
+from sgns.evaluate.command import read_log
 from sgns.evaluate.costs import network_costs
-from sgns.evaluate.figures import read_log
 from sgns.frontier.measure import read_record
 from sgns.frontier.observation import read_observation
 from sgns.frontier.point import read_points

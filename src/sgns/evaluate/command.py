@@ -16,8 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
+from mpm_warp.inputs import open_file
 from mpm_warp.poses import in_body_frame
 from sgns.clock import elapsed
 from sgns.config import UserError
@@ -25,7 +27,7 @@ from sgns.data.files import only_here, require_replaceable
 from sgns.data.layout import scene_problems
 from sgns.data.run import Run
 from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory, provenance
-from sgns.evaluate.figures import read_log
+from sgns.evaluate.figures import VALIDATION
 from sgns.evaluate.metrics import body_errors, is_wheel, mean_prediction, position_errors, surface_grid
 from sgns.evaluate.report import write_report
 from sgns.evaluate.results import (
@@ -35,10 +37,9 @@ from sgns.evaluate.results import (
     aggregate,
     run_scores,
     seen_before,
-    seen_warning,
+    write_tables,
 )
-from sgns.evaluate.tables import write_tables
-from sgns.evaluate.words import describe, forward_name, short_names
+from sgns.evaluate.words import describe, forward_name, seen_warning, short_names
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout
 from sgns.settings import ModelSettings, model_settings
@@ -51,6 +52,8 @@ if TYPE_CHECKING:
     from sgns.states import Rollout
 
 log = logging.getLogger(__name__)
+
+MOST_BYTES = 1 << 26  # of a training's log, all files together; a day of training writes a tenth of that
 
 
 def roll_out(simulator: Simulator, run: Run) -> Rollout:
@@ -75,8 +78,10 @@ def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTimin
                 simulator.basis.inverse(latent)
             per_second = float(rollout.wall_time_s) / simulated
             times.append((per_second, per_second + elapsed(began, time.perf_counter()) / simulated))
-        medians = (statistics.median(kind) for kind in zip(*times[1:], strict=True))
-        return NetworkTiming(*medians, repeats, path.stem, rollout_bytes, peak_memory())
+        rollout_time, decoded_time = (statistics.median(kind) for kind in zip(*times[1:], strict=True))
+        return NetworkTiming(
+            rollout_time, decoded_time, repeats, path.stem, rollout_bytes, decoded_bytes=peak_memory()
+        )
 
 
 def full_basis(dataset: Dataset, basis: Basis) -> Basis:
@@ -87,10 +92,9 @@ def full_basis(dataset: Dataset, basis: Basis) -> Basis:
             other = Basis.load(path)
         except UserError:  # another version's cache: the report then shows the network's modes only
             continue
-        shared = other.num_modes > best.num_modes and other.modes.shape[0] == basis.modes.shape[0]
-        if shared and torch.allclose(
-            other.modes[:, : basis.num_modes].double(), basis.modes.double(), atol=1e-5
-        ):
+        first = other.modes[:, : basis.num_modes].double()
+        larger = other.num_modes > best.num_modes and first.shape == basis.modes.shape
+        if larger and torch.allclose(first, basis.modes.double(), atol=1e-5):
             best = other
     return best
 
@@ -105,6 +109,35 @@ def training_means(paths: Sequence[Path], history: int) -> tuple[np.ndarray, np.
     return mean_prediction(forces, history), mean_prediction(torques, history)
 
 
+def read_log(folder: Path) -> dict[str, np.ndarray]:
+    """Scalars of a TensorBoard folder: name → steps and values, shape (k, 2); empty if there is no log.
+
+    Raises:
+        UserError: It holds what is no log.
+    """
+    if not folder.is_dir():
+        return {}
+    advice = "remove it: only a figure of the report needs it"
+    left = MOST_BYTES
+    for file in sorted(folder.glob("*tfevents*")):  # what TensorBoard would read
+        try:
+            with open_file(file, left) as content:
+                left -= os.fstat(content.fileno()).st_size
+        except (OSError, ValueError) as error:
+            raise UserError(f"{file} is no log of TensorBoard ({error}); {advice}") from error
+    try:
+        events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
+    except Exception as error:  # whatever bytes do to a reader that is not ours
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"{folder} holds no log of TensorBoard ({reason:.200}); {advice}") from error
+    # A training that was killed logs some steps again, and its files are out of order if the clock went back.
+    return {
+        name: np.array(sorted({e.step: e.value for e in events.Scalars(name)}.items()), dtype=np.float64)
+        for name in events.Tags()["scalars"]
+        if name.startswith("loss/") or name in VALIDATION
+    }
+
+
 def require_known_run(simulator: Simulator, run: Run, checkpoint: Path) -> None:
     """Refuses a run that the checkpoint's subspace, or the report, cannot describe."""
     if problems := scene_problems(run.scene):
@@ -114,7 +147,7 @@ def require_known_run(simulator: Simulator, run: Run, checkpoint: Path) -> None:
             f"{run.path} has another particle arrangement ({run.arrangement_hash}) than {checkpoint} was "
             f"trained on ({simulator.arrangement_hash}); evaluate it on its own dataset"
         )
-    if abs(run.frame_rate - float(simulator.frame_rate)) > 1e-6 * run.frame_rate:
+    if abs(run.frame_rate - simulator.frame_rate) > 1e-6 * run.frame_rate:
         raise UserError(
             f"{run.path} was recorded at {run.frame_rate:g} Hz, {checkpoint} steps at "
             f"{simulator.frame_rate:g} Hz; evaluate it on its own dataset"
@@ -139,11 +172,11 @@ def evaluate(
     what the same network would cost on every particle; `made` says how the evaluation was made, for the report.
     """
     network = model_settings(simulator.card["model"]) if full_space else None
-    if full_space and not isinstance(network, ModelSettings):
+    if network is not None and not isinstance(network, ModelSettings):
         raise UserError(
             f"full_space=true: {checkpoint} holds polynomials; only a network has a counterpart in full space"
         )
-    paths = [Path(path) for path in dataset.runs(split)]
+    paths = dataset.runs(split)
     if not paths:
         raise UserError(
             f"dataset {dataset.name} has no complete run in its split {split!r}; allowed: train, "
@@ -165,24 +198,28 @@ def evaluate(
         raise UserError(
             f"cannot write to output={output}: {error.strerror}; give a folder that you may write to"
         ) from error
-    history = int(simulator.history)
+    history = simulator.history
     means = training_means(dataset.runs("train"), history)
     start = np.asarray(simulator.start_positions, dtype=np.float64)
     grid = surface_grid(start)
 
-    runs = []
-    labels = short_names([path.stem for path in paths])
-    for path, label in zip(tqdm(paths, desc="rolling out", unit="run", disable=None), labels, strict=True):
+    runs, names = [], [path.stem for path in paths]
+    progress = tqdm(paths, desc="rolling out", unit="run", disable=None)
+    for path, label in zip(progress, short_names(names), strict=True):
         target = output / "rollouts" / f"{path.stem}.h5"
         with Run(path) as truth:
             rollout = roll_out(simulator, truth)
-            recorded = {
-                "effects": truth.effects,
-                "seed": truth.seed,
-                "mesh": truth.mesh,
-                "given_frames": history,
-            }
-            write_rollout(target, simulator, truth.scene, rollout, checkpoint=checkpoint, **recorded)
+            write_rollout(
+                target,
+                simulator,
+                truth.scene,
+                rollout,
+                effects=truth.effects,
+                seed=truth.seed,
+                checkpoint=checkpoint,
+                mesh=truth.mesh,
+                given_frames=history,
+            )
             with Run(target) as prediction:
                 errors = position_errors(truth, prediction, simulator.basis, history, grid)
                 body = body_errors(truth, prediction, history)
@@ -190,7 +227,7 @@ def evaluate(
             words, wheel = describe(truth.scene), is_wheel(truth.scene)
         runs.append(EvaluatedRun(path.stem, label, words, path, target, errors, scores, wheel))
 
-    trained_on, chosen_by = seen_before(simulator, [run.name for run in runs])
+    trained_on, chosen_by = seen_before(simulator, names)
     evaluation = Evaluation(
         dataset=str(dataset.name),
         split=split,
@@ -206,12 +243,11 @@ def evaluate(
         chosen_by=chosen_by,
         curves=reduction_curves(full_basis(dataset, simulator.basis), paths),
         basis=simulator.basis,
-        num_modes=int(simulator.num_modes),
+        num_modes=simulator.num_modes,
         history=history,
-        particle_count=len(start),
         start=start,
-        new_rollouts=[Path(path) for path in new_rollouts],
-        made=dict(made or {}),
+        new_rollouts=new_rollouts,
+        made=made or {},
     )
     write_tables(evaluation, output)
     return evaluation

@@ -9,6 +9,7 @@ import shlex
 import statistics
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -35,12 +36,10 @@ if TYPE_CHECKING:
 
 def cpu_model() -> str:
     """Name of this machine's processor."""
-    try:
+    with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
     return platform.processor() or platform.machine() or "unknown"
 
 
@@ -66,7 +65,7 @@ def provenance(simulator: Simulator, checkpoint: Path) -> dict[str, str]:
         "training steps": str((settings.get("training") or {}).get("max_steps") or ""),
         "modes": str(simulator.num_modes),
         "history frames": str(simulator.history),
-        "basis fitted on": f"{len(simulator.basis.fitted_on)} training runs",
+        "basis fitted on": f"{len(simulator.basis.fitted_on or ())} training runs",
         "package": f"sgns {__version__}, torch {torch.__version__}, Python {platform.python_version()}",
         "machine": f"{cpu_model()}, {cores} cores, {platform.system()}",
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
@@ -98,25 +97,18 @@ def network_costs(checkpoint: Path, card: dict[str, Any]) -> Costs:
     return Costs(**found)
 
 
-# --- memory of this process, as Linux counts it -----------------------------------------------------------
-
-
 def forget_peak() -> None:
-    """Start measuring the peak anew; without effect where the system cannot."""
-    try:
+    """Start measuring the peak of this process's memory anew; without effect where the system cannot."""
+    with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
-        pass
 
 
 def peak_memory() -> float:
-    """Largest resident memory of this process since the peak was forgotten [bytes]; NaN if not known."""
-    try:
+    """Largest resident memory since the peak was forgotten, as Linux counts it [bytes]; NaN if not known."""
+    with suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
             if line.startswith("VmHWM:"):
                 return 1024.0 * float(line.split()[1])
-    except OSError:
-        pass
     return math.nan
 
 
@@ -147,7 +139,8 @@ def full_space_cost(path: Path, settings: ModelSettings, repeats: int) -> FullSp
 
     def training_step() -> None:
         dynamics.zero_grad()
-        sum(losses(dynamics, windows.batch(0, _BATCH, still))).backward()
+        acceleration, force = losses(dynamics, windows.batch(0, _BATCH, still))
+        (acceleration + force).backward()
 
     with single_thread():
         with torch.inference_mode():

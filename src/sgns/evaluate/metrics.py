@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-import torch
+from numpy.typing import ArrayLike
 
 from sgns.config import UserError
 from sgns.data.run import frame_chunks
@@ -75,13 +75,10 @@ def surface_grid(positions: np.ndarray, column: float | None = None) -> SurfaceG
     positions = np.asarray(positions, dtype=np.float64)
     spacing = particle_spacing(positions)
     column = SPACINGS_PER_COLUMN * spacing if column is None else column
-    edges = []
-    for axis in (0, 1):
-        # The bed reaches half a spacing beyond its outermost particles.
-        low, high = positions[:, axis].min() - 0.5 * spacing, positions[:, axis].max() + 0.5 * spacing
-        count = max(1, round((high - low) / column))
-        edges.append(np.linspace(low, high, count + 1))
-    return SurfaceGrid(*edges)
+    # The bed reaches half a spacing beyond its outermost particles.
+    low, high = positions.min(axis=0) - 0.5 * spacing, positions.max(axis=0) + 0.5 * spacing
+    counts = [max(1, round(length / column)) for length in high - low]
+    return SurfaceGrid(*(np.linspace(low[axis], high[axis], counts[axis] + 1) for axis in (0, 1)))
 
 
 def height_map(positions: np.ndarray, grid: SurfaceGrid) -> np.ndarray:
@@ -89,17 +86,15 @@ def height_map(positions: np.ndarray, grid: SurfaceGrid) -> np.ndarray:
 
     Particles (n, 3) [m] beyond the grid's border count for the outermost columns.
     """
-    positions = np.asarray(positions)
-    nx, ny = grid.shape
-    column = []
-    for axis, edges, count in ((0, grid.x_edges, nx), (1, grid.y_edges, ny)):
-        share = (positions[:, axis] - edges[0]) / (edges[-1] - edges[0])
-        share = np.clip(np.nan_to_num(share), 0.0, 1.0)  # clipped before the cast: inf has no integer
-        column.append(np.minimum((share * count).astype(np.int64), count - 1))
-    heights = np.full(nx * ny, -np.inf)
-    np.maximum.at(heights, column[0] * ny + column[1], positions[:, 2].astype(np.float64))
+    positions, count = np.asarray(positions), np.array(grid.shape)
+    low, high = (np.array([grid.x_edges[end], grid.y_edges[end]]) for end in (0, -1))
+    share = (positions[:, :2] - low) / (high - low)
+    share = np.clip(np.nan_to_num(share), 0.0, 1.0)  # clipped before the cast: inf has no integer
+    column, row = np.minimum((share * count).astype(np.int64), count - 1).T
+    heights = np.full(grid.shape, -np.inf)
+    np.maximum.at(heights, (column, row), positions[:, 2].astype(np.float64))
     heights[heights == -np.inf] = np.nan
-    return heights.reshape(nx, ny)
+    return heights
 
 
 # --- How far a predicted run is from a simulated one: positions, surface, force and torque --------------
@@ -164,6 +159,8 @@ class VectorErrors:
     truth_squared: np.ndarray  # Σ truth², shape (3,)
     truth_sum: np.ndarray  # Σ truth, shape (3,)
     prediction_sum: np.ndarray  # Σ prediction, shape (3,)
+    mpe_sizes: np.ndarray | float = 0.0  # Σ |MPE| over the runs for which it has a meaning [%], shape (3,)
+    mpe_runs: np.ndarray | int = 0  # number of those runs, shape (3,)
 
     @classmethod
     def compare(cls, truth: np.ndarray, prediction: np.ndarray) -> VectorErrors:
@@ -171,7 +168,7 @@ class VectorErrors:
         truth = np.asarray(truth, dtype=np.float64)
         prediction = np.broadcast_to(np.asarray(prediction, dtype=np.float64), truth.shape)
         difference = prediction - truth
-        return cls(
+        errors = cls(
             samples=len(truth),
             absolute=np.abs(difference).sum(axis=0),
             squared=(difference**2).sum(axis=0),
@@ -179,6 +176,9 @@ class VectorErrors:
             truth_sum=truth.sum(axis=0),
             prediction_sum=prediction.sum(axis=0),
         )
+        size = np.abs(errors.mpe)
+        unknown = np.isnan(size)
+        return replace(errors, mpe_sizes=np.where(unknown, 0.0, size), mpe_runs=np.where(unknown, 0, 1))
 
     def __add__(self, other: VectorErrors) -> VectorErrors:
         return VectorErrors(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
@@ -214,8 +214,13 @@ class VectorErrors:
         significant = np.abs(self.truth_sum) / self.samples > NEGLIGIBLE_SHARE * self.rms_truth
         return 100.0 * _ratio(self.prediction_sum - self.truth_sum, self.truth_sum, significant)
 
+    @property
+    def absolute_mpe(self) -> np.ndarray:
+        """Mean of |MPE| over the runs per axis [%], shape (3,): errors of different runs do not cancel."""
+        return _ratio(self.mpe_sizes, self.mpe_runs, np.greater(self.mpe_runs, 0))
 
-def _ratio(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> np.ndarray:
+
+def _ratio(a: ArrayLike, b: ArrayLike, where: np.ndarray) -> np.ndarray:
     return np.divide(a, b, out=np.full(3, np.nan), where=where)
 
 
@@ -273,23 +278,21 @@ def position_errors(
     prediction that lies in the subspace of the basis.
     """
     require_comparable(truth, prediction, history)
-    last = np.asarray(truth.positions(slice(history - 1, history)), dtype=np.float64)[0]
-    before = np.asarray(truth.positions(slice(max(history - 2, 0), max(history - 1, 1))), dtype=np.float64)[0]
-    step = last - before
+    given = np.asarray(truth.positions(slice(max(history - 2, 0), history)), dtype=np.float64)
+    last, step = given[-1], given[-1] - given[0]
     last_heights = height_map(last, grid)
     parts: list[dict[str, Any]] = []  # PositionErrors of some frames each
     by_particle = {name: np.zeros(truth.particle_count) for name in ("reduction", "network")}
     for frames in frame_chunks(truth.particle_count, truth.frame_count, history):
         true = np.asarray(truth.positions(frames), dtype=np.float64)
         predicted = np.asarray(prediction.positions(frames), dtype=np.float64)
-        latent = basis.transform(torch.from_numpy(true))
-        difference = basis.transform(torch.from_numpy(predicted)) - latent
+        latent = basis.transform(true)
+        difference = basis.transform(predicted) - latent
         since = np.arange(frames.start, frames.stop) - (history - 1)
         projected = basis.inverse(latent).numpy()
         by_particle["reduction"] += np.einsum("tna,tna->n", projected - true, projected - true)
         by_particle["network"] += np.einsum("tna,tna->n", predicted - projected, predicted - projected)
-        heights = [height_map(frame, grid) for frame in true]
-        guesses = [height_map(frame, grid) for frame in predicted]
+        heights, guesses = ([height_map(frame, grid) for frame in run] for run in (true, predicted))
         parts.append(
             {
                 "reduction": mean_square(projected - true),

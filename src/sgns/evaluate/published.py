@@ -20,8 +20,7 @@ from sgns.data.files import require_replaceable
 from sgns.data.published import PARTICLES, fingerprint, published_runs
 from sgns.evaluate.costs import provenance
 from sgns.evaluate.metrics import PositionErrors
-from sgns.evaluate.results import Scores, aggregate, run_scores
-from sgns.evaluate.tables import write_csv, write_json
+from sgns.evaluate.results import Scores, aggregate, run_scores, write_csv, write_json
 from sgns.reduction.reduce import ReducedRun
 from sgns.rollout import single_thread
 
@@ -119,6 +118,6 @@ def score_lines(scores: Sequence[Scores]) -> list[str]:
             f"{score.skill('constant_velocity'):9.3f} {score.force.mpe[0]:7.1f} {score.force.mpe[2]:7.1f} "
             f"{score.force.overall_nrmse:9.3f} {score.mean_force.overall_nrmse:11.3f}"
         )
-    absolute = scores[-1].absolute_mpe
-    lines.append(f"mean |MPE|: x {absolute['draft']:.1f} %, z {absolute['vertical']:.1f} %")
+    absolute = scores[-1].force.absolute_mpe
+    lines.append(f"mean |MPE|: x {absolute[0]:.1f} %, z {absolute[2]:.1f} %")
     return lines

@@ -1,15 +1,18 @@
-"""What an evaluation found, in numbers: what the tables, the figures and the report are made from."""
+"""What an evaluation found, in numbers: what the figures and the report are made from, and as files."""
 
 from __future__ import annotations
 
+import csv
+import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sgns.data.files import whole_file, write_whole
 from sgns.evaluate.metrics import (
     FORCE_COMPONENTS,
     PRESCRIBED,
@@ -44,8 +47,6 @@ class Scores:
     mean_force: VectorErrors  # errors of the mean force of the training split [N]
     mean_torque: VectorErrors  # errors of the mean torque of the training split [N m]
     solver_rate: float  # wall seconds per simulated second of the solver; NaN if not recorded
-    absolute_mpe: Mapping[str, float]  # mean over runs of |MPE| [%] by component of the force
-    mean_force_absolute_mpe: Mapping[str, float]  # the same of the mean force of the training split [%]
     # mean-square distance of the body from its true place [m²]; 0 where its path was given
     body_mse: float = 0.0
     sinkage_mae: float = math.nan  # mean absolute error of a wheel's sinkage [m]; NaN for other bodies
@@ -63,14 +64,12 @@ class Scores:
         row: dict[str, Any] = {"run": self.name, "frames": self.frames}
         row |= {f"mse_{name}_m2": self.mse[name] for name in POSITION_ERRORS}
         row |= {f"rmse_{name}_mm": self.rmse_mm(name) for name in POSITION_ERRORS}
-        row |= {
-            "skill_frozen": self.skill("frozen"),
-            "skill_constant_velocity": self.skill("constant_velocity"),
-        }
+        row |= {f"skill_{name}": self.skill(name) for name in ("frozen", "constant_velocity")}
         row |= {f"{name}_rmse_mm": self.rmse_mm(name) for name in SURFACE_ERRORS}
         for prefix, errors in (("", self.force), ("mean_force_", self.mean_force)):
             row |= columns(errors, FORCE_COMPONENTS, prefix, "force", "N")
-        row |= {f"{name}_abs_mpe_percent": value for name, value in self.absolute_mpe.items()}
+        sizes = self.force.absolute_mpe
+        row |= {f"{name}_abs_mpe_percent": float(sizes[axis]) for name, axis in FORCE_COMPONENTS.items()}
         for prefix, errors in (("", self.torque), ("mean_torque_", self.mean_torque)):
             row |= columns(errors, TORQUE_COMPONENTS, prefix, "torque", "Nm")
         row |= {"body_rmse_mm": 1e3 * math.sqrt(self.body_mse), "sinkage_mae_mm": 1e3 * self.sinkage_mae}
@@ -87,7 +86,7 @@ def columns(
         values[f"{prefix}{name}_mae_{unit}"] = float(errors.mae[axis])
         values[f"{prefix}{name}_nrmse"] = float(errors.nrmse[axis])
         values[f"{prefix}{name}_mpe_percent"] = float(errors.mpe[axis])
-    values[f"{prefix}{vector}_nrmse" if not prefix else f"{prefix}nrmse"] = errors.overall_nrmse
+    values[f"{prefix or vector + '_'}nrmse"] = errors.overall_nrmse
     return values
 
 
@@ -105,29 +104,20 @@ def run_scores(
 
     The mean force [N] and torque [N m] of the training split are baselines, shape (3,) each.
     """
-    force = VectorErrors.compare(truth.force[history:], prediction.force[history:])
-    mean = VectorErrors.compare(truth.force[history:], mean_force)
-    simulated = float(truth.time[-1] - truth.time[0])
-    wall = truth.wall_time_s
+    force, torque = truth.force[history:], truth.torque[history:]
+    simulated, wall = float(truth.time[-1] - truth.time[0]), truth.wall_time_s
     return Scores(
         name=name,
         frames=len(positions.time),
         mse={key: positions.mse(key) for key in POSITION_ERRORS + SURFACE_ERRORS},
-        force=force,
-        torque=VectorErrors.compare(truth.torque[history:], prediction.torque[history:]),
-        mean_force=mean,
-        mean_torque=VectorErrors.compare(truth.torque[history:], mean_torque),
+        force=VectorErrors.compare(force, prediction.force[history:]),
+        torque=VectorErrors.compare(torque, prediction.torque[history:]),
+        mean_force=VectorErrors.compare(force, mean_force),
+        mean_torque=VectorErrors.compare(torque, mean_torque),
         solver_rate=float(wall) / simulated if wall else math.nan,
-        absolute_mpe=absolute_mpe(force),
-        mean_force_absolute_mpe=absolute_mpe(mean),
         body_mse=body.mse,
         sinkage_mae=body.sinkage_mae,
     )
-
-
-def absolute_mpe(force: VectorErrors) -> dict[str, float]:
-    """|MPE| [%] by component of the force."""
-    return {key: abs(float(force.mpe[axis])) for key, axis in FORCE_COMPONENTS.items()}
 
 
 def aggregate(runs: Sequence[Scores], name: str = "all runs") -> Scores:
@@ -150,16 +140,9 @@ def aggregate(runs: Sequence[Scores], name: str = "all runs") -> Scores:
         mean_force=pooled("mean_force"),
         mean_torque=pooled("mean_torque"),
         solver_rate=mean_of_known([run.solver_rate for run in runs]),
-        absolute_mpe=means_of_known([run.absolute_mpe for run in runs]),
-        mean_force_absolute_mpe=means_of_known([run.mean_force_absolute_mpe for run in runs]),
         body_mse=float(np.mean([run.body_mse for run in runs])),
         sinkage_mae=mean_of_known([run.sinkage_mae for run in runs]),
     )
-
-
-def means_of_known(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """`mean_of_known` for every key of the first."""
-    return {key: mean_of_known([run[key] for run in runs]) for key in runs[0]}
 
 
 def mean_of_known(values: Sequence[float]) -> float:
@@ -168,7 +151,7 @@ def mean_of_known(values: Sequence[float]) -> float:
     return sum(known) / len(known) if known else math.nan
 
 
-# --- What an evaluation found, in numbers: what the tables, the figures and the report are made from ----
+# --- Everything that an evaluation found ------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -240,14 +223,13 @@ class Evaluation:
     basis: Basis  # of the network
     num_modes: int  # modes r that the network uses
     history: int  # frames d that it was given
-    particle_count: int  # particles n of the bed
     start: np.ndarray  # common start of the particles [m], shape (n, 3)
     costs: Costs = field(default_factory=Costs)  # of the network
     # of the same network on every particle; None if it was not asked for
     full_space: FullSpaceCost | None = None
     # mean torque of the training split [N m], shape (3,)
     mean_torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    # losses and validation scores by step, as `figures.read_log` gives them
+    # losses and validation scores by step, as `read_log` gives them
     training_log: Mapping[str, np.ndarray] = field(default_factory=dict)
     # names of the evaluated runs that the basis and the network were fitted on
     trained_on: Sequence[str] = ()
@@ -256,29 +238,105 @@ class Evaluation:
     made: dict[str, str] = field(default_factory=dict)  # how it was made: name → value, in the order to show
 
 
-# --- Which of the judged runs a checkpoint has already seen: a number for those is no test --------------
-
-
 def seen_before(simulator: Simulator, names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Of some runs' names those that the checkpoint was trained on, and those that chose it.
-
-    A checkpoint knows its runs by name only.
-    """
+    """Of some runs' names those that the checkpoint was trained on, and those that chose it: for these a number is no
+    test. A checkpoint knows its runs by name only."""
     fitted = set(simulator.basis.fitted_on or ())
     judged = set(simulator.card.get("settings", {}).get("validation_runs", ()))
     trained_on = [name for name in names if name in fitted]
     return trained_on, [name for name in names if name in judged - fitted]
 
 
-def seen_warning(evaluation: Evaluation) -> str:
-    """One sentence if the evaluation is no clean test, else nothing."""
-    count = len(evaluation.runs)
-    parts = [
-        f"{len(names)} of the {count} evaluated runs {verb} ({names[0]}{', …' if len(names) > 1 else ''})"
-        for names, verb in (
-            (evaluation.trained_on, "bear the names of runs that this checkpoint was trained on"),
-            (evaluation.chosen_by, "bear the names of validation runs that chose this checkpoint"),
-        )
-        if names
-    ]
-    return f"{'; '.join(parts)}: for those the numbers are no test." if parts else ""
+# --- The numbers of an evaluation as files: `metrics.csv`, `examples.csv` and `metrics.json` ------------
+
+
+def write_tables(evaluation: Evaluation, output: Path) -> None:
+    """Writes the files.
+
+    `metrics.csv`: a row per run and one for all; `examples.csv`: the columns of the paper's table of test
+    examples with the baselines beside; `metrics.json`: the first and everything around it.
+    """
+    scores = [run.scores for run in evaluation.runs]
+    write_csv(output / "metrics.csv", [score.row() for score in (*scores, evaluation.total)])
+    write_csv(output / "examples.csv", [example_row(score) for score in (*scores, evaluation.total)])
+    timing, costs = evaluation.timing, evaluation.costs
+    write_json(
+        output / "metrics.json",
+        {
+            "dataset": evaluation.dataset,
+            "split": evaluation.split,
+            "num_modes": evaluation.num_modes,
+            "history": evaluation.history,
+            "particles": len(evaluation.start),
+            "aggregate": evaluation.total.row(),
+            "runs": [score.row() for score in scores],
+            "mean_training_force_N": evaluation.mean_force,
+            "wall_s_per_simulated_s": {
+                "solver": evaluation.total.solver_rate,
+                "network_stepping_with_force": timing.rollout,
+                "network_with_decoding": timing.decoded,
+                "network_threads": 1,
+                "network_repeats": timing.repeats,
+            },
+            "peak_memory_bytes": {
+                "network_stepping_with_force": timing.rollout_bytes,
+                "network_with_decoding": timing.decoded_bytes,
+            },
+            "network": {
+                "parameters": costs.parameters,
+                "checkpoint_bytes": costs.checkpoint_bytes,
+                "training_steps": costs.training_steps,
+                "training_wall_s": costs.training_seconds,
+                "training_wall_s_per_step": costs.seconds_per_step,
+                "training_batch_size": costs.batch_size,
+            },
+            "full_space": asdict(evaluation.full_space) if evaluation.full_space else None,
+            "evaluated_runs_trained_on": list(evaluation.trained_on),
+            "evaluated_runs_that_chose_the_checkpoint": list(evaluation.chosen_by),
+            "reconstruction_mse_m2": evaluation.curves.held_out,
+            "made": evaluation.made,
+        },
+    )
+
+
+def example_row(scores: Scores) -> dict[str, Any]:
+    """One row of the table of test examples: MSE of positions, signed MPE of the force, and baselines.
+
+    The signed MPE of several runs together is that of the pooled means, in which runs cancel; beside it the mean
+    of |MPE| over runs, in which they do not.
+    """
+    shown = ("network", "total", "frozen", "constant_velocity")
+    row: dict[str, Any] = {"run": scores.name} | {f"mse_{name}_m2": scores.mse[name] for name in shown}
+    for prefix, errors in (("", scores.force), ("mean_force_", scores.mean_force)):
+        for name, axis in FORCE_COMPONENTS.items():
+            row[f"{prefix}{name}_mpe_percent"] = float(errors.mpe[axis])
+            row[f"{prefix}{name}_abs_mpe_percent"] = float(errors.absolute_mpe[axis])
+        row[f"{prefix}nrmse"] = errors.overall_nrmse
+    return row
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """One line per row under a line of column names; a metric without meaning is left empty."""
+    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({key: "" if value != value else value for key, value in row.items()})
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Nested plain values as JSON that every reader takes: numbers that are not finite become null."""
+    write_whole(path, json.dumps(plain(content), indent=2, allow_nan=False) + "\n")
+
+
+def plain(value: Any) -> Any:
+    """Mappings, sequences, arrays and numbers as JSON knows them, with None for numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

@@ -15,17 +15,12 @@ from sgns.settings import ModelSettings
 from sgns_testing.runs import make_run
 from sgns_testing.tiny import MODEL
 
-# ---  ---------------------------------------------------------------------------------------------------
-
 CARD = {"settings": {"training": {"batch_size": 32}}}
 
 
-def test_nothing_is_known_of_a_checkpoint_that_is_not_there(tmp_path):
-    unknown = network_costs(tmp_path / "best.ckpt", {})
-    assert math.isnan(unknown.parameters) and math.isnan(unknown.seconds_per_step)
-
-
 def test_training_is_read_from_beside_the_checkpoint(tmp_path):
+    unknown = network_costs(tmp_path / "best.ckpt", CARD)
+    assert math.isnan(unknown.parameters) and math.isnan(unknown.seconds_per_step)
     (tmp_path / "training.json").write_text(json.dumps({"steps": 50, "seconds": 2.0, "skill": 0.5}))
     known = network_costs(tmp_path / "best.ckpt", CARD)
     assert known.seconds_per_step == pytest.approx(0.04) and known.batch_size == 32
@@ -64,16 +59,10 @@ def test_systems_that_do_not_count_it(monkeypatch):
     assert math.isnan(peak_memory())
 
 
-# ---  ---------------------------------------------------------------------------------------------------
-
-SETTINGS = ModelSettings(**MODEL)
-
-
-@pytest.mark.parametrize("n", [200, 2000])
-def test_cost_of_a_network_on_every_particle(tmp_path, n):
-    run = make_run(tmp_path / "run.h5", n=n)
-    cost = full_space_cost(run, SETTINGS, 3)
+def test_cost_of_a_network_on_every_particle(tmp_path):
+    run, settings = make_run(tmp_path / "run.h5", n=500), ModelSettings(**MODEL)
+    cost = full_space_cost(run, settings, 3)
     assert cost.training_step > cost.rollout / 60.0 > 0.0
     assert cost.peak_bytes > 1e7 and cost.batch_size == 2
-    wider = full_space_cost(run, replace(SETTINGS, hidden_width=2 * SETTINGS.hidden_width), 1)
+    wider = full_space_cost(run, replace(settings, hidden_width=2 * settings.hidden_width), 1)
     assert wider.parameters > 2 * cost.parameters

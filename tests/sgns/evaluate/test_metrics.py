@@ -30,12 +30,9 @@ def lattice(nx=12, ny=8, nz=4, spacing=0.05):
     return spacing * np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def test_spacing_of_a_lattice():
-    assert particle_spacing(lattice()) == pytest.approx(0.05, rel=1e-9)
-
-
 def test_grid_covers_the_bed_with_columns_of_two_spacings():
     grid = surface_grid(lattice())
+    assert particle_spacing(lattice()) == pytest.approx(0.05, rel=1e-9)
     assert grid.shape == (6, 4)
     assert grid.x_edges[[0, -1]] == pytest.approx([0.0, 0.6])
     assert grid.y_edges[[0, -1]] == pytest.approx([0.0, 0.4])
@@ -52,14 +49,9 @@ def test_known_bump():
     rows = np.sort(np.unique(bed[:, 0])).reshape(-1, 2)
     expected = 0.03 * np.exp(-((rows - 0.325) ** 2) / 0.01).max(axis=1)
     assert heights == pytest.approx(np.repeat(expected[:, None], 4, axis=1))
-
-
-def test_flat_bed_is_flat_and_order_does_not_matter():
-    bed = lattice()
-    grid = surface_grid(bed)
+    shuffled = np.random.default_rng(0).permutation(raised)
+    assert (height_map(shuffled, grid) == heights).all()
     assert (height_map(bed, grid) == 0.0).all()
-    shuffled = np.random.default_rng(0).permutation(bed)
-    assert (height_map(shuffled, grid) == height_map(bed, grid)).all()
 
 
 def test_empty_column_is_nan_and_outside_counts_for_the_border():
@@ -85,9 +77,8 @@ def test_surface_error_of_a_thinned_bed_is_that_of_the_bed(arrangement):
         )
         grid = surface_grid(start)
         raised = height_map(start + np.stack([0 * hill, 0 * hill, hill], axis=1), grid)
-        return np.sqrt(
-            np.mean((raised - height_map(start, grid)) ** 2)
-        )  # a column without particles makes it NaN
+        # A column without particles makes it NaN.
+        return np.sqrt(np.mean((raised - height_map(start, grid)) ** 2))
 
     full = bed.filled[0]
     thinned = full[Scene(bed=bed).stored]
@@ -95,18 +86,17 @@ def test_surface_error_of_a_thinned_bed_is_that_of_the_bed(arrangement):
     assert particle_spacing(thinned) == pytest.approx(5 ** (1 / 3) * particle_spacing(full), rel=0.05)
 
 
-class ArrayRun:
-    """A run in memory."""
-
-    def __init__(self, positions, name="run.h5"):
-        self.values = np.asarray(positions, dtype=np.float32)
-        self.frame_count, self.particle_count, _ = self.values.shape
-        self.time = np.arange(self.frame_count) / 60.0
-        self.arrangement_hash = "same"
-        self.path = name
-
-    def positions(self, frames=slice(None)):
-        return self.values[frames]
+def in_memory(positions):
+    """A run of these positions."""
+    values = np.asarray(positions, dtype=np.float32)
+    return SimpleNamespace(
+        positions=lambda frames: values[frames],
+        frame_count=values.shape[0],
+        particle_count=values.shape[1],
+        time=np.arange(len(values)) / 60.0,
+        arrangement_hash="same",
+        path="run.h5",
+    )
 
 
 def make_basis(n=7, r=2, seed=0):
@@ -123,8 +113,8 @@ def make_basis(n=7, r=2, seed=0):
 
 
 def compared(truth, prediction, basis=None, history=2):
-    truth, prediction = ArrayRun(truth), ArrayRun(prediction)
-    grid = surface_grid(truth.values[0])
+    grid = surface_grid(truth[0])
+    truth, prediction = in_memory(truth), in_memory(prediction)
     return position_errors(truth, prediction, basis or make_basis(truth.particle_count), history, grid)
 
 
@@ -155,12 +145,15 @@ def skill_of(errors, baseline="frozen"):
     return skill([errors.mse("total")], [errors.mse(baseline)])
 
 
-def test_skill_of_perfect_is_one_and_of_frozen_is_zero():
+def test_skill_of_perfect_is_one_of_frozen_zero_and_of_several_runs_that_of_sums():
     truth = random_walk()
     assert skill_of(compared(truth, truth)) == 1.0
     frozen = truth.copy()
     frozen[2:] = frozen[1]
     assert skill_of(compared(truth, frozen)) == pytest.approx(0.0, abs=1e-12)
+    assert skill([1.0, 3.0], [4.0, 4.0]) == pytest.approx(0.5)
+    assert skill([5.0], [4.0]) == pytest.approx(-0.25)
+    assert math.isnan(skill([0.0], [0.0]))
 
 
 def test_history_counts_in_no_metric():
@@ -182,6 +175,9 @@ def test_latent_formula_equals_full_space():
     assert errors.network == pytest.approx(full, rel=1e-5)
     # The residual of the reduction stands at right angles to the subspace.
     assert errors.total == pytest.approx(errors.network + errors.reduction, rel=1e-5)
+    assert errors.particles.reduction.shape == errors.particles.network.shape == (7,)
+    assert errors.particles.reduction.mean() == pytest.approx(errors.mse("reduction"))
+    assert errors.particles.network.mean() == pytest.approx(errors.mse("network"), rel=1e-5)
 
 
 def test_chunks_of_frames_do_not_change_anything(monkeypatch):
@@ -193,16 +189,6 @@ def test_chunks_of_frames_do_not_change_anything(monkeypatch):
         assert getattr(pieces, name) == pytest.approx(getattr(whole, name), rel=1e-12)
     assert pieces.particles.reduction == pytest.approx(whole.particles.reduction, rel=1e-12)
     assert pieces.particles.network == pytest.approx(whole.particles.network, rel=1e-12)
-
-
-def test_errors_by_particle_have_the_same_mean_as_those_by_frame():
-    basis = make_basis()
-    truth, walk = random_walk(), random_walk(seed=2)
-    prediction = basis.inverse(basis.transform(torch.from_numpy(walk))).numpy()
-    errors = compared(truth, prediction, basis)
-    assert errors.particles.reduction.shape == errors.particles.network.shape == (7,)
-    assert errors.particles.reduction.mean() == pytest.approx(errors.mse("reduction"))
-    assert errors.particles.network.mean() == pytest.approx(errors.mse("network"), rel=1e-5)
 
 
 def test_error_of_one_particle_by_hand():
@@ -232,20 +218,18 @@ def test_one_frame_of_history_has_no_velocity():
     assert errors.constant_velocity == pytest.approx(errors.frozen)
 
 
-def test_aggregate_skill_is_of_sums():
-    assert skill([1.0, 3.0], [4.0, 4.0]) == pytest.approx(0.5)
-    assert skill([5.0], [4.0]) == pytest.approx(-0.25)
-    assert math.isnan(skill([0.0], [0.0]))
-
-
-def test_incomparable_runs_are_refused():
+@pytest.mark.parametrize(
+    ("shown", "history", "words"),
+    [
+        (np.s_[:-1], 2, "frames 8 against 9"),
+        (np.s_[:, :-1], 2, "particles 6 against 7"),
+        (np.s_[:], 9, "nothing is left to compare"),
+    ],
+)
+def test_incomparable_runs_are_refused(shown, history, words):
     truth = random_walk()
-    with pytest.raises(UserError, match="frames 8 against 9"):
-        compared(truth, truth[:-1])
-    with pytest.raises(UserError, match="particles 6 against 7"):
-        compared(truth, truth[:, :-1], make_basis())
-    with pytest.raises(UserError, match="nothing is left to compare"):
-        compared(truth, truth, history=9)
+    with pytest.raises(UserError, match=words):
+        compared(truth, truth[shown], history=history)
 
 
 def test_force_metrics_by_hand():
@@ -263,8 +247,10 @@ def test_force_metrics_by_hand():
 
 def test_sign_of_mpe_does_not_depend_on_the_sign_of_the_force():
     truth = np.full((5, 3), [-10.0, 8.0, 10.0])
-    assert VectorErrors.compare(truth, 1.2 * truth).mpe == pytest.approx([20.0, 20.0, 20.0])
-    assert VectorErrors.compare(truth, 0.9 * truth).mpe == pytest.approx([-10.0, -10.0, -10.0])
+    high, low = (VectorErrors.compare(truth, factor * truth) for factor in (1.2, 0.9))
+    assert high.mpe == pytest.approx(20.0) and low.mpe == pytest.approx(-10.0)
+    assert (high + low).mpe == pytest.approx(5.0)  # cancels
+    assert (high + low).absolute_mpe == pytest.approx(15.0)  # does not
 
 
 def test_body_errors_by_hand():
@@ -294,7 +280,8 @@ def test_sums_of_runs_equal_the_runs_joined():
 def test_forces_of_zero_have_no_relative_error():
     errors = VectorErrors.compare(np.zeros((3, 3)), np.ones((3, 3)))
     assert math.isnan(errors.overall_nrmse)
-    assert np.isnan(errors.nrmse).all() and np.isnan(errors.mpe).all()
+    for relative in (errors.nrmse, errors.mpe, errors.absolute_mpe):
+        assert np.isnan(relative).all()
 
 
 def test_constant_prediction_and_training_mean():
@@ -303,8 +290,4 @@ def test_constant_prediction_and_training_mean():
     assert mean == pytest.approx([3.0, 4.0, 5.0])
     errors = VectorErrors.compare(np.array([[1.0, 2, 3], [3, 4, 5]]), mean)
     assert errors.mae == pytest.approx([1.0, 1.0, 1.0])
-
-
-def test_errors_of_zero_are_zero_not_negative():
-    zeros = np.zeros(3)
-    assert rms_mm(PositionErrors(*[zeros] * 8).mse("total")) == 0.0
+    assert rms_mm(PositionErrors(*[np.zeros(3)] * 8).mse("total")) == 0.0

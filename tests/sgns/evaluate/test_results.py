@@ -1,29 +1,56 @@
+import csv
+import json
 import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from sgns.evaluate.results import aggregate, seen_before, seen_warning
+from sgns.evaluate.results import aggregate, example_row, seen_before, write_csv, write_json
 from sgns_testing.surrogates import made_scores
 
 
-def test_aggregate_by_hand():
-    total = aggregate([made_scores("a", 1e-6, 4e-6, 1.2), made_scores("b", 3e-6, 4e-6, 0.9, math.nan)])
+def test_aggregate_by_hand(tmp_path):
+    scores = [made_scores("a, with comma", 1e-6, 4e-6, 1.2), made_scores("b", 3e-6, 4e-6, 0.9, math.nan)]
+    total = aggregate(scores)
     assert total.frames == 8
     assert total.skill() == pytest.approx(0.5)
     assert total.skill("constant_velocity") == pytest.approx(0.75)
     assert total.rmse_mm("total") == pytest.approx(math.sqrt(2.0))
     assert total.force.mpe[0] == pytest.approx(5.0)  # signed: errors cancel
-    assert total.absolute_mpe["draft"] == pytest.approx(15.0)  # unsigned: they do not
-    assert math.isnan(total.absolute_mpe["lateral"])
+    assert total.force.absolute_mpe[[0, 2]] == pytest.approx(15.0)  # unsigned: they do not
+    assert math.isnan(total.force.absolute_mpe[1])
     assert total.solver_rate == 10.0
+
+    write_csv(tmp_path / "metrics.csv", [score.row() for score in (*scores, total)])
+    with (tmp_path / "metrics.csv").open(newline="", encoding="utf-8") as file:
+        read = list(csv.DictReader(file))
+    assert [row["run"] for row in read] == ["a, with comma", "b", "all runs"]
+    assert float(read[0]["skill_frozen"]) == pytest.approx(0.75)
+    assert read[0]["lateral_nrmse"] == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
+
+    row, together = example_row(scores[1]), example_row(total)
+    assert row["mse_total_m2"] == 3e-6 and row["mse_frozen_m2"] == 4e-6
+    assert row["draft_mpe_percent"] == pytest.approx(-10.0)
+    assert row["draft_abs_mpe_percent"] == pytest.approx(10.0)
+    assert row["nrmse"] == pytest.approx(0.1)
+    assert math.isnan(row["lateral_mpe_percent"])
+    assert together["draft_mpe_percent"] == pytest.approx(5.0)
+    assert together["draft_abs_mpe_percent"] == pytest.approx(15.0)
+    assert list(together) == list(row)
 
 
 def test_aggregate_of_one_run_is_that_run():
     one = made_scores("a", 1e-6, 4e-6, 1.2)
-    row = aggregate([one], "a").row()
-    assert {k: row[k] for k in row} == pytest.approx(one.row(), nan_ok=True)
+    assert aggregate([one], "a").row() == pytest.approx(one.row(), nan_ok=True)
+
+
+def test_json_is_strict(tmp_path):
+    content = {"x": math.nan, "y": [np.float64(1.5), np.inf], "z": np.arange(2), "n": np.int64(3)}
+    write_json(tmp_path / "a.json", content)
+    assert json.loads((tmp_path / "a.json").read_text()) == {"x": None, "y": [1.5, None], "z": [0, 1], "n": 3}
 
 
 def test_sinkage_is_the_mean_of_the_wheels_only():
@@ -39,32 +66,17 @@ def test_sinkage_is_the_mean_of_the_wheels_only():
     assert blade.row()["body_rmse_mm"] == 0.0 and math.isnan(blade.row()["sinkage_mae_mm"])
 
 
-def simulator(fitted_on, validation_runs):
-    return SimpleNamespace(
-        basis=SimpleNamespace(fitted_on=fitted_on), card={"settings": {"validation_runs": validation_runs}}
-    )
-
-
 @pytest.mark.parametrize(
-    ("fitted_on", "validation", "expected"),
+    ("fitted_on", "settings", "expected"),
     [
-        (["a", "b"], ["c"], ([], [])),
-        (["a", "x"], ["c"], (["x"], [])),
-        (["a"], ["y"], ([], ["y"])),
-        (["x"], ["x", "y"], (["x"], ["y"])),  # a training run that also served for validation
-        (None, [], ([], [])),
+        (["a", "b"], {"validation_runs": ["c"]}, ([], [])),
+        (["a", "x"], {"validation_runs": ["c"]}, (["x"], [])),
+        (["a"], {"validation_runs": ["y"]}, ([], ["y"])),
+        (["x"], {"validation_runs": ["x", "y"]}, (["x"], ["y"])),  # a training run that also validated
+        (None, {"validation_runs": []}, ([], [])),
+        (["x"], {}, (["x"], [])),
     ],
 )
-def test_what_was_seen_before(fitted_on, validation, expected):
-    assert seen_before(simulator(fitted_on, validation), ["x", "y"]) == expected
-
-
-def test_checkpoint_that_does_not_tell_its_validation_runs():
-    known = SimpleNamespace(basis=SimpleNamespace(fitted_on=["x"]), card={})
-    assert seen_before(known, ["x", "y"]) == (["x"], [])
-
-
-def test_warning_counts_and_names():
-    judged = SimpleNamespace(runs=[1, 2, 3], trained_on=["x", "y"], chosen_by=[])
-    assert "2 of the 3 evaluated runs" in seen_warning(judged) and "(x, …)" in seen_warning(judged)
-    assert seen_warning(SimpleNamespace(runs=[1], trained_on=[], chosen_by=[])) == ""
+def test_what_was_seen_before(fitted_on, settings, expected):
+    simulator = SimpleNamespace(basis=SimpleNamespace(fitted_on=fitted_on), card={"settings": settings})
+    assert seen_before(simulator, ["x", "y"]) == expected

@@ -8,25 +8,109 @@ import pytest
 
 from mpm_warp.scenes import Wheel, sinkage
 from sgns.data.run import Run
-from sgns.evaluate.figures import latent_path, subspace_view
+from sgns.evaluate import figures
+from sgns.evaluate.depth_buffer import CAMERA, DepthBuffer, project
 from sgns.evaluate.metrics import forward_force, is_wheel
-from sgns.evaluate.side_view import body_corners
-from sgns.evaluate.solid_view import Camera, DepthBuffer, hull_triangles, solid_views, upper_scale
+from sgns.evaluate.views import (
+    body_corners,
+    body_outline,
+    common_scales,
+    hull,
+    hull_triangles,
+    latent_path,
+    middle_slice,
+    nice,
+    side_views,
+    solid_views,
+    subspace_view,
+    upper_scale,
+    view_times,
+)
 from sgns_testing.pictures import pixels
 from sgns_testing.runs import PLATE, make_run, start_positions
 from sgns_testing.surrogates import fitted
 
-# --- The whole bed and the subspace in three dimensions --------------------------------------------------
+WHEEL = {"blade": None, "kind": "wheel", "diameter": 0.15, "width": 0.08}
 
 
-@pytest.fixture
-def pair(tmp_path):
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
     paths = [
-        make_run(tmp_path / f"{seed}.h5", frames=12, n=300, seed=seed, producer=producer)
+        make_run(folder / f"{seed}.h5", frames=20, n=300, seed=seed, producer=producer)
         for seed, producer in ((1, "mpm"), (2, "rollout"))
     ]
     with Run(paths[0]) as truth, Run(paths[1]) as prediction:
         yield truth, prediction, fitted(paths, 4)
+
+
+# --- From the side ---------------------------------------------------------------------------------------
+
+
+def test_runs_above_each_other_have_one_scale(pair):
+    truth, prediction, _ = pair
+    frames = view_times(truth, 3)
+    scales = common_scales([truth, prediction], frames, start_positions(300))
+    figure = side_views(
+        [[("simulated (MPM)", truth, frames[-1])], [("network", prediction, frames[-1])]], scales
+    )
+    upper, lower = figure.axes[:2]
+    assert upper.get_xlim() == lower.get_xlim() == pytest.approx(scales.x_limits)
+    assert upper.collections[0].norm is lower.collections[0].norm is scales.speed
+    assert pixels(figure).shape[1] == round(figures.PICTURE_WIDTH * figures.DPI)
+    assert upper.get_position().y0 > lower.get_position().y1
+    strongest = max(np.linalg.norm(run.force[f, [0, 2]]) for run in (truth, prediction) for f in frames)
+    assert scales.arrow * strongest < 0.3 * np.ptp(scales.x_limits)
+
+
+def test_runs_may_stand_side_by_side_in_a_wide_picture(pair):
+    truth, prediction, _ = pair
+    scales = common_scales([truth, prediction], [4], start_positions(300))
+    figure = side_views([[("a", truth, 4), ("b", prediction, 4)]], scales, 10.8, 4.95)
+    assert pixels(figure).shape[1] == round(10.8 * figures.DPI)
+    left, right = figure.axes[:2]
+    assert left.get_position().x1 < right.get_position().x0
+
+
+@pytest.mark.parametrize("scene", [WHEEL, {"blade": None, "kind": "body"}, {"blade": None, "speed": 1e-12}])
+def test_other_bodies_and_soil_that_rests(tmp_path, scene):
+    with Run(make_run(tmp_path / "run.h5", frames=8, n=200, scene={"depth": 0.0} | scene)) as run:
+        scales = common_scales([run], view_times(run, 2), start_positions(200))
+        pixels(side_views([[("network", run, 5)]], scales))
+        for view in solid_views(run, run, 5, start_positions(200)).values():
+            pixels(view)
+
+
+@pytest.mark.parametrize("name", [r"$\frac$", "50 % $x^$_2", "a\nb", "_"])
+def test_names_are_no_formulas(pair, name):
+    pixels(side_views([[(name, pair[0], 4)]], common_scales(pair[:1], [4], start_positions(300))))
+
+
+def test_view_times_lie_after_the_history_and_within_the_run(pair):
+    frames = view_times(pair[0], 3)
+    assert len(frames) == 3 and frames == sorted(frames)
+    assert 3 < frames[0] and frames[-1] < pair[0].frame_count
+
+
+def test_a_tool_that_only_turns_moves():
+    pose, points = np.zeros((20, 7)), np.zeros((20, 1, 3))
+    angle = 0.05 * np.minimum(np.arange(20), 12)
+    pose[:, 5], pose[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
+    points[:, 0, 0], points[:, 0, 1] = np.cos(angle), np.sin(angle)
+    run = SimpleNamespace(pose=pose, body_points=points, frame_count=20)
+    assert view_times(run, 3)[-1] == round(3 + 0.9 * (12 - 3))
+
+
+def test_middle_slice_nice_numbers_and_the_scale_of_nothing():
+    y = np.linspace(0.0, 1.0, 11)
+    bed = np.stack(np.meshgrid(y, y, y), axis=-1).reshape(-1, 3)
+    chosen = bed[middle_slice(bed)]
+    assert np.abs(chosen[:, 1] - 0.5).max() < 0.2 and len(chosen) > 100
+    assert [nice(v) for v in (0.1, 0.11, 27.0, 8.5)] == pytest.approx([0.1, 0.15, 30.0, 10.0])
+    assert upper_scale(np.zeros(5)).vmax == 1.0 and upper_scale(np.zeros(5), np.full(5, 2.9)).vmax == 3.0
+
+
+# --- The whole bed and the subspace in three dimensions --------------------------------------------------
 
 
 def test_whole_bed_is_drawn_three_times_with_one_scale_of_displacement(pair):
@@ -40,34 +124,10 @@ def test_whole_bed_is_drawn_three_times_with_one_scale_of_displacement(pair):
     assert bars[0] == bars[1]
 
 
-@pytest.mark.parametrize(
-    "scene",
-    [
-        {"blade": None, "kind": "wheel", "diameter": 0.15, "width": 0.08},
-        {"blade": None, "kind": "body"},
-        {"blade": None, "speed": 1e-12, "depth": 0.0},
-    ],
-)
-def test_other_bodies_and_soil_that_rests(tmp_path, scene):
-    with Run(make_run(tmp_path / "run.h5", frames=6, n=200, scene=scene)) as run:
-        for view in solid_views(run, run, 5, start_positions(200)).values():
-            pixels(view)
-
-
-def test_scale_of_nothing():
-    assert upper_scale(np.zeros(5)).vmax == 1.0
-
-
-def test_path_in_the_subspace_is_the_projection(pair):
-    truth, _, basis = pair
-    whole = latent_path(truth, basis)
-    assert whole == pytest.approx(basis.transform(truth.positions()).numpy())
-    assert whole.shape == (truth.frame_count, 4, 3)
-
-
 def test_subspace_shows_both_paths_and_the_body(pair):
     truth, prediction, basis = pair
     paths = (latent_path(truth, basis), latent_path(prediction, basis))
+    assert paths[0] == pytest.approx(basis.transform(truth.positions()).numpy())
     figure = subspace_view(truth, prediction, paths, 9)
     axis = figure.axes[0]
     assert [text.get_text() for text in axis.texts] == ["1", "2", "3", "4"]
@@ -77,7 +137,6 @@ def test_subspace_shows_both_paths_and_the_body(pair):
 
 
 # --- Depth buffer and hull -------------------------------------------------------------------------------
-
 
 RED, BLUE = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 CUBE = np.array(list(itertools.product([0.0, 1.0], repeat=3)))
@@ -89,28 +148,27 @@ def area(triangles):
 
 
 def test_camera_keeps_lengths_and_looks_from_its_direction():
-    camera = Camera(azimuth=-60.0, elevation=28.0)
-    assert camera.axes @ camera.axes.T == pytest.approx(np.eye(3))
-    assert np.linalg.det(camera.axes) == pytest.approx(1.0)
-    assert camera.project([0.0, 0.0, 1.0])[1] > 0.0  # up is up
-    assert camera.project([0.0, -1.0, 0.0])[2] > camera.project([0.0, 1.0, 0.0])[2]  # −y is in front
+    assert CAMERA @ CAMERA.T == pytest.approx(np.eye(3))
+    assert np.linalg.det(CAMERA) == pytest.approx(1.0)
+    assert project([0.0, 0.0, 1.0])[1] > 0.0  # up is up
+    assert project([0.0, -1.0, 0.0])[2] > project([0.0, 1.0, 0.0])[2]  # −y is in front
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_the_nearer_particle_hides_the_other_whatever_the_order(order):
     centres = np.array([[0.5, 0.5, 0.0], [0.5, 0.5, 1.0]])[list(order)]
-    colours = np.stack([BLUE, RED])[list(order)]
     together = DepthBuffer([0, 0], [1, 1], 40)
-    together.spheres(centres, 0.2, colours)
+    together.spheres(centres, 0.2, np.stack([BLUE, RED])[list(order)])
     red, _, blue = together.colour[20, 20]
     assert red > 0.5 and blue == 0.0
 
 
 def test_a_face_hides_what_is_behind_it_and_not_what_is_in_front():
     face = np.array([[[-5.0, -5.0, 0.5], [5.0, -5.0, 0.5], [0.0, 9.0, 0.5]]])
+    edge_on = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 0.0, 9.0]]])
     buffer = DepthBuffer([0, 0], [1, 1], 50)
     buffer.spheres(np.array([[0.25, 0.5, 0.0], [0.75, 0.5, 1.0]]), 0.1, np.stack([BLUE, BLUE]))
-    buffer.triangles(face, RED)
+    buffer.triangles(np.concatenate([face, edge_on]), RED)
     assert buffer.colour[25, 12, 2] == 0.0  # covered
     assert buffer.colour[25, 37, 2] > 0.5  # in front
     assert np.isfinite(buffer.nearness).all()
@@ -133,29 +191,23 @@ def test_what_lies_outside_the_picture_is_left_out():
     assert (buffer.colour == 1.0).all()
 
 
-def test_hull_of_a_cube_has_its_surface_and_its_corners_only():
+def test_hull_of_a_square_and_of_two_points():
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
+    inside = np.random.default_rng(0).uniform(0.1, 0.9, (20, 2))
+    assert sorted(hull(np.vstack([square, inside, square])).tolist()) == sorted(square.tolist())
+    assert len(hull(np.array([[0.0, 0.0], [1.0, 1.0]]))) == 2
+
+
+def test_hull_of_a_cube_of_flat_points_and_of_points_on_a_line():
     inside = np.random.default_rng(0).uniform(0.2, 0.8, (5, 3))
     triangles = hull_triangles(np.concatenate([CUBE, inside]))
     assert len(triangles) == 12 and area(triangles) == pytest.approx(6.0)
     assert np.unique(triangles.reshape(-1, 3), axis=0) == pytest.approx(np.unique(CUBE, axis=0))
-
-
-def test_hull_of_a_wheel_approaches_that_of_a_cylinder():
-    angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
-    rim = np.stack([np.cos(angle), np.zeros(24), np.sin(angle)], axis=-1)
-    half = np.array([0.0, 0.5, 0.0])
-    triangles = hull_triangles(np.concatenate([rim - half, rim + half]))
-    assert area(triangles) == pytest.approx(2.0 * np.pi * 1.0 + 2.0 * np.pi, rel=0.01)
-
-
-def test_hull_of_flat_points_is_one_face_and_of_points_on_a_line_is_nothing():
-    flat = CUBE * [1.0, 1.0, 0.0]
-    assert area(hull_triangles(flat[::2])) == pytest.approx(1.0)
+    assert area(hull_triangles((CUBE * [1.0, 1.0, 0.0])[::2])) == pytest.approx(1.0)
     assert hull_triangles(np.outer(np.arange(4.0), [1.0, 2.0, 3.0])).shape == (0, 3, 3)
 
 
 # --- The body of a recorded scene ------------------------------------------------------------------------
-
 
 REST = np.array([[0.3, 0.2, 0.1, 0.0, 0.0, 0.0, 1.0]])
 
@@ -174,28 +226,30 @@ def test_sinkage_is_that_of_the_scene(grousers):
     assert (sinkage(scene.to_dict(), poses) == scene.sinkage(poses)).all()
 
 
-def test_corners_of_a_wheel_lie_on_its_rims():
-    run = SimpleNamespace(scene={"kind": "wheel", "diameter": 0.15, "width": 0.08}, pose=REST)
+def test_a_wheel_is_its_rims_and_from_the_side_a_circle():
+    run = SimpleNamespace(scene=WHEEL, pose=REST)
     corners = body_corners(run, 0) - REST[0, :3]
     assert np.hypot(corners[:, 0], corners[:, 2]) == pytest.approx(0.075)
     assert np.abs(corners[:, 1]) == pytest.approx(0.04)
+    assert area(hull_triangles(corners)) == pytest.approx(np.pi * 0.15 * (0.08 + 0.075), rel=0.01)
+    assert np.linalg.norm(body_outline(run, 0) - REST[0, [0, 2]], axis=1) == pytest.approx(0.075)
 
 
-def test_corners_of_a_blade_are_those_of_its_box(tmp_path):
-    with Run(make_run(tmp_path / "run.h5")) as run:
-        corners = body_corners(run, 3)
-        assert corners.mean(axis=0) == pytest.approx(run.pose[3, :3])
-        distance = np.linalg.norm(corners - run.pose[3, :3], axis=1)
-        assert distance == pytest.approx(0.5 * np.linalg.norm(PLATE))
+def test_a_blade_is_its_box(pair):
+    run = pair[0]
+    corners = body_corners(run, 3)
+    assert corners.mean(axis=0) == pytest.approx(run.pose[3, :3])
+    distance = np.linalg.norm(corners - run.pose[3, :3], axis=1)
+    assert distance == pytest.approx(0.5 * np.linalg.norm(PLATE))
+    outline = body_outline(run, 0)
+    sides = np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1)
+    assert np.sort(sides) == pytest.approx([PLATE[0]] * 2 + [PLATE[2]] * 2, rel=1e-6)
+    assert outline.mean(axis=0) == pytest.approx(run.pose[0, [0, 2]])
 
 
-def test_other_bodies_are_their_recorded_points():
+def test_other_bodies_are_the_vertices_of_their_mesh_or_their_recorded_points():
     points = np.random.default_rng(0).normal(size=(2, 8, 3))
     run = SimpleNamespace(scene={"kind": "body"}, body_points=points, pose=REST, mesh=None)
     assert np.array_equal(body_corners(run, 1), points[1])
-
-
-def test_corners_of_a_mesh_are_its_vertices():
-    vertices = np.random.default_rng(0).normal(size=(20, 3))
-    run = SimpleNamespace(scene={"kind": "body"}, pose=REST, mesh=(vertices, None))
-    assert body_corners(run, 0) == pytest.approx(vertices + REST[0, :3])
+    run.mesh = (points[0], None)
+    assert body_corners(run, 0) == pytest.approx(points[0] + REST[0, :3])
