@@ -11,7 +11,6 @@ from mpm_warp import Bed, Box, Column, Effects, Excavation, Incline, Material, P
 from mpm_warp.diagnostics import leakage
 from sgns_testing.scenes import BlockBed, block, cut
 
-from .case import Case
 from .measures import energies, frames_of, shares, stopped_with, top_speed, volume_gain, work_on_soil
 
 
@@ -308,59 +307,24 @@ def out_of_the_grid() -> tuple[float, str]:
     return stopped_with(scene, "raise scene.bed.headroom")
 
 
-CASES = [
-    Case("one layer of particles at rest", "nothing above, nothing beside: the grid hardly sees it",
-         "stays where it is", "largest displacement in 1 s", 1.0, "mm", one_layer_at_rest, quick=True),
-    Case("one layer of particles scraped off", "single particles between blade and floor",
-         "force, speed and leakage stay bounded", "largest share of a limit", 1.0, "", one_layer_scraped),
-    Case("single grains in flight", "particles without neighbours", "each flies its parabola",
-         "largest error after 0.1 s", 0.01, "mm", flight, quick=True),
-    *(
-        Case(f"bed thrown up and settled ({per_cell:g} per cell)", "soil comes apart and must become dense again",
-             "settled soil has its volume back, in either direction", "volume change", 3.0, "%",
-             partial(thrown_and_settled, per_cell), quick=per_cell <= 4)
-        for per_cell in (1, 4, 8)
-    ),
-    *(
-        Case(f"rain of grains becomes a layer ({per_cell:g} per cell)",
-             "every particle was alone: nothing remembers the density but itself",
-             "the layer is as high as the full bed", "change of the median height", 3.0, "%",
-             partial(grains_and_settled, per_cell))
-        for per_cell in (1, 4)
-    ),
-    Case("block hits the floor at 5 m/s", "a shock of a sixth of the wave speed", "no energy appears",
-         "energy above that at the start", 1.0, "%", lambda: dropped_block(5.0), quick=True),
-    Case("tool hits the bed at 5 m/s", "stopped 3 cm deep within a millimetre per substep",
-         "the soil gains no more energy than the tool gives", "energy gained over work done", 1.0, "",
-         lambda: impact(5.0), quick=True),
-    Case("zero gravity, nothing touches", "every stress and every velocity is exactly zero",
-         "soil that nothing acts on stays where it is", "largest displacement after 0.5 s", 1e-3, "mm",
-         free_block_in_nothing, quick=True),
-    Case("zero gravity, a plate pushes", "soil flies apart at zero pressure",
-         "momentum of soil and body together is conserved", "momentum that appears or is lost, over what was given",
-         1e-3, "", push_without_gravity, quick=True),
-    Case("particles on every node, walls and corners included",
-         "weights at their kinks; half the wall particles' support is beyond the wall",
-         "stays in the bin and comes to rest", "largest share of a limit", 1.0, "", on_nodes, quick=True),
-    Case("soil pushed against a wall", "soil between plate and wall has nowhere to go but up",
-         "wall and plate hold, speeds stay bounded", "largest share of a limit", 1.0, "", against_the_wall),
-    *(
-        Case(f"soil thrown against walls ({kind})", "2 m/s into walls and floor", "walls and floor hold",
-             "way beyond them", 1.0, "mm", partial(walls_hold, kind), quick=True)
-        for kind in ("no_slip", "slip", 0.3)
-    ),
-    Case("column four times as high as wide", "collapse from rest into free fall", "no energy appears",
-         "energy above that at the start", 1.0, "%", column_falls),
-    Case("endless slope of 60 degrees", "beyond mu_2: no steady flow exists",
-         "accelerates as friction between mu_s and mu_2 lets it", "speed outside of that range", 2.0, "%",
-         steep_slope),
-    *(
-        Case(f"volume after the deepest, fastest cut ({per_cell:g} per cell)",
-             "soil falls apart behind the blade and is heaped up in front of it",
-             "settled soil has its volume back, in either direction", "volume change", 3.0, "%",
-             partial(volume_after_a_deep_cut, per_cell))
-        for per_cell in (1, 4)
-    ),
-    Case("soil thrown out of the grid", "no grid node is there to carry it", "stops and says what to change",
-         "runs not stopped", 0.0, "", out_of_the_grid, quick=True),
-]  # fmt: skip
+MEASURES = {
+    "one layer of particles at rest": one_layer_at_rest,
+    "one layer of particles scraped off": one_layer_scraped,
+    "single grains in flight": flight,
+    **{f"bed thrown up and settled ({n} per cell)": partial(thrown_and_settled, n) for n in (1, 4, 8)},
+    **{f"rain of grains becomes a layer ({n} per cell)": partial(grains_and_settled, n) for n in (1, 4)},
+    "block hits the floor at 5 m/s": partial(dropped_block, 5.0),
+    "tool hits the bed at 5 m/s": partial(impact, 5.0),
+    "zero gravity, nothing touches": free_block_in_nothing,
+    "zero gravity, a plate pushes": push_without_gravity,
+    "particles on every node, walls and corners included": on_nodes,
+    "soil pushed against a wall": against_the_wall,
+    **{f"soil thrown against walls ({kind})": partial(walls_hold, kind) for kind in ("no_slip", "slip", 0.3)},
+    "column four times as high as wide": column_falls,
+    "endless slope of 60 degrees": steep_slope,
+    **{
+        f"volume after the deepest, fastest cut ({n} per cell)": partial(volume_after_a_deep_cut, n)
+        for n in (1, 4)
+    },
+    "soil thrown out of the grid": out_of_the_grid,
+}
