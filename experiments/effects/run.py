@@ -9,32 +9,28 @@ Then draws effects.png. About fifteen minutes on one core.
 
 from __future__ import annotations
 
-import csv
 import logging
 import math
 import statistics
+import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+import matplotlib.pyplot as plt
 import numpy as np
-from hydra import compose, initialize_config_module
+from common import read_rows, scene_of, write_rows
 
 from mpm_warp import Decision, Effects, Scene, Solver, Tolerances, asymmetry, effects_for
-from sgns.simulate.scene import scene_from_config
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
 REPEATS = 3
 SCENES = {
-    "excavation": [
-        "scene=quick_excavation",
-        "scene.duration=1.0",
-        "scene.bed.headroom=0.5",
-    ],  # elastic soil flies
+    # Elastic soil flies.
+    "excavation": ["scene=quick_excavation", "scene.duration=1.0", "scene.bed.headroom=0.5"],
     "wheel": ["scene=quick_wheel", "scene.duration=1.0"],
     "column": ["scene=column", "scene.duration=0.4"],
     "incline": ["scene=incline", "scene.duration=0.4"],
@@ -48,8 +44,7 @@ DURATIONS = (0.75, 1.0, 1.5)  # of the cut in friction.csv [s]
 
 
 def make_scene(name: str, *more: str) -> Scene:
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        return scene_from_config(compose("simulate", [*SCENES[name], *more]))
+    return scene_of(*SCENES[name], *more)[0]
 
 
 def pair(chosen: Effects, effect: str) -> tuple[Effects, Effects]:
@@ -141,39 +136,18 @@ def with_more_friction(duration: float, share: float) -> dict:
     return {"duration": duration, "share": share, **changes(scene, one, two)}
 
 
-def as_written(value: float | str) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
 def resume(
-    file: Path, keys: tuple[str, ...], names: tuple[str, ...], jobs: list[tuple], make
+    name: str, keys: tuple[str, ...], jobs: list[tuple], make: Callable[..., dict]
 ) -> list[dict[str, str]]:
-    """Rows of `file`, with the columns `names`, made where they are missing and written one by one."""
-    rows = list(csv.DictReader(file.open(newline=""))) if file.exists() else []
-    done = {tuple(row[key] for key in keys) for row in rows}
+    """Rows of the table `name`, made where they are missing; the file is complete after every one."""
+    file = HERE / f"{name}.csv"
+    done = {tuple(row[key] for key in keys) for row in read_rows(file)}
     for job in jobs:
-        if tuple(as_written(part) for part in job) in done:
-            continue
-        row = {key: value if value is None else as_written(value) for key, value in make(*job).items()}
-        logging.info("%s", {key: value for key, value in row.items() if value is not None})
-        new = not file.exists()
-        with file.open("a", newline="") as stream:
-            writer = csv.DictWriter(stream, names, extrasaction="ignore", restval="")
-            if new:
-                writer.writeheader()
-            writer.writerow(row)
-    return list(csv.DictReader(file.open(newline="")))
-
-
-TABLE = (
-    "scene", "effect", "auto", "number", "time_ratio", "force_change", "displacement_change", "seconds_off",
-    "seconds_on",
-)  # fmt: skip
-EDGE = (
-    "scene", "effect", "grain_diameter", "auto", "tolerance", "number", "number_over_tolerance", "force_change",
-    "displacement_change",
-)  # fmt: skip
-FRICTION = ("duration", "share", "force_change", "displacement_change")
+        if tuple(f"{part:.4g}" if isinstance(part, float) else part for part in job) not in done:
+            row = make(*job)
+            logging.info("%s", row)
+            write_rows(file, [*read_rows(file), row])
+    return read_rows(file)
 
 
 def largest(row: dict[str, str]) -> float:
@@ -237,16 +211,16 @@ def draw(table: list[dict[str, str]], edge: list[dict[str, str]]) -> None:
 def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     jobs = [(name, effect) for name in SCENES for effect in EFFECTS]
-    table = resume(HERE / "table.csv", ("scene", "effect"), TABLE, jobs, each_effect)
+    table = resume("table", ("scene", "effect"), jobs, each_effect)
     jobs = [
         (name, effect, grain)
         for name in ("excavation", "wheel", "column", "incline")
         for effect in ("rate_dependence", "nonlocality")
         for grain in GRAINS
     ]
-    edge = resume(HERE / "edge.csv", ("scene", "effect", "grain_diameter"), EDGE, jobs, at_the_edge)
+    edge = resume("edge", ("scene", "effect", "grain_diameter"), jobs, at_the_edge)
     jobs = [(duration, share) for duration in DURATIONS for share in SHARES]
-    resume(HERE / "friction.csv", ("duration", "share"), FRICTION, jobs, with_more_friction)
+    resume("friction", ("duration", "share"), jobs, with_more_friction)
     draw(table, edge)
 
 

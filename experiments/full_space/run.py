@@ -11,11 +11,11 @@ beside this script, and a line that is there is not made again; bars.png is draw
 from __future__ import annotations
 
 import argparse
-import csv
 import logging
 import multiprocessing
 import os
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -23,11 +23,12 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from common import read_rows, training_settings, write_rows
 from torch import Tensor
 
 from sgns.data.dataset import Dataset
@@ -41,9 +42,6 @@ from sgns.reduction.reduce import reduce_dataset
 from sgns.simulator import Simulator
 from sgns.train.command import train as train_subspace
 from sgns.train.lightning_module import SurrogateTraining, TrainingSettings, prepared
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
 SPACING = 0.015  # of the particles of dataset=quick, and the largest of the body nodes [m]
@@ -63,8 +61,7 @@ FULL_SPACE_TRAINING = {"batch_size": 1, "noise": 0.5, "learning_rate": 2e-3, "wa
 
 def settings(path: Path, model: dict[str, Any] | None = None, **training: Any) -> dict[str, Any]:
     """`conf/train` as plain values, with changes."""
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        plain = OmegaConf.to_container(compose("train", [f"dataset.path={path}"]), resolve=False)
+    plain = training_settings(f"dataset.path={path}")
     plain["model"] |= model or {}
     plain["training"] |= {"threads": 1} | training
     return plain
@@ -390,23 +387,6 @@ def single_threaded() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
 
 
-def done(table: Path) -> dict[str, dict[str, str]]:
-    """Lines of the table by case."""
-    if not table.exists():
-        return {}
-    with table.open(newline="") as stream:
-        return {row["case"]: row for row in csv.DictReader(stream)}
-
-
-def save(table: Path, rows: dict[str, dict[str, Any]]) -> None:
-    columns = list(dict.fromkeys(key for row in rows.values() for key in row))
-    with table.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, columns, restval="")
-        writer.writeheader()
-        for row in rows.values():
-            writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()})
-
-
 def draw(rows: dict[str, dict[str, str]], file: Path) -> None:
     """Times, memory and errors side by side."""
     panels = {
@@ -451,7 +431,7 @@ def main() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     # Freed blocks are kept for the next step: otherwise a third of the time goes into getting zeroed pages anew.
     os.environ |= {"MALLOC_MMAP_THRESHOLD_": "4294967296", "MALLOC_TRIM_THRESHOLD_": "17179869184"}
-    rows: dict[str, dict[str, Any]] = dict(done(options.table))
+    rows: dict[str, dict[str, Any]] = {row["case"]: row for row in read_rows(options.table)}
     order = ("solver", SUBSPACE, *FULL_SPACE)
     for name in order:
         if name not in rows:
@@ -462,14 +442,14 @@ def main() -> None:
                 else in_fresh_process(cost, options.data, name, options.repeats)
             )
             rows[name] = {"case": name, **found}
-            save(options.table, rows)
+            write_rows(options.table, rows.values())
             print(rows[name], flush=True)
     for name, learn in ((SUBSPACE, learn_subspace), (TRAINED, learn_full_space)):
         if not rows[name].get("trained_steps"):
             rows[name] |= in_fresh_process(learn, options.data, name, options.minutes, options.runs)
-            save(options.table, rows)
+            write_rows(options.table, rows.values())
             print(rows[name], flush=True)
-    draw(done(options.table), HERE / "bars.png")
+    draw({row["case"]: row for row in read_rows(options.table)}, HERE / "bars.png")
 
 
 if __name__ == "__main__":

@@ -10,21 +10,22 @@ figure.png beside this script; a training that is complete in `--output` is not 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import logging
 import multiprocessing
 import os
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from common import training_settings, write_rows
 
 from sgns.data.published import published_dataset
 from sgns.evaluate.published import scored
@@ -41,27 +42,6 @@ PRESETS = ("paper", "released", "default")
 WARM_UP = 60  # steps that tell how long one takes
 
 
-def settings(preset: str, folder: Path, fold: int, overrides: list[str]) -> dict[str, Any]:
-    """All settings of `sgns train`, plain."""
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        config = compose(
-            "train",
-            [
-                f"preset={preset}",
-                "dataset=published",
-                f"dataset.path={folder}",
-                f"dataset.folds={FOLDS}",
-                f"dataset.fold={fold}",
-                "training.threads=1",
-                *overrides,
-            ],
-        )
-    config.output = ""
-    plain = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(plain, dict)
-    return plain
-
-
 def trained(
     preset: str, folder: Path, fold: int, seconds: float, output: Path, overrides: list[str]
 ) -> float:
@@ -69,7 +49,13 @@ def trained(
     record = output / "training.json"
     if record.exists():
         return float(json.loads(record.read_text())["seconds"])
-    config = settings(preset, folder, fold, overrides)
+    published = (
+        "dataset=published",
+        f"dataset.path={folder}",
+        f"dataset.folds={FOLDS}",
+        f"dataset.fold={fold}",
+    )
+    config = training_settings(f"preset={preset}", *published, "training.threads=1", *overrides)
     data = published_dataset(config["dataset"], config["reduction"]["num_modes"])
     # The last checkpoint is judged, so that nothing is to be chosen: validation is kept short.
     runs = {split: data.runs(split) for split in ("train", "test")}
@@ -215,10 +201,7 @@ def main() -> None:
             rows += [table_row(kind, preset, row["scores"], [row]) for row in own]
             rows.append(table_row(kind, preset, aggregate([row["scores"] for row in own]), own))
             logging.info("%s", rows[-1])
-    with (HERE / "table.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(HERE / "table.csv", rows, digits=6)
     if set(options.presets) == set(PRESETS) and set(options.kinds) == set(KINDS):
         draw(rows, HERE / "figure.png")
 

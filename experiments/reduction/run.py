@@ -9,20 +9,20 @@ this script. "Held out" are the validation and the test runs.
 from __future__ import annotations
 
 import argparse
-import csv
+import sys
 from pathlib import Path
 
-import matplotlib
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from common import write_rows
 
 from sgns.data.dataset import SPLITS, Dataset
 from sgns.evaluate.costs import cpu_model
 from sgns.reduction.basis import CENTRINGS, ReductionCurves, reduction_curves
 from sgns.reduction.reduce import fit_runs
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
 POWERS = [2**k for k in range(9)]
@@ -62,15 +62,6 @@ def draw(curves: dict[str, ReductionCurves], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def write(path: Path, rows: list[dict[str, str]]) -> None:
-    """A table, also on the terminal."""
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    print("  ".join(rows[0]), *("  ".join(row.values()) for row in rows), sep="\n")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("dataset", nargs="?", default="data/quick", help="folder of a complete campaign")
@@ -85,7 +76,8 @@ def main() -> None:
         basis = pca.basis(centring)
         curves[centring] = reduction_curves(basis, paths["validation"] + paths["test"])
         rows += rows_of(centring, curves[centring])
-    write(HERE / "curves.csv", rows)
+    write_rows(HERE / "curves.csv", rows)
+    print(*("  ".join(row.values()) for row in rows), sep="\n")
     draw(curves, HERE / "curves.png")
 
 

@@ -1,4 +1,4 @@
-"""How fast are training and rollout, and what does each rearrangement of the network gain?
+"""How fast are training and rollout, and what do the rearrangements of the network gain?
 
     python experiments/rollout_speed/run.py [--threads 1 2 4]
 
@@ -10,30 +10,32 @@ random: time does not depend on them. Writes table.csv and bars.png beside this 
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import statistics
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-import matplotlib
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+import matplotlib.pyplot as plt
 import torch
-from forms import forms_of, multiplications, onednn
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from common import training_settings, write_rows
 from torch import Tensor
 
 from sgns.evaluate.costs import cpu_model
+from sgns.model import algebra
 from sgns.model.algebra import GraphStepper, product
 from sgns.model.features import BodyTrack
+from sgns.model.network import EncodeProcessDecode
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
 HERE = Path(__file__).parent
+Row = dict[str, object]
+Job = Callable[[], object]
 MODES = 8
 BODY_POINTS = 15
 PARTICLES = 29_700
@@ -46,10 +48,9 @@ NETWORKS = {
 
 def dynamics_of(overrides: list[str]) -> LatentDynamics:
     """An untrained network without context, on 8 modes."""
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        model = OmegaConf.to_container(compose("train", overrides).model)
+    model = training_settings(*overrides)["model"] | {"context": []}
     torch.manual_seed(0)
-    dynamics = LatentDynamics(ModelSettings(**(model | {"context": []})), MODES).requires_grad_(False)
+    dynamics = LatentDynamics(ModelSettings(**model), MODES).requires_grad_(False)
     # Small changes: a path of random weights stays in the range of numbers of a trained one.
     dynamics.change.scale.fill_(1e-3)
     return dynamics
@@ -70,9 +71,7 @@ def track_of(dynamics: LatentDynamics, paths: int, frames: int, turning: bool = 
     )
 
 
-def in_turn(
-    jobs: dict[str, Callable[[], object]], rounds: int, calls: int, warm: int = 2
-) -> dict[str, float]:
+def in_turn(jobs: dict[str, Job], rounds: int, calls: int, warm: int = 2) -> dict[str, float]:
     """Median processor time of a call [s], the jobs in turn; after some calls that warm the caches."""
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(rounds):
@@ -86,7 +85,7 @@ def in_turn(
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def best_by_the_clock(jobs: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+def best_by_the_clock(jobs: dict[str, Job], rounds: int) -> dict[str, float]:
     """Shortest time of a call [s], the jobs in turn."""
     best = dict.fromkeys(jobs, float("inf"))
     for _ in range(rounds):
@@ -99,34 +98,56 @@ def best_by_the_clock(jobs: dict[str, Callable[[], object]], rounds: int) -> dic
     return best
 
 
-def time_forms(name: str, dynamics: LatentDynamics, rounds: int) -> list[dict[str, object]]:
-    """One step of the network, form by form, beside dense products of as many multiplications."""
+@contextmanager
+def onednn(allowed: bool) -> Iterator[None]:
+    """oneDNN's products allowed or not."""
+    before, algebra._AVAILABLE = algebra._AVAILABLE, allowed and algebra._AVAILABLE
+    try:
+        yield
+    finally:
+        algebra._AVAILABLE = before
+
+
+def multiplications(network: EncodeProcessDecode, nodes: int, edges: int) -> int:
+    """Multiplications of one step that no rearrangement removes, for one message-passing step of two hidden layers.
+
+    Every layer between nonlinearities counts once: of the edges, the first and second hidden layer of their encoder,
+    then two layers of their update, the first of which holds the encoder's last; of the nodes, two of the encoder,
+    three blocks of the layers after it, the sum's, one of the update, two of the decoder and its output.
+    """
+    width = network.process[0].width
+    inputs, outputs = network.encode_nodes.first.in_features, network.decode.linears[-1].out_features
+    of_edges = edges * width * (network.encode_edges.first.in_features + 3 * width)
+    return of_edges + nodes * width * (inputs + width * (1 + 3 + 1 + 1 + 1 + 1) + outputs)
+
+
+def inputs_of(dynamics: LatentDynamics, batch: int) -> tuple[int, Tensor, Tensor, Tensor]:
+    """Number of body nodes, edges (2, E), and random features of nodes (B, V, ...) and edges (B, E, ...)."""
     network, body = dynamics.network, 1 if dynamics.settings.body_nodes == "pose" else BODY_POINTS
     edge_index = dynamics.edge_index(MODES, body, torch.device("cpu"))
-    nodes = torch.randn(1, MODES + body, network.encode_nodes.first.in_features)
-    edges = torch.randn(1, edge_index.shape[1], network.encode_edges.first.in_features)
+    nodes = torch.randn(batch, MODES + body, network.encode_nodes.first.in_features)
+    return (
+        body,
+        edge_index,
+        nodes,
+        torch.randn(batch, edge_index.shape[1], network.encode_edges.first.in_features),
+    )
+
+
+def time_step(name: str, dynamics: LatentDynamics, rounds: int) -> list[Row]:
+    """One step of the network, plain and as it is, beside dense products of as many multiplications."""
+    network = dynamics.network
+    body, edge_index, nodes, edges = inputs_of(dynamics, 1)
     width, work = network.process[0].width, multiplications(network, MODES + body, edge_index.shape[1])
     rows = round(work / width**2)
     left, right, out = torch.randn(rows, width), torch.randn(width, width), torch.empty(rows, width)
     stepper = GraphStepper(network, edge_index, MODES + body, body)
 
-    def without_onednn(job: Callable[[], object]) -> Callable[[], object]:
-        def called() -> None:
-            with onednn(False):
-                job()
+    def plain() -> None:
+        with onednn(False):
+            network.plain(nodes, edges, edge_index)
 
-        return called
-
-    jobs: dict[str, Callable[[], object]] = {
-        form: without_onednn(lambda f=f: f(nodes, edges))
-        for form, f in forms_of(network, edge_index, MODES + body).items()
-    }
-    with onednn(False):
-        plain_stepper = GraphStepper(network, edge_index, MODES + body, body)
-    jobs |= {
-        "all matrices merged once, memory kept": lambda: plain_stepper(nodes[0], edges[0]),
-        "oneDNN's products": lambda: stepper(nodes[0], edges[0]),
-    }
+    jobs: dict[str, Job] = {"plain": plain, "oneDNN's products": lambda: stepper(nodes[0], edges[0])}
     if body > 1:
         jobs["edges within the body kept"] = lambda: stepper(nodes[0], edges[0], same_body=True)
     jobs |= {
@@ -150,7 +171,7 @@ def time_forms(name: str, dynamics: LatentDynamics, rounds: int) -> list[dict[st
     ]
 
 
-def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[dict[str, object]]:
+def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[Row]:
     """Whole steps with features, force and torque: advance, a path, a path whose body turns, paths side by side."""
     frames, d = 123, dynamics.history
     latent = torch.randn(1, d, MODES, 3).double()
@@ -170,7 +191,7 @@ def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[dict
         finally:
             dynamics.network.forward = forward
 
-    jobs: dict[str, Callable[[], object]] = {
+    jobs: dict[str, Job] = {
         "advance, plain network": plainly,
         "advance": advanced,
         "a path": lambda: dynamics.unroll(latent, track),
@@ -202,36 +223,31 @@ def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[dict
 
 def time_training(
     name: str, dynamics: LatentDynamics, threads: list[int], cores: set[int], rounds: int
-) -> list[dict[str, object]]:
-    """Optimiser steps of the network with batches of 32: on one thread its processor time, form by form, the median; on
-    more the wall clock, plain and fast, the best of the rounds."""
-    network = dynamics.network.requires_grad_(True)
-    body = 1 if dynamics.settings.body_nodes == "pose" else BODY_POINTS
-    edge_index = dynamics.edge_index(MODES, body, torch.device("cpu"))
-    batch = 32
-    nodes = torch.randn(batch, MODES + body, network.encode_nodes.first.in_features)
-    edges = torch.randn(batch, edge_index.shape[1], network.encode_edges.first.in_features)
+) -> list[Row]:
+    """Optimiser steps of the network, plain and as it is, with batches of 32: on one thread its processor time, the
+    median; on more the wall clock, the best of the rounds."""
+    network, batch = dynamics.network.requires_grad_(True), 32
+    _, edge_index, nodes, edges = inputs_of(dynamics, batch)
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4, fused=True)
 
-    def trained(form: Callable[[Tensor, Tensor], Tensor], fast_products: bool) -> None:
+    def trained(form: Callable[..., Tensor], fast_products: bool) -> None:
         with onednn(fast_products):
             optimizer.zero_grad()
-            form(nodes, edges).square().mean().backward()
+            form(nodes, edges, edge_index).square().mean().backward()
             optimizer.step()
 
-    jobs: dict[str, Callable[[], object]] = {
-        form: lambda f=f: trained(f, False) for form, f in forms_of(network, edge_index, MODES + body).items()
+    jobs: dict[str, Job] = {
+        "plain": lambda: trained(network.plain, False),
+        "oneDNN's products": lambda: trained(network, True),
     }
-    jobs["oneDNN's products"] = lambda: trained(lambda *x: network(*x, edge_index), True)
-    rows: list[dict[str, object]] = []
+    rows: list[Row] = []
     for count in threads:
         torch.set_num_threads(count)
         os.sched_setaffinity(0, cores if count > 1 else {min(cores)})
         if count == 1:
             found, clock = in_turn(jobs, rounds, 2, warm=1), "processor time, median"
         else:
-            ends = {form: jobs[form] for form in ("plain", "oneDNN's products")}
-            found, clock = best_by_the_clock(ends, rounds), "wall clock, best round"
+            found, clock = best_by_the_clock(jobs, rounds), "wall clock, best round"
         rows += [
             {
                 "part": "training",
@@ -249,7 +265,7 @@ def time_training(
     return rows
 
 
-def time_with_basis(dynamics: LatentDynamics, device: str, rounds: int) -> dict[str, object]:
+def time_with_basis(dynamics: LatentDynamics, device: str, rounds: int) -> Row:
     """The paper's variant: particles to modes and back in every step, on `device`."""
     dynamics = dynamics.to(device)
     basis = torch.linalg.qr(torch.randn(PARTICLES, MODES))[0].to(device)
@@ -278,7 +294,7 @@ def time_with_basis(dynamics: LatentDynamics, device: str, rounds: int) -> dict[
     }
 
 
-def draw(rows: list[dict[str, object]]) -> None:
+def draw(rows: list[Row]) -> None:
     """Bars: forms of the step at the paper's size, training there, whole steps of the three networks."""
     figure, axes = plt.subplots(1, 3, figsize=(15, 3.8), layout="constrained")
     panels = (
@@ -301,15 +317,10 @@ def draw(rows: list[dict[str, object]]) -> None:
     figure.savefig(HERE / "bars.png", dpi=130)
 
 
-def in_digits(row: dict[str, object]) -> dict[str, object]:
-    """Numbers with four digits."""
-    return {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()}
-
-
-def told(rows: list[dict[str, object]]) -> list[dict[str, object]]:
+def told(rows: list[Row]) -> list[Row]:
     """The rows, printed."""
     for row in rows:
-        print(*(f"{key}={value}" for key, value in in_digits(row).items() if key != "note"), flush=True)
+        print(*(f"{key}={value}" for key, value in row.items() if key != "note"), flush=True)
     return rows
 
 
@@ -321,23 +332,17 @@ def main() -> None:
     torch.set_num_threads(1)
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})
-    rows: list[dict[str, object]] = []
+    rows: list[Row] = []
     for name, overrides in NETWORKS.items():
         dynamics = dynamics_of(overrides)
-        rows += told(time_forms(name, dynamics, options.rounds))
+        rows += told(time_step(name, dynamics, options.rounds))
         rows += told(time_rollouts(name, dynamics, max(2, options.rounds // 3)))
         if name == "paper's size":
             for device in ("cpu", *(["cuda"] if torch.cuda.is_available() else [])):
                 rows += told([time_with_basis(dynamics, device, options.rounds)])
         rows += told(time_training(name, dynamics, options.threads, cores, options.rounds))
     machine = f"{cpu_model()}, {len(cores)} of {os.cpu_count()} cores"
-    with (HERE / "table.csv").open("w", newline="") as stream:
-        keys = ["part", "network", "what", "threads", "us", "samples_per_s", "times_faster_than_plain",
-                "times_torch_mm", "times_onednn_product", "note", "machine"]  # fmt: skip
-        writer = csv.DictWriter(stream, keys)
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({"threads": 1} | in_digits(row) | {"machine": machine})
+    write_rows(HERE / "table.csv", [{"threads": 1} | row | {"machine": machine} for row in rows])
     draw(rows)
 
 

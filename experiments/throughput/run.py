@@ -10,7 +10,6 @@ growth.png beside this script. The clock is the processor time of each process: 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import statistics
@@ -19,13 +18,13 @@ import sys
 import tempfile
 from pathlib import Path
 
-import matplotlib
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+import matplotlib.pyplot as plt
 import ours
+from common import write_rows
 
 from sgns.evaluate.costs import cpu_model
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
 PAPER = 30_000  # asked for; the lattice of the paper's bin at 13.3 mm has 29 700
@@ -159,10 +158,7 @@ def main() -> None:
     if grown:
         draw(grown)
     rows += grown
-    with (HERE / "table.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(HERE / "table.csv", rows)
     for row in rows:
         print(
             *(row[key] for key in ("solver", "what", "particles", "M_steps_per_s", "s_per_simulated_s")),

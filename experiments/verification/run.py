@@ -8,16 +8,16 @@ Writes NAME.csv and NAME.png beside this script; all of them take about 25 minut
 from __future__ import annotations
 
 import argparse
-import csv
 import importlib
 import logging
+import sys
 import time
 from pathlib import Path
 
-import matplotlib
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from common import write_rows
 
 HERE = Path(__file__).parent
 CASES = ("bagnold", "mckyes", "passive", "runout", "silo", "slope", "stopping", "waves")
@@ -35,11 +35,7 @@ def main() -> None:
         start = time.perf_counter()
         rows = case.measure()
         logging.info("%s: %.0f s", name, time.perf_counter() - start)
-        with (HERE / f"{name}.csv").open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, rows[0])
-            writer.writeheader()
-            for row in rows:
-                writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+        write_rows(HERE / f"{name}.csv", rows, digits=6)
         figure = plt.figure(figsize=(9, 5), layout="constrained")
         case.draw(figure, rows)
         figure.savefig(HERE / f"{name}.png", dpi=100)
