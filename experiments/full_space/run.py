@@ -33,6 +33,7 @@ from torch import Tensor
 
 from sgns.data.dataset import Dataset
 from sgns.data.run import Run
+from sgns.evaluate.costs import forget_peak, peak_memory
 from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
 from sgns.evaluate.metrics import VectorErrors, mean_prediction, skill
 from sgns.model.features import BodyTrack
@@ -157,34 +158,23 @@ def timed(action: Callable[[], object], repeats: int) -> list[float]:
     return found
 
 
-def resident(peak: bool) -> float:
-    """Memory of this process now, or the most since `forget_peak` [MB]."""
-    key = "VmHWM:" if peak else "VmRSS:"
-    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith(key))
-    return float(line.split()[1]) / 1024
-
-
-def forget_peak() -> None:
-    Path("/proc/self/clear_refs").write_text("5")
-
-
 def rates(
     step: Callable[[], object], frame: Callable[[], object], frame_rate: float, repeats: int, parameters: int
 ) -> dict[str, Any]:
     """Cost of rolling out frames and of training steps; memory is the most that each adds to the process."""
-    before = resident(peak=False)
     forget_peak()
+    before = peak_memory()
     # Not inference_mode: the subspace network keeps its edges, and those made there cannot be trained with.
     with torch.no_grad():
         frames = timed(frame, repeats)
-    rolled = resident(peak=True)
+    rolled = peak_memory()
     steps = timed(step, repeats)
     return {
         "parameters": parameters,
         "training_s_per_step": statistics.median(steps),
-        "training_memory_MB": resident(peak=True) - before,
+        "training_memory_MB": (peak_memory() - before) / 2**20,
         "rollout_s_per_simulated_s": statistics.median(frames) * frame_rate,
-        "rollout_memory_MB": rolled - before,
+        "rollout_memory_MB": (rolled - before) / 2**20,
         "repeats": repeats,
     }
 
@@ -236,21 +226,14 @@ def cost_subspace(path: Path, name: str, repeats: int) -> dict[str, Any]:
 
 
 def errors(
-    paths: list[Path],
-    training_paths: list[Path],
-    predict: Callable[[Path], tuple[np.ndarray, np.ndarray]],
-    d: int,
+    path: Path, count: int | None, predict: Callable[[Path], tuple[np.ndarray, np.ndarray]], d: int
 ) -> dict[str, float]:
-    """Skill and force NRMSE over runs, the first d frames given, beside the baselines.
+    """Skill and force NRMSE over the first `count` test runs of a dataset, d frames given, beside the baselines.
 
-    Args:
-        paths: runs to predict.
-        training_paths: runs whose mean force is a baseline.
-        predict: positions [m] (T, n, 3) and force [N] (T, 3) of a run.
-        d: frames given.
+    `predict` gives positions [m] (T, n, 3) and force [N] (T, 3) of a run.
     """
-    forces = []
-    for file in training_paths:
+    forces, paths = [], Dataset.open(path).runs("test")[:count]
+    for file in Dataset.open(path).runs("train"):
         with Run(file) as run:
             forces.append(run.force)
     mean = mean_prediction(forces, d)
@@ -272,6 +255,7 @@ def errors(
         force.append(VectorErrors.compare(true_force[d:], predicted[d:]))
         constant.append(VectorErrors.compare(true_force[d:], mean))
     return {
+        "test_runs": len(paths),
         "position_rmse_mm": 1e3 * float(np.sqrt(np.mean(mse["total"]))),
         "frozen_rmse_mm": 1e3 * float(np.sqrt(np.mean(mse["frozen"]))),
         "skill_frozen": skill(mse["total"], mse["frozen"]),
@@ -286,19 +270,14 @@ def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) ->
     plain = settings(path, FULL_SPACE[name], **FULL_SPACE_TRAINING)
     dynamics, training_runs = full_space(path, plain["model"], "train")
     windows = FullSpaceWindows(training_runs, dynamics.history)
-    noise_scale = fit_normalisation(
-        dynamics, windows, plain["training"]["noise"], plain["training"]["normalisation_floor"]
-    )
-    short = TrainingSettings.from_dict(
-        plain["training"]
-        | {"max_steps": 4, "warmup_steps": 0, "learning_rate": 1e-8, "final_learning_rate": 1e-8}
-    )
+    given = plain["training"]
+    noise_scale = fit_normalisation(dynamics, windows, given["noise"], given["normalisation_floor"])
+    slow = {"max_steps": 4, "warmup_steps": 0, "learning_rate": 1e-8, "final_learning_rate": 1e-8}
+    short = TrainingSettings.from_dict(given | slow)
     per_step = statistics.median(timed(lambda: train(dynamics, windows, short, noise_scale), 1)) / 4
     steps = max(1, round(60 * minutes / per_step))
     began = time.process_time()
-    record = train(
-        dynamics, windows, TrainingSettings.from_dict(plain["training"] | {"max_steps": steps}), noise_scale
-    )
+    record = train(dynamics, windows, TrainingSettings.from_dict(given | {"max_steps": steps}), noise_scale)
     taken = time.process_time() - began
     last = max(1, steps // 10)
     logging.warning(
@@ -315,13 +294,8 @@ def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) ->
             positions, force = dynamics.unroll(run.soil(slice(0, dynamics.history))[None], body)
         return positions[0].numpy(), force[0].numpy()
 
-    dataset = Dataset.open(path)
-    found = errors(dataset.runs("test")[:runs], dataset.runs("train"), predict, dynamics.history)
-    return {
-        "trained_processor_s": taken,
-        "trained_steps": steps,
-        "test_runs": len(dataset.runs("test")[:runs]),
-    } | found
+    found = errors(path, runs, predict, dynamics.history)
+    return {"trained_processor_s": taken, "trained_steps": steps} | found
 
 
 def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
@@ -333,13 +307,8 @@ def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> d
     def fit(steps: int, output: Path) -> float:
         changes = {"max_steps": steps, "validate_every": max(1, steps // 10)}
         began = time.process_time()
-        train_subspace(
-            reduced,
-            num_modes=modes,
-            model=plain["model"],
-            training=plain["training"] | changes,
-            output=output,
-        )
+        training = plain["training"] | changes
+        train_subspace(reduced, num_modes=modes, model=plain["model"], training=training, output=output)
         return time.process_time() - began
 
     with tempfile.TemporaryDirectory() as temporary:
@@ -348,7 +317,6 @@ def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> d
         steps = max(1, round(60 * minutes / ((fit(300, folder / "pilot")) / 300)))
         taken = fit(steps, folder / "training")
         simulator = Simulator.load(folder / "training" / "best.ckpt")
-    dataset = Dataset.open(path)
     by_name = {run.name: run for run in reduced.runs("test")}
 
     def predict(file: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -356,12 +324,8 @@ def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> d
         rollout = simulator.rollout(run.pose, latent_history=run.latent[: simulator.history, :modes])
         return simulator.basis.inverse(torch.as_tensor(rollout.latent)).numpy(), rollout.force
 
-    found = errors(dataset.runs("test")[:runs], dataset.runs("train"), predict, simulator.history)
-    return {
-        "trained_processor_s": taken,
-        "trained_steps": steps,
-        "test_runs": len(dataset.runs("test")[:runs]),
-    } | found
+    found = errors(path, runs, predict, simulator.history)
+    return {"trained_processor_s": taken, "trained_steps": steps} | found
 
 
 def solver(path: Path, name: str) -> dict[str, Any]:

@@ -36,24 +36,14 @@ from unittest import mock
 import numpy as np
 import warp as wp
 
-from mpm_warp import launch as work
 from mpm_warp import solver
 from mpm_warp.kernels import nonlocal_fluidity
 
-__all__ = ["Checked", "Report", "Threads", "compiler", "on_stand_in", "with_graphs"]
+__all__ = ["Checked", "Report", "Threads", "compiler", "on_stand_in"]
 
 HERE = Path(__file__).resolve().parent
 MANY = 0xFFFFFFFF
-FLAGS = (
-    "-std=c++17",
-    "-w",
-    "-DNDEBUG",
-    "-fPIC",
-    "-shared",
-    "-march=native",
-    "-ffp-contract=fast",
-    "-pthread",
-)
+FLAGS = tuple("-std=c++17 -w -DNDEBUG -fPIC -shared -march=native -ffp-contract=fast -pthread".split())
 
 
 @cache
@@ -89,18 +79,16 @@ class StandIn(ABC):
 
     Args:
         atomic: the kernels as a GPU gets them; False, a planted fault: those for one thread.
-        plain: a planted fault: atomic operations are not.
     """
 
     flags: tuple[str, ...]
 
-    def __init__(self, atomic: bool = True, plain: bool = False) -> None:
+    def __init__(self, atomic: bool = True) -> None:
         self.atomic = atomic
-        self._flags = (*self.flags, *(["-DPLAIN"] if plain else []))
 
     def taken_over(self, command: wp.Launch) -> wp.Launch:
         """The recorded launch, which from now on runs this way."""
-        built = _built(_source(command), self._flags)
+        built = _built(_source(command), self.flags)
 
         def forward(bounds: Any, arguments: Any) -> None:
             self.run(command.kernel, built, bounds._obj, arguments._obj)
@@ -118,8 +106,8 @@ class Threads(StandIn):
 
     flags = ("-O2",)
 
-    def __init__(self, count: int = 4, seed: int = 0, plain: bool = False) -> None:
-        super().__init__(plain=plain)
+    def __init__(self, count: int = 4, seed: int = 0) -> None:
+        super().__init__()
         self._count, self._random = count, np.random.default_rng(seed)
         self.launches = 0
 
@@ -145,8 +133,8 @@ class Checked(StandIn):
 
     flags = ("-O1", "-fno-tree-loop-distribute-patterns", "-fsanitize=thread", "-DCHECKED")
 
-    def __init__(self, atomic: bool = True, plain: bool = False) -> None:
-        super().__init__(atomic, plain)
+    def __init__(self, atomic: bool = True) -> None:
+        super().__init__(atomic)
         self._reports: dict[str, Report] = {}
         self._met: set[str] = set()
 
@@ -206,11 +194,6 @@ def on_stand_in(stand_in: Way) -> Iterator[Way]:
         ),
     ):
         yield stand_in
-
-
-def with_graphs() -> Any:
-    """A context in which launches on the CPU are captured and replayed as graphs, as they are on a GPU."""
-    return mock.patch.object(work, "captures", lambda device: True)
 
 
 Way = TypeVar("Way", bound=StandIn)

@@ -190,27 +190,19 @@ def wedge(
 def cases() -> list[dict]:
     """Arguments of `buried_blade` of every run."""
     plane = [
-        {"friction_map": m, "rake": rake, "spacing": h} for h in SPACINGS for m in MAPS for rake in RAKES
-    ]
-    square = [
-        {"friction_map": m, "rake": rake, "spacing": h, "end": "square"}
+        {"friction_map": m, "rake": rake, "spacing": h, "end": end}
+        for end in ("level", "square")
         for h in SPACINGS
         for m in MAPS
-        for rake in RAKES[1:]
+        for rake in RAKES
+        if (end, rake) != ("square", 0.0)  # upright, both ends are level
     ]
-    wide = [
-        {"friction_map": m, "depth": depth, "spacing": h, "bin_width": bin_width}
+    bins = [(0.04, 0.02, 1.2), (0.06, 0.02, 1.2), *((0.08, h, w) for w in (1.2, 0.6) for h in (0.02, 0.01))]
+    return plane + [
+        {"friction_map": m, "depth": depth, "spacing": h, "bin_width": width}
         for m in MAPS
-        for depth, h, bin_width in (
-            (0.04, 0.02, 1.2),
-            (0.06, 0.02, 1.2),
-            (0.08, 0.02, 1.2),
-            (0.08, 0.01, 1.2),
-            (0.08, 0.02, 0.6),
-            (0.08, 0.01, 0.6),
-        )
+        for depth, h, width in bins
     ]
-    return plane + square + wide
 
 
 def measure() -> list[dict]:
@@ -237,32 +229,13 @@ def measure() -> list[dict]:
     return rows
 
 
-def draw(figure, rows: list[dict]) -> None:
-    axes = figure.subplots(1, 3, sharey=True)
-    for axis, (friction_map, end) in zip(
-        axes, (("sin", "level"), ("tan", "level"), ("tan", "square")), strict=True
-    ):
-        found = [
-            r
-            for r in rows
-            if (r["friction_map"], r["end"]) == (friction_map, end) and math.isinf(r["bin_width"])
-        ]
-        for spacing, marker in zip(SPACINGS, "sdo", strict=True):
-            points = [(r["rake"], r["draft"]) for r in found if r["spacing"] == spacing]
-            axis.plot(
-                *zip(*points, strict=True),
-                f"C0{marker}",
-                mfc="none",
-                label=f"solver, dx {1e3 * spacing:.1f} mm",
-            )
-        rakes = np.linspace(0.0, 35.0, 36)
-        angles = {round(found[0]["angle_own"], 2): "k-", round(ANGLE, 2): "k--"}
-        for angle, style in angles.items():
-            theory = [wedge(angle, rake, 0.08)[0] for rake in rakes]
-            axis.plot(rakes, theory, style, lw=1, label=f"McKyes, φ = {angle:.1f}°")
-        axis.set_title(f"μs = {friction_map} {ANGLE:.1f}°, {end} end", fontsize=10)
-        axis.set_xlabel("rake from vertical [°]")
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=7)
-    axes[0].set_ylim(0.0, None)
-    axes[0].set_ylabel("draft per width, 8 cm deep [N/m]")
+PLOT = {
+    "x": "rake",
+    "y": "draft",
+    "theory": "draft_own",
+    "curves": ["spacing"],
+    "panels": ["friction_map", "end"],
+    "where": {"bin_width": math.inf},
+    "xlabel": "rake from vertical [°]",
+    "ylabel": "draft per width, 8 cm deep [N/m]",
+}
