@@ -38,7 +38,6 @@ Row = dict[str, object]
 Job = Callable[[], object]
 MODES = 8
 BODY_POINTS = 15
-PARTICLES = 29_700
 NETWORKS = {
     "paper's size": ["model.body_nodes=points"],
     "default": [],
@@ -265,35 +264,6 @@ def time_training(
     return rows
 
 
-def time_with_basis(dynamics: LatentDynamics, device: str, rounds: int) -> Row:
-    """The paper's variant: particles to modes and back in every step, on `device`."""
-    dynamics = dynamics.to(device)
-    basis = torch.linalg.qr(torch.randn(PARTICLES, MODES))[0].to(device)
-    mean = torch.randn(PARTICLES, 3, device=device)
-    track = BodyTrack(*(part.to(device) for part in track_of(dynamics, 1, dynamics.history)))
-    stepper = dynamics.stepper(BODY_POINTS)
-    history = torch.randn(1, dynamics.history, MODES, 3, device=device).double()
-
-    def step() -> None:
-        following = stepper.advance(history, track).latent[0].float()
-        soil = basis @ following + mean
-        latent = basis.T @ (soil - mean)
-        if device == "cuda":
-            torch.cuda.synchronize()
-        assert latent.shape == (MODES, 3)
-
-    with torch.inference_mode():
-        seconds = best_by_the_clock({"": step}, 10 * rounds)[""]
-    dynamics.to("cpu")
-    return {
-        "part": "with PCA and inverse",
-        "network": "paper's size",
-        "what": f"one step, {device}",
-        "us": 1e6 * seconds,
-        "note": f"{PARTICLES} particles, wall clock, best round",
-    }
-
-
 def draw(rows: list[Row]) -> None:
     """Bars: forms of the step at the paper's size, training there, whole steps of the three networks."""
     figure, axes = plt.subplots(1, 3, figsize=(15, 3.8), layout="constrained")
@@ -337,9 +307,6 @@ def main() -> None:
         dynamics = dynamics_of(overrides)
         rows += told(time_step(name, dynamics, options.rounds))
         rows += told(time_rollouts(name, dynamics, max(2, options.rounds // 3)))
-        if name == "paper's size":
-            for device in ("cpu", *(["cuda"] if torch.cuda.is_available() else [])):
-                rows += told([time_with_basis(dynamics, device, options.rounds)])
         rows += told(time_training(name, dynamics, options.threads, cores, options.rounds))
     machine = f"{cpu_model()}, {len(cores)} of {os.cpu_count()} cores"
     write_rows(HERE / "table.csv", [{"threads": 1} | row | {"machine": machine} for row in rows])

@@ -31,18 +31,7 @@ PAPER = 30_000  # asked for; the lattice of the paper's bin at 13.3 mm has 29 70
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 NEWTON_SIZES = (1_000, 10_000)
 MISSING = "not measured"
-COLUMNS = (
-    "solver",
-    "what",
-    "particles",
-    "M_steps_per_s",
-    "min",
-    "max",
-    "s_per_simulated_s",
-    "repeats",
-    "version",
-    "machine",
-)
+COLUMNS = "solver what particles M_steps_per_s min max s_per_simulated_s repeats version machine".split()
 
 
 def child(python: str, script: str, *options: object) -> dict | None:
@@ -125,21 +114,17 @@ def main() -> None:
             frames = ["--core", options.core, "--frames", options.newton_frames]
             return child(options.newton_python, "newton_mpm.py", case(particles), *frames, *more)
 
-        bed = "bed at rest, constant friction"
+        bed, limited = "bed at rest, constant friction", "blade, at most {} iterations a step (its {})"
         compared = [
             ("mpm_warp", "blade, mu(I), contact, frames copied", lambda: mpm_warp(PAPER, "--blade")),
             ("mpm_warp", f"{bed}, frames copied", lambda: mpm_warp(PAPER)),
             ("Taichi MLS-MPM", f"{bed}, plain sums", lambda: taichi(PAPER)),
             ("Taichi MLS-MPM", f"{bed}, atomic sums", lambda: taichi(PAPER, "--atomic")),
             ("Taichi MLS-MPM", f"{bed}, SVD, plain sums", lambda: taichi(PAPER, "--law", "svd")),
+            ("Newton implicit MPM", limited.format(250, "default"), lambda: newton(PAPER)),
             (
                 "Newton implicit MPM",
-                "blade, at most 250 iterations a step (its default)",
-                lambda: newton(PAPER),
-            ),
-            (
-                "Newton implicit MPM",
-                "blade, at most 50 iterations a step (its examples)",
+                limited.format(50, "examples"),
                 lambda: newton(PAPER, "--iterations", 50),
             ),
         ]
@@ -160,10 +145,7 @@ def main() -> None:
     rows += grown
     write_rows(HERE / "table.csv", rows)
     for row in rows:
-        print(
-            *(row[key] for key in ("solver", "what", "particles", "M_steps_per_s", "s_per_simulated_s")),
-            sep="  ",
-        )
+        print(*(row[key] for key in (*COLUMNS[:4], "s_per_simulated_s")), sep="  ")
 
 
 if __name__ == "__main__":
