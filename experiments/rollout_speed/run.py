@@ -27,9 +27,7 @@ from torch import Tensor
 
 from sgns.evaluate.costs import cpu_model
 from sgns.model import algebra
-from sgns.model.algebra import GraphStepper, product
 from sgns.model.features import BodyTrack
-from sgns.model.network import EncodeProcessDecode
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
 
@@ -107,69 +105,6 @@ def onednn(allowed: bool) -> Iterator[None]:
         algebra._AVAILABLE = before
 
 
-def multiplications(network: EncodeProcessDecode, nodes: int, edges: int) -> int:
-    """Multiplications of one step that no rearrangement removes, for one message-passing step of two hidden layers.
-
-    Every layer between nonlinearities counts once: of the edges, the first and second hidden layer of their encoder,
-    then two layers of their update, the first of which holds the encoder's last; of the nodes, two of the encoder,
-    three blocks of the layers after it, the sum's, one of the update, two of the decoder and its output.
-    """
-    width = network.process[0].width
-    inputs, outputs = network.encode_nodes.first.in_features, network.decode.linears[-1].out_features
-    of_edges = edges * width * (network.encode_edges.first.in_features + 3 * width)
-    return of_edges + nodes * width * (inputs + width * (1 + 3 + 1 + 1 + 1 + 1) + outputs)
-
-
-def inputs_of(dynamics: LatentDynamics, batch: int) -> tuple[int, Tensor, Tensor, Tensor]:
-    """Number of body nodes, edges (2, E), and random features of nodes (B, V, ...) and edges (B, E, ...)."""
-    network, body = dynamics.network, 1 if dynamics.settings.body_nodes == "pose" else BODY_POINTS
-    edge_index = dynamics.edge_index(MODES, body, torch.device("cpu"))
-    nodes = torch.randn(batch, MODES + body, network.encode_nodes.first.in_features)
-    return (
-        body,
-        edge_index,
-        nodes,
-        torch.randn(batch, edge_index.shape[1], network.encode_edges.first.in_features),
-    )
-
-
-def time_step(name: str, dynamics: LatentDynamics, rounds: int) -> list[Row]:
-    """One step of the network, plain and as it is, beside dense products of as many multiplications."""
-    network = dynamics.network
-    body, edge_index, nodes, edges = inputs_of(dynamics, 1)
-    width, work = network.process[0].width, multiplications(network, MODES + body, edge_index.shape[1])
-    rows = round(work / width**2)
-    left, right, out = torch.randn(rows, width), torch.randn(width, width), torch.empty(rows, width)
-    stepper = GraphStepper(network, edge_index, MODES + body, body)
-
-    def plain() -> None:
-        with onednn(False):
-            network.plain(nodes, edges, edge_index)
-
-    jobs: dict[str, Job] = {"plain": plain, "oneDNN's products": lambda: stepper(nodes[0], edges[0])}
-    if body > 1:
-        jobs["edges within the body kept"] = lambda: stepper(nodes[0], edges[0], same_body=True)
-    jobs |= {
-        "one dense product, torch.mm": lambda: torch.mm(left, right, out=out),
-        "one dense product, oneDNN": lambda: product(left, right),
-    }
-    with torch.inference_mode():
-        found = in_turn(jobs, rounds, 20)
-    return [
-        {
-            "part": "network step",
-            "network": name,
-            "what": form,
-            "us": seconds * 1e6,
-            "times_faster_than_plain": found["plain"] / seconds,
-            "times_torch_mm": seconds / found["one dense product, torch.mm"],
-            "times_onednn_product": seconds / found["one dense product, oneDNN"],
-            "note": f"{2e-6 * work:.1f} MFLOP",
-        }
-        for form, seconds in found.items()
-    ]
-
-
 def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[Row]:
     """Whole steps with features, force and torque: advance, a path, a path whose body turns, paths side by side."""
     frames, d = 123, dynamics.history
@@ -226,7 +161,10 @@ def time_training(
     """Optimiser steps of the network, plain and as it is, with batches of 32: on one thread its processor time, the
     median; on more the wall clock, the best of the rounds."""
     network, batch = dynamics.network.requires_grad_(True), 32
-    _, edge_index, nodes, edges = inputs_of(dynamics, batch)
+    body = 1 if dynamics.settings.body_nodes == "pose" else BODY_POINTS
+    edge_index = dynamics.edge_index(MODES, body, torch.device("cpu"))
+    nodes = torch.randn(batch, MODES + body, network.encode_nodes.first.in_features)
+    edges = torch.randn(batch, edge_index.shape[1], network.encode_edges.first.in_features)
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4, fused=True)
 
     def trained(form: Callable[..., Tensor], fast_products: bool) -> None:
@@ -265,23 +203,20 @@ def time_training(
 
 
 def draw(rows: list[Row]) -> None:
-    """Bars: forms of the step at the paper's size, training there, whole steps of the three networks."""
-    figure, axes = plt.subplots(1, 3, figsize=(15, 3.8), layout="constrained")
+    """Bars: whole steps and training of the three networks, on one core."""
+    figure, axes = plt.subplots(1, 2, figsize=(12, 3.8), layout="constrained")
     panels = (
-        ("network step, paper's size, one core [µs]", "network step", "us", lambda r: r["network"] == "paper's size"),
-        ("training, paper's size, one thread [samples/s]", "training", "samples_per_s",
-         lambda r: r["network"] == "paper's size" and r["threads"] == 1),
-        ("whole step per path, one core [µs]", "rollout", "us", lambda r: True),
-    )  # fmt: skip
-    for axis, (title, part, key, chosen) in zip(axes, panels, strict=True):
-        shown = [row for row in rows if row["part"] == part and chosen(row)]
-        prefix = part == "rollout"
-        names = [f"{row['network']}: {row['what']}" if prefix else str(row["what"]) for row in shown]
-        values = [float(row[key]) for row in shown]
-        colours = ["0.5" if "dense" in n or "plain" in n else "C0" for n in names]
-        axis.bar_label(axis.barh(names, values, color=colours), fmt=" %.0f", fontsize=7)
+        ("rollout", "us", "whole step per path [µs]"),
+        ("training", "samples_per_s", "training [samples/s]"),
+    )
+    for axis, (part, key, title) in zip(axes, panels, strict=True):
+        shown = [row for row in rows if row["part"] == part and row.get("threads", 1) == 1]
+        names = [f"{row['network']}: {row['what']}" for row in shown]
+        colours = ["0.5" if "plain" in name else "C0" for name in names]
+        bars = axis.barh(names, [row[key] for row in shown], color=colours)
+        axis.bar_label(bars, fmt=" %.0f", fontsize=7)
         axis.set_title(title, fontsize=9)
-        axis.set_xlim(0, 1.2 * max(values))
+        axis.margins(x=0.2)
         axis.tick_params(labelsize=7)
         axis.invert_yaxis()
     figure.savefig(HERE / "bars.png", dpi=130)
@@ -305,7 +240,6 @@ def main() -> None:
     rows: list[Row] = []
     for name, overrides in NETWORKS.items():
         dynamics = dynamics_of(overrides)
-        rows += told(time_step(name, dynamics, options.rounds))
         rows += told(time_rollouts(name, dynamics, max(2, options.rounds // 3)))
         rows += told(time_training(name, dynamics, options.threads, cores, options.rounds))
     machine = f"{cpu_model()}, {len(cores)} of {os.cpu_count()} cores"
