@@ -2,8 +2,8 @@
 
     python experiments/reference/run.py [--only cut|wheel] [--workers 2]
 
-Every finished run is kept as a line of cut.csv or wheel.csv and is not made again; positions go to data/reference. The
-figures are drawn from the tables (`--draw` does nothing else).
+Every finished run is kept as a line of cut.csv or wheel.csv and is not made again. The figures are drawn from the
+tables (`--draw` does nothing else).
 """
 
 from __future__ import annotations
@@ -22,13 +22,11 @@ sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 import matplotlib.pyplot as plt
 import numpy as np
 from common import composed, read_rows, write_rows
-from scipy.spatial import cKDTree
 
 from mpm_warp import Effects, Solver
 from sgns.simulate.scene import scene_from_config
 
 HERE = Path(__file__).parent
-DATA = Path("data/reference")
 DX = {"20": 0.02, "13.3": 0.8 / 60, "10": 0.01, "6.7": 0.8 / 120}
 
 CUT = ["scene=excavation", "scene.depth=0.08", "scene.duration=2.0"]
@@ -89,7 +87,7 @@ def settings(kind: str) -> dict[str, list[str]]:
 
 
 def measure(kind: str, name: str, overrides: list[str]) -> dict[str, float | str]:
-    """One run; its forces [N], cost, and the file with its profile and displacements."""
+    """One run: its forces [N], sinkage and cost."""
     config = composed("simulate", *(CUT if kind == "cut" else WHEEL), *overrides)
     scene = scene_from_config(config)
     effects = Effects(rate_dependence=bool(config.effects.rate_dependence is not False), symmetry=True)
@@ -98,7 +96,6 @@ def measure(kind: str, name: str, overrides: list[str]) -> dict[str, float | str
     for frame in solver.frames():
         start = start if start is not None else time.process_time()
         frames.append((frame.force, frame.torque, frame.body_pose))
-        last = frame
     cost = (time.process_time() - start) / scene.duration
     force = np.array([f[0] for f in frames])[1:]
     half = len(force) // 2
@@ -126,54 +123,12 @@ def measure(kind: str, name: str, overrides: list[str]) -> dict[str, float | str
             "settled_sinkage_mm": 1e3 * sinkage[round(scene.settle * scene.frame_rate) - 1],
             "sinkage_mm": 1e3 * sinkage[driving].mean(),
         }
-    DATA.mkdir(parents=True, exist_ok=True)
-    surface, moved = on_common_points(scene, last.position)
-    np.savez_compressed(file_of(kind, name), force=force, surface=surface, moved=moved)
     return {k: round(float(v), 3) if isinstance(v, np.floating) else v for k, v in row.items()}
 
 
-def on_common_points(scene, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The final surface on columns of 2 cm, and displacements near points 2 cm apart, so that different beds compare.
-
-    The height of a column is that of its highest particle, half a particle spacing added.
-    """
-    start, volume = scene.filled
-    lx, ly, lz = scene.bed.size
-    columns = [np.arange(0.0, length - 1e-9, 0.02) for length in (lx, ly)]
-    shape = tuple(len(c) for c in columns)
-    index = [np.clip((position[:, axis] / 0.02).astype(int), 0, shape[axis] - 1) for axis in (0, 1)]
-    surface = np.full(shape, -lz)
-    np.maximum.at(surface, tuple(index), position[:, 2] + 0.5 * volume ** (1.0 / 3.0))
-    points = np.stack(
-        np.meshgrid(*[c + 0.01 for c in columns], np.arange(-lz + 0.01, 0.0, 0.02), indexing="ij"), axis=-1
-    ).reshape(-1, 3)
-    near = cKDTree(start).query(points, k=8)[1]
-    return surface, (position[near] - start[near]).mean(axis=1)
-
-
 def save(kind: str, rows: dict[str, dict]) -> None:
-    """The table in the order of the settings, with the distances from the finest run that is there."""
-    order = [name for name in settings(kind) if name in rows]
-    finest = max(order, key=lambda name: float(rows[name]["particles"]) * float(rows[name]["steps_per_s"]))
-    reference = np.load(file_of(kind, finest))
-    for name in order:
-        if not file_of(kind, name).exists():
-            continue  # an earlier sitting's, already measured
-        with np.load(file_of(kind, name)) as run:
-            rows[name] |= {
-                "surface_rms_mm": round(1e3 * rms(run["surface"] - reference["surface"]), 2),
-                "moved_rms_mm": round(1e3 * rms(run["moved"] - reference["moved"]), 2),
-                "reference": finest,
-            }
-    write_rows(HERE / f"{kind}.csv", [rows[name] for name in order], digits=6)
-
-
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def file_of(kind: str, name: str) -> Path:
-    return DATA / f"{kind}_{name.replace(' ', '_')}.npz"
+    """The table in the order of the settings."""
+    write_rows(HERE / f"{kind}.csv", [rows[name] for name in settings(kind) if name in rows], digits=6)
 
 
 def draw(kind: str, rows: dict[str, dict]) -> None:
