@@ -159,51 +159,33 @@ def largest(row: dict[str, str]) -> float:
 
 
 def draw(table: list[dict[str, str]], edge: list[dict[str, str]]) -> None:
+    """What effects cost; what they change; and that change against `auto`'s number. Filled: auto turns it on."""
     figure, (cost, change, sizes) = plt.subplots(1, 3, figsize=(15, 5), layout="constrained")
-    colours = {name: f"C{i}" for i, name in enumerate(SCENES)}
-    for k, name in enumerate(SCENES):
-        rows = {row["effect"]: row for row in table if row["scene"] == name}
-        at = np.arange(len(EFFECTS)) + 0.16 * (k - 2)
-        times = [float(rows[e]["time_ratio"] or "nan") for e in EFFECTS]
-        cost.barh(at, np.array(times) - 1.0, 0.15, left=1.0, color=colours[name], label=name)
-        for place, effect in zip(at, EFFECTS, strict=True):
-            value = max(largest(rows[effect]), 1e-7)
-            filled = colours[name] if rows[effect]["auto"] == "on" else "white"
-            change.plot(value, place, "o", color=colours[name], mfc=filled, ms=7)
+    for number, name in enumerate(SCENES):
+        colour = f"C{number}"
+
+        def style(row: dict[str, str], colour: str = colour) -> dict[str, str]:
+            return {"color": colour, "mfc": colour if row["auto"] == "on" else "white"}
+
+        for row in (row for row in table if row["scene"] == name):
+            place = EFFECTS.index(row["effect"]) + 0.16 * (number - 2)
+            ratio = float(row["time_ratio"] or "nan")
+            cost.barh(place, ratio - 1.0, 0.15, left=1.0, color=colour)
+            change.plot(max(largest(row), 1e-7), place, "o", **style(row))
+        for row in (row for row in edge if row["scene"] == name):
+            marker = "o" if row["effect"] == "rate_dependence" else "s"
+            sizes.plot(float(row["number_over_tolerance"]), largest(row), marker, **style(row))
+        sizes.plot([], [], "o", color=colour, label=name)
     for axis in (cost, change):
         axis.set_yticks(range(len(EFFECTS)), EFFECTS)
         axis.invert_yaxis()
-        axis.grid(alpha=0.3, axis="x")
-    cost.axvline(1.0, color="k", lw=1)
+        axis.axvline(1.0 if axis is cost else AIM, color="k", ls=":")
     cost.set(xlabel="processor time with the effect / without")
-    cost.legend(fontsize=8)
-    change.axvline(AIM, color="k", ls=":")
-    change.set(
-        xscale="log",
-        xlabel="change of force or displacement, the larger (1e-7: none)\nfilled: auto turns it on",
-    )
-    for row in edge:
-        marker = "o" if row["effect"] == "rate_dependence" else "s"
-        filled = colours[row["scene"]] if row["auto"] == "on" else "white"
-        sizes.plot(
-            float(row["number_over_tolerance"]),
-            largest(row),
-            marker,
-            color=colours[row["scene"]],
-            mfc=filled,
-            ms=7,
-        )
-    sizes.plot([], [], "o", color="0.4", label="rate_dependence")
-    sizes.plot([], [], "s", color="0.4", label="nonlocality")
+    change.set(xscale="log", xlabel="change of force or displacement, the larger (1e-7: none)")
     sizes.axvline(1.0, color="k", lw=1)
     sizes.axhline(AIM, color="k", ls=":", label=f"aim: {AIM:.0%}")
-    sizes.set(
-        xscale="log",
-        yscale="log",
-        xlabel="auto's number / its tolerance, grains of 0.1 to 5 mm",
-        ylabel="change of force or displacement, the larger",
-    )
-    sizes.grid(alpha=0.3)
+    sizes.set(xscale="log", yscale="log", ylabel="change of force or displacement, the larger")
+    sizes.set_xlabel("auto's number / its tolerance (squares: nonlocality)")
     sizes.legend(fontsize=8)
     figure.savefig(HERE / "effects.png", dpi=100)
 

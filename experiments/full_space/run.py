@@ -328,7 +328,7 @@ def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> d
     return {"trained_processor_s": taken, "trained_steps": steps} | found
 
 
-def solver(path: Path, name: str) -> dict[str, Any]:
+def solver(path: Path) -> dict[str, Any]:
     """Wall time of the solver, as its runs recorded it."""
     found = []
     for split in ("train", "validation", "test"):
@@ -351,34 +351,22 @@ def single_threaded() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
 
 
-def draw(rows: dict[str, dict[str, str]], file: Path) -> None:
+def draw(rows: list[dict[str, str]], file: Path) -> None:
     """Times, memory and errors side by side."""
     panels = {
         "training_s_per_step": f"training, batch {BATCH} [s/step]",
         "rollout_s_per_simulated_s": "rollout [s per simulated s]",
         "training_memory_MB": "memory of training [MB]",
+        "skill_frozen": "position skill, test runs",
+        "force_nrmse": "force NRMSE, test runs",
     }
-    figure, axes = plt.subplots(1, 4, figsize=(12, 2.6), layout="constrained", sharey=True)
-    names = list(rows)
-    colours = ["0.3" if n == "solver" else "C0" if n == SUBSPACE else "C1" for n in names]
-    for axis, (key, label) in zip(axes, panels.items(), strict=False):
-        values = [float(rows[n].get(key) or "nan") for n in names]
-        bars = axis.barh(names, values, color=colours)
-        axis.bar_label(
-            bars, ["" if np.isnan(v) else f" {v:.0f}" if v >= 100 else f" {v:.2g}" for v in values]
-        )
-        axis.set(xscale="log", xlabel=label)
-        low, high = np.nanmin(values), np.nanmax(values)
-        axis.set_xlim(low / 4, high * 30)
-    place = np.arange(len(names))
-    for shift, key, label in ((-0.2, "skill_frozen", "position skill"), (0.2, "force_nrmse", "force NRMSE")):
-        values = [float(rows[n].get(key) or "nan") for n in names]
-        bars = axes[3].barh(place + shift, values, 0.4, label=label, color="C2" if shift < 0 else "C3")
-        axes[3].bar_label(bars, ["" if np.isnan(v) else f" {v:.2f}" for v in values])
-    axes[3].axvline(0, color="0.2", lw=0.8)
-    axes[3].set(xlabel="test runs, after minutes of training")
-    axes[3].margins(x=0.25)
-    axes[3].legend(fontsize=7, loc="upper right")
+    figure, axes = plt.subplots(1, len(panels), figsize=(14, 2.6), layout="constrained", sharey=True)
+    for axis, (key, label) in zip(axes, panels.items(), strict=True):
+        values = [float(row.get(key) or "nan") for row in rows]
+        bars = axis.barh([row["case"] for row in rows], values)
+        axis.bar_label(bars, ["" if np.isnan(value) else f" {value:.2g}" for value in values])
+        axis.set(xlabel=label, xscale="linear" if key in ("skill_frozen", "force_nrmse") else "log")
+        axis.margins(x=0.3)
     axes[0].invert_yaxis()
     figure.savefig(file, dpi=130)
 
@@ -396,15 +384,13 @@ def main() -> None:
     # Freed blocks are kept for the next step: otherwise a third of the time goes into getting zeroed pages anew.
     os.environ |= {"MALLOC_MMAP_THRESHOLD_": "4294967296", "MALLOC_TRIM_THRESHOLD_": "17179869184"}
     rows: dict[str, dict[str, Any]] = {row["case"]: row for row in read_rows(options.table)}
-    order = ("solver", SUBSPACE, *FULL_SPACE)
-    for name in order:
+    for name in ("solver", SUBSPACE, *FULL_SPACE):
         if name not in rows:
-            cost = cost_subspace if name == SUBSPACE else cost_full_space
-            found = (
-                solver(options.data, name)
-                if name == "solver"
-                else in_fresh_process(cost, options.data, name, options.repeats)
-            )
+            if name == "solver":
+                found = solver(options.data)
+            else:
+                cost = cost_subspace if name == SUBSPACE else cost_full_space
+                found = in_fresh_process(cost, options.data, name, options.repeats)
             rows[name] = {"case": name, **found}
             write_rows(options.table, rows.values())
             print(rows[name], flush=True)
@@ -413,7 +399,7 @@ def main() -> None:
             rows[name] |= in_fresh_process(learn, options.data, name, options.minutes, options.runs)
             write_rows(options.table, rows.values())
             print(rows[name], flush=True)
-    draw({row["case"]: row for row in read_rows(options.table)}, HERE / "bars.png")
+    draw(read_rows(options.table), HERE / "bars.png")
 
 
 if __name__ == "__main__":

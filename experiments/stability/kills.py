@@ -31,7 +31,7 @@ import time
 import traceback
 import types
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -78,14 +78,10 @@ class Row:
 
     command: str
     kills: float = 0
-    """SIGKILLs that hit a running process; the next four add up to them."""
-    before_work: float = 0  # before the command had read its settings
-    at_work: float = 0  # between that and its end, without a half-written file
-    while_writing: float = 0  # with a hidden half of a file left
-    after_work: float = 0  # between the command's last word and the end of the process
-    at_a_write: float = 0  # of all these, at a call of `os.fsync` or `os.replace` and not by the clock
-    of_workers: float = 0  # of all these, a campaign's worker process was hit
-    with_results: float = 0  # of all these, some files of the result were complete
+    """SIGKILLs that hit a running process."""
+    while_writing: float = 0  # of them, with a hidden half of a file left
+    at_a_write: float = 0  # of them, at a call of `os.fsync` or `os.replace` and not by the clock
+    of_workers: float = 0  # of them, a campaign's worker process was hit
     corrupt: float = 0
     """Files under their final name that were not whole."""
     completed: float = 0
@@ -118,10 +114,11 @@ def main() -> int:
     torch.set_num_threads(1)
     for line in COMMANDS.values():  # here, so that no time of the commands goes into imports
         importlib.import_module(cli.COMMANDS[line.split()[0]].module)
-    done = {}
-    for known in read_rows(asked.table):
-        name = known.pop("command")
-        done[name] = Row(name, **{key: float(value) for key, value in known.items()})
+    numbers = [field.name for field in fields(Row)[1:]]
+    done = {
+        row["command"]: Row(row["command"], **{key: float(row[key]) for key in numbers})
+        for row in read_rows(asked.table)
+    }
     with tempfile.TemporaryDirectory(prefix="sgns_kills_") as name:
         bench = Bench(Path(name), asked.data)
         for command in asked.commands or COMMANDS:
@@ -166,7 +163,7 @@ class Bench:
 
     def killed(self, row: Row, folder: Path, chance: np.random.Generator) -> bool:
         """Begin the command and kill it; says whether it was hit, or complete before."""
-        given = self.given(row.command, folder)
+        self.give(row.command, folder)
         moments = self.writes[row.command] if row.command != "simulate" else 0
         if moments and chance.integers(2):
             begun = self.begin(row.command, folder, fatal=int(chance.integers(moments)))
@@ -183,36 +180,27 @@ class Bench:
         row.corrupt += len(wrong)
         for line in wrong:
             log.info("%s: %s", row.command, line)
-        if hit:
-            files = [path for path in folder.rglob("*") if path.is_file() and path not in given]
-            writing = any(path.suffix == ".partial" for path in files)
-            row.kills += 1
-            row.while_writing += writing
-            row.before_work += not writing and begun.stage == BEFORE
-            row.at_work += not writing and begun.stage == WORK
-            row.after_work += not writing and begun.stage == AFTER
-            row.with_results += any(path.suffix in READERS and path.name[0] != "." for path in files)
+        row.kills += hit
+        row.while_writing += hit and any(folder.rglob("*.partial"))
         return hit
 
     def undisturbed(self, command: str) -> Path:
         """Folder of the result of the undisturbed command."""
         folder = self.folder / command.replace(" ", "_")
         if command not in self.seconds:
-            self.given(command, folder)
+            self.give(command, folder)
             begun = self.begin(command, folder)
             begun.wait()
             self.seconds[command], self.writes[command] = begun.spent, begun.writes
         return folder
 
-    def given(self, command: str, folder: Path) -> set[Path]:
-        """Files that a command finds in its folder: the dataset, beside which the reduced runs go."""
+    def give(self, command: str, folder: Path) -> None:
+        """Put the dataset there, beside which the reduced runs go."""
         folder.mkdir(parents=True, exist_ok=True)
-        if "dataset.path={data}" not in COMMANDS[command] or command == "simulate":
-            return set()
-        source, data = self.data or self.undisturbed("simulate") / "data", folder / "data"
-        if not data.exists():
-            shutil.copytree(source, data)
-        return {data / path.relative_to(source) for path in source.rglob("*")}
+        if "dataset.path={data}" in COMMANDS[command] and command != "simulate":
+            source = self.data or self.undisturbed("simulate") / "data"
+            if not (folder / "data").exists():
+                shutil.copytree(source, folder / "data")
 
     def begin(self, command: str, folder: Path, fatal: int | None = None) -> Begun:
         """Begin a command with its result in `folder`; a checkpoint is that of the undisturbed training."""
@@ -223,10 +211,6 @@ class Bench:
         for name, place in places.items():
             arguments = [argument.replace(f"{{{name}}}", str(place)) for argument in arguments]
         return Begun(arguments, self.folder / "log.txt", fatal)
-
-
-BEFORE, WORK, AFTER = range(3)
-"""Stages of a command: settings are read; the command itself; its process ends."""
 
 
 class Begun:
@@ -245,20 +229,15 @@ class Begun:
         self.spent = 0.0
         """Processor time of them all [s]."""
         self.status: int | None = None
-        self._shared = np.frombuffer(mmap.mmap(-1, 16), np.int64)
+        self._shared = np.frombuffer(mmap.mmap(-1, 8), np.int64)
         self.pid = os.fork()
         if self.pid == 0:
             self._be(arguments, fatal)
 
     @property
-    def stage(self) -> int:
-        """The stage in which the command is, or ended."""
-        return int(self._shared[0])
-
-    @property
     def writes(self) -> int:
         """Moments at writes that have passed."""
-        return int(self._shared[1])
+        return int(self._shared[0])
 
     def _be(self, arguments: list[str], fatal: int | None) -> None:
         status = 1
@@ -270,8 +249,6 @@ class Begun:
             # So that worker processes begin as those of `python -m sgns` do, without this file and its imports.
             sys.modules["__main__"] = types.ModuleType("__main__")
             sys.modules["__main__"].__spec__ = importlib.util.find_spec("sgns.__main__")
-            module = importlib.import_module(cli.COMMANDS[arguments[0]].module)
-            module.main = self._staged(module.main)
             for name in ("fsync", "replace"):
                 setattr(os, name, self._counted(getattr(os, name), fatal))
             status = cli.main()
@@ -282,20 +259,11 @@ class Begun:
             sys.stderr.flush()
             os._exit(status)
 
-    def _staged(self, main: Callable[..., Any]) -> Callable[..., Any]:
-        def staged(*args: Any) -> Any:
-            self._shared[0] = WORK
-            result = main(*args)
-            self._shared[0] = AFTER
-            return result
-
-        return staged
-
     def _counted(self, write: Callable[..., Any], fatal: int | None) -> Callable[..., Any]:
         def moment() -> None:
             if self.writes == fatal:
                 os.kill(os.getpid(), signal.SIGKILL)
-            self._shared[1] += 1
+            self._shared[0] += 1
 
         def counted(*args: Any, **settings: Any) -> Any:
             moment()
