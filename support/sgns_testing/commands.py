@@ -28,6 +28,7 @@ __all__ = [
     "composed",
     "environment",
     "files",
+    "python",
     "refusal",
     "refused",
     "sgns",
@@ -107,6 +108,12 @@ def composed(*overrides: str, command: str = "simulate") -> DictConfig:
 def environment() -> dict[str, str]:
     """Of a process that finds this package, too."""
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+def python(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Another process that runs some code with these arguments."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment())
 
 
 def files(folder: Path) -> dict[str, bytes]:
