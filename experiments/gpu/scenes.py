@@ -28,9 +28,7 @@ from mpm_warp import (
 )
 from mpm_warp.bodies import Box, MeshBody
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
-from sgns_testing.scenes import cut
-
-__all__ = ["FARTHEST", "FORCE", "Case", "Outcome", "cases", "outcome"]
+from sgns_testing.scenes import UNDAMPED, cut
 
 FARTHEST, FORCE = 1e-4, 0.01
 """Ways to compute a case agree if no particle is farther off [m] and the forces differ by no larger share: what the
@@ -47,7 +45,6 @@ BEADS = Material(
     nonlocal_amplitude=0.48,
 )
 BED = Bed(size=(0.48, 0.4, 0.16), spacing=0.02, headroom=0.12)
-UNDAMPED = {"friction_angle": None, "damping": 0.0}  # wheels fall freely
 DYNAMIC = Effects(fluidity=True, nonlocality=True)
 
 

@@ -39,8 +39,6 @@ import warp as wp
 from mpm_warp import solver
 from mpm_warp.kernels import nonlocal_fluidity
 
-__all__ = ["Checked", "Report", "Threads", "compiler", "on_stand_in"]
-
 HERE = Path(__file__).resolve().parent
 MANY = 0xFFFFFFFF
 FLAGS = tuple("-std=c++17 -w -DNDEBUG -fPIC -shared -march=native -ffp-contract=fast -pthread".split())

@@ -18,7 +18,6 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 sys.path.insert(1, str(HERE.parents[2] / "support"))
 
-__all__ = ["AREAS", "Case", "Row", "cases"]
 
 AREAS = {
     "solver": ("corners", "steps", "soil", "tools", "laws"),

@@ -19,17 +19,6 @@ from sgns.simulator import Simulator
 from sgns.train.command import train
 from sgns_testing import tiny
 
-__all__ = [
-    "fresh_data",
-    "poisoned",
-    "quick_data",
-    "quick_network",
-    "simulator_of",
-    "synthetic_data",
-    "synthetic_network",
-    "train_synthetic",
-]
-
 ROOT = Path(__file__).resolve().parents[3]
 # Kept until the process ends.
 _FOLDER = tempfile.TemporaryDirectory(prefix="sgns-stability-")

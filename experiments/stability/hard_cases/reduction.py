@@ -22,8 +22,6 @@ from sgns_testing.tiny import REDUCTION, make_dataset
 
 from .measures import unsaid
 
-__all__ = ["MEASURES"]
-
 
 def soil(t: int = 40, n: int = 60, rank: int | None = None, offset: float = 0.0, seed: int = 0) -> np.ndarray:
     """A bed of 1 m whose particles move by 0.1 m in `rank` ways; (t, n, 3) [m]."""

@@ -25,8 +25,6 @@ from sgns.states import Rollout
 from .measures import unsaid
 from .networks import quick_data, quick_network, simulator_of, synthetic_data, synthetic_network
 
-__all__ = ["MEASURES"]
-
 Change = Callable[[np.ndarray], np.ndarray]
 
 

@@ -75,16 +75,11 @@ def turns_back() -> tuple[float, str]:
     return blade_shares(scene, frames_of(scene))
 
 
-def rests(seconds: float = 60.0) -> tuple[list, Excavation]:
-    """Down, 3 cm forward, then at rest."""
-    scene = driven([*down(), (0.5, 0.134, IN_SOIL)], 1.0 + seconds)
-    scene = replace(scene, bed=replace(scene.bed, spacing=0.04 / 1.5))
-    return frames_of(scene, every=60, effects=Effects(symmetry=True)), scene
-
-
 def creep() -> tuple[float, str]:
-    """Of the soil around a tool at rest, from 1 s to 60 s after it stopped [mm]."""
-    frames, _ = rests()
+    """Of the soil around a tool that goes down, 3 cm forward and rests: from 1 s to 60 s after it stopped [mm]."""
+    scene = driven([*down(), (0.5, 0.134, IN_SOIL)], 61.0)
+    scene = replace(scene, bed=replace(scene.bed, spacing=0.04 / 1.5))
+    frames = frames_of(scene, every=60, effects=Effects(symmetry=True))
     moved = np.linalg.norm(frames[-1].position - frames[2].position, axis=1)
     force = [float(np.linalg.norm(f.force)) for f in frames]
     words = (

@@ -26,8 +26,6 @@ from sgns.train.windows import TrainingWindows
 from .measures import unsaid
 from .networks import fresh_data, poisoned, synthetic_data, synthetic_network, train_synthetic
 
-__all__ = ["MEASURES"]
-
 
 @contextmanager
 def folder() -> Iterator[Path]:
