@@ -68,31 +68,21 @@ def track_of(dynamics: LatentDynamics, paths: int, frames: int, turning: bool = 
     )
 
 
-def in_turn(jobs: dict[str, Job], rounds: int, calls: int, warm: int = 2) -> dict[str, float]:
-    """Median processor time of a call [s], the jobs in turn; after some calls that warm the caches."""
+def in_turn(
+    jobs: dict[str, Job], rounds: int, calls: int, warm: int = 2, wall: bool = False
+) -> dict[str, float]:
+    """Time of a call [s], the jobs in turn: the median of processor times, or the shortest by the clock."""
+    now = time.perf_counter if wall else time.thread_time
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(rounds):
         for name, job in jobs.items():
             for _ in range(warm):
                 job()
             for _ in range(calls):
-                began = time.thread_time()
+                began = now()
                 job()
-                times[name].append(time.thread_time() - began)
-    return {name: statistics.median(values) for name, values in times.items()}
-
-
-def best_by_the_clock(jobs: dict[str, Job], rounds: int) -> dict[str, float]:
-    """Shortest time of a call [s], the jobs in turn."""
-    best = dict.fromkeys(jobs, float("inf"))
-    for _ in range(rounds):
-        for name, job in jobs.items():
-            job()
-            for _ in range(3):
-                began = time.perf_counter()
-                job()
-                best[name] = min(best[name], time.perf_counter() - began)
-    return best
+                times[name].append(now() - began)
+    return {name: min(values) if wall else statistics.median(values) for name, values in times.items()}
 
 
 @contextmanager
@@ -184,7 +174,7 @@ def time_training(
         if count == 1:
             found, clock = in_turn(jobs, rounds, 2, warm=1), "processor time, median"
         else:
-            found, clock = best_by_the_clock(jobs, rounds), "wall clock, best round"
+            found, clock = in_turn(jobs, rounds, 3, warm=1, wall=True), "wall clock, best round"
         rows += [
             {
                 "part": "training",
