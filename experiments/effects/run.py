@@ -2,9 +2,8 @@
 
     python experiments/effects/run.py
 
-Appends to table.csv (each effect), edge.csv (rate dependence and nonlocality for grains of several sizes) and
-friction.csv (what a little more friction does to the cut) beside this script; rows that are there are not made again.
-Then draws effects.png. About fifteen minutes on one core.
+Appends to table.csv (each effect) and edge.csv (rate dependence and nonlocality for grains of several sizes) beside
+this script; rows that are there are not made again. Then draws effects.png. About fifteen minutes on one core.
 """
 
 from __future__ import annotations
@@ -39,8 +38,6 @@ SCENES = {
 EFFECTS = ("yielding", "rate_dependence", "fluidity", "nonlocality", "separation", "symmetry", "torque")
 GRAINS = (1e-4, 3e-4, 5e-4, 7e-4, 1e-3, 2e-3, 5e-3)  # diameters for edge.csv [m]
 AIM = 0.03  # what auto leaves out should change force and displacement by less
-SHARES = (1e-6, 1e-4, 1e-3, 5e-3)  # of mu_s, added to it for friction.csv [-]
-DURATIONS = (0.75, 1.0, 1.5)  # of the cut in friction.csv [s]
 
 
 def make_scene(name: str, *more: str) -> Scene:
@@ -126,16 +123,6 @@ def at_the_edge(name: str, effect: str, grain: float) -> dict:
     }
 
 
-def with_more_friction(duration: float, share: float) -> dict:
-    """The cut without rate dependence, and with mu_s larger by `share`: how sharply it answers to friction."""
-    scene = make_scene("excavation", f"scene.duration={duration}")
-    material = scene.material
-    more = replace(material, static_friction=material.static_friction * (1.0 + share))
-    effects = replace(effects_for(scene)[0], rate_dependence=False, nonlocality=False)
-    one, two = (play(replace(scene, material=m), effects) for m in (material, more))
-    return {"duration": duration, "share": share, **changes(scene, one, two)}
-
-
 def resume(
     name: str, keys: tuple[str, ...], jobs: list[tuple], make: Callable[..., dict]
 ) -> list[dict[str, str]]:
@@ -201,8 +188,6 @@ def main() -> None:
         for grain in GRAINS
     ]
     edge = resume("edge", ("scene", "effect", "grain_diameter"), jobs, at_the_edge)
-    jobs = [(duration, share) for duration in DURATIONS for share in SHARES]
-    resume("friction", ("duration", "share"), jobs, with_more_friction)
     draw(table, edge)
 
 

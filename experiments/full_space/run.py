@@ -84,17 +84,8 @@ def fit_normalisation(
 ) -> Tensor:
     """Give the dynamics the statistics of windows spread evenly over the training runs.
 
-    All particles share one scale per axis: what a particle does must not depend on its number.
-
-    Args:
-        dynamics: Filled in place.
-        windows: The training windows.
-        noise: Deviation of the velocity noise as a share of the velocity's scale.
-        floor: Smallest scale as a share of the quantity's largest.
-        samples: How many windows to read.
-
-    Returns:
-        Deviation of the velocity noise [m], shape (3,).
+    All particles share one scale per axis: what a particle does must not depend on its number. `noise` is a share of the
+    velocity's scale, `floor` the smallest scale as a share of the largest. Returns the velocity noise [m], shape (3,).
     """
     chosen = torch.linspace(0, len(windows) - 1, min(samples, len(windows))).long().unique().tolist()
     read = [windows.window(index) for index in chosen]
@@ -114,16 +105,9 @@ def fit_normalisation(
 def train(
     dynamics: FullSpaceDynamics, windows: FullSpaceWindows, settings: TrainingSettings, noise_scale: Tensor
 ) -> list[tuple[float, float]]:
-    """Optimise for `settings.max_steps` steps with AdamW, the schedule and the clipping of `settings`.
+    """Optimise as the latent dynamics, without torque and validation; `noise_scale` is that of `fit_normalisation`.
 
-    Args:
-        dynamics: With its statistics; trained in place.
-        windows: To draw from.
-        settings: As for the latent dynamics; there is no torque here and no validation on the way.
-        noise_scale: Of the history's noise [m], shape (3,), as `fit_normalisation` returns it.
-
-    Returns:
-        Losses of acceleration and force of every step [1].
+    Returns the losses of acceleration and force of every step [1].
     """
     optimiser = torch.optim.AdamW(
         dynamics.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
