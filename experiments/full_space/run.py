@@ -84,8 +84,8 @@ def fit_normalisation(
 ) -> Tensor:
     """Give the dynamics the statistics of windows spread evenly over the training runs.
 
-    All particles share one scale per axis: what a particle does must not depend on its number. `noise` is a share of the
-    velocity's scale, `floor` the smallest scale as a share of the largest. Returns the velocity noise [m], shape (3,).
+    All particles share one scale per axis: what a particle does must not depend on its number. `noise` is a share of
+    the velocity's scale, `floor` the least scale as a share of the largest. Returns the velocity noise [m], shape (3,).
     """
     chosen = torch.linspace(0, len(windows) - 1, min(samples, len(windows))).long().unique().tolist()
     read = [windows.window(index) for index in chosen]
