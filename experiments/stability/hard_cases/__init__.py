@@ -16,7 +16,7 @@ from importlib import import_module
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(1, str(HERE.parents[2] / "support"))
+sys.path[1:1] = [str(HERE.parents[1]), str(HERE.parents[2] / "support")]
 
 
 AREAS = {
