@@ -23,7 +23,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -59,11 +58,6 @@ class Report:
     """What the check found in all launches of one kernel."""
 
     kernel: str
-    variants: int = 0
-    """Of the kernel, compiled for other physics, bodies, walls or numbers."""
-    launches: int = 0
-    items: int = 0
-    accesses: int = 0
     conflicts: int = 0
     """Places of four bytes, counted in every launch."""
     outside: int = 0
@@ -72,7 +66,7 @@ class Report:
     """The first conflict or access outside, in words."""
 
 
-class StandIn(ABC):
+class StandIn:
     """A way to run a kernel's items.
 
     Args:
@@ -94,9 +88,9 @@ class StandIn(ABC):
         command.hooks = SimpleNamespace(forward=forward)
         return command
 
-    @abstractmethod
     def run(self, kernel: wp.Kernel, built: ctypes.CDLL, bounds: Any, arguments: ctypes.Structure) -> None:
         """Run one launch."""
+        raise NotImplementedError
 
 
 class Threads(StandIn):
@@ -134,7 +128,6 @@ class Checked(StandIn):
     def __init__(self, atomic: bool = True) -> None:
         super().__init__(atomic)
         self._reports: dict[str, Report] = {}
-        self._met: set[str] = set()
 
     def reports(self) -> list[Report]:
         """One for each kernel, by name."""
@@ -158,11 +151,6 @@ class Checked(StandIn):
 
         name = kernel.key.split("__")[-1]
         report = self._reports.setdefault(name, Report(name))
-        report.variants += built._name not in self._met
-        self._met.add(built._name)
-        report.launches += 1
-        report.items += int(bounds.size)
-        report.accesses += found.accesses
         report.conflicts += found.conflicts
         report.outside += found.outside
         if not report.first and found.conflicts:
