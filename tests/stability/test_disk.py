@@ -15,13 +15,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from kills import broken, same
 
+from sgns.config import UserError
 from sgns.data.files import whole_file, write_whole
 from sgns.evaluate.figures import read_log
+from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import reduce_dataset
 from sgns.train.command import train
 from sgns_testing.commands import REDUCED, SMALL, TRAIN, call, files, python, refused, small_dataset
@@ -29,14 +32,6 @@ from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset, reduced
 
 resource = pytest.importorskip("resource", reason="needs limits on a process")
 
-LIMITED = """
-import resource, sys
-limit = int(sys.argv.pop(1))
-import sgns.cli, sgns.simulate.command, sgns.train.command, sgns.rollout, sgns.reduction.command
-sys.argv[0] = "sgns"
-resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-sys.exit(sgns.cli.main())
-"""
 NETWORK = [*TRAIN, "training.max_steps=20", "training.validate_every=10"]
 POLYNOMIAL = [
     *(*REDUCED, "training.threads=1", "model=polynomial"),
@@ -45,22 +40,34 @@ POLYNOMIAL = [
 CAMPAIGN = ["dataset=quick", "dataset.draw=[{rake:[0.0,10.0,20.0]}]", "dataset.runs=3", *SMALL]
 
 
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """No file can be larger than `size` bytes meanwhile."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
 def limited(limit: int, *arguments: str) -> str:
     """The line with which a command ends when no file can be larger than `limit` bytes."""
-    done = python(LIMITED, limit, *arguments)
-    assert done.returncode == 2, (done.returncode, done.stdout, done.stderr)
+    with largest_file(limit):
+        done = call(*arguments)
+    assert done.returncode == 2, done
     assert "Traceback" not in done.stderr and "Logging error" not in done.stderr, done.stderr
     return done.stderr.splitlines()[-1]
 
 
-def test_simulate(tmp_path) -> None:
+def test_simulate(tmp_path, empty_folder) -> None:
     (tmp_path / "run.h5").write_bytes(b"earlier")
     line = limited(20_000, "simulate", *SMALL, f"output={tmp_path / 'run.h5'}")
     assert "cannot write" in line and "File too large" in line
     assert files(tmp_path) == {"run.h5": b"earlier"}
 
 
-def test_a_campaign(tmp_path) -> None:
+def test_a_campaign(tmp_path, empty_folder) -> None:
     arguments = ["simulate", f"dataset.path={tmp_path / 'a'}", *CAMPAIGN]
     assert "3 of 3 runs could not be made" in limited(20_000, *arguments)
     assert broken(tmp_path) == [] and [p.name for p in (tmp_path / "a").iterdir()] == ["dataset.yaml", "runs"]
@@ -68,7 +75,7 @@ def test_a_campaign(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("limit", [0, 15_000])
-def test_reduce_and_train(tmp_path, limit) -> None:
+def test_reduce_and_train(tmp_path, limit, empty_folder) -> None:
     make_dataset(tmp_path / "data")
     before = files(tmp_path)
     limited(limit, "train", f"dataset.path={tmp_path / 'data'}", *NETWORK, f"output={tmp_path / 'out'}")
@@ -187,13 +194,9 @@ def test_hidden_files_of_a_killed_process_do_not_stay(collected, tmp_path) -> No
 
 def test_a_disk_that_is_full_for_the_basis_leaves_the_earlier_one(tmp_path) -> None:
     folder = reduced(tmp_path).folder
-    before = files(folder)
-    code = "import resource, sys, torch; from sgns.reduction import Basis\n"
-    code += "from sgns.config import UserError\nbasis = Basis.load(sys.argv[1])\n"
-    code += "resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))\n"
-    code += "try: basis.save(sys.argv[1])\nexcept UserError as error: sys.exit(str(error))"
-    done = python(code, folder / "basis.h5")
-    assert done.returncode == 1 and "cannot write" in done.stderr and "Traceback" not in done.stderr
+    before, basis = files(folder), Basis.load(folder / "basis.h5")
+    with largest_file(2000), pytest.raises(UserError, match="cannot write"):
+        basis.save(folder / "basis.h5")
     assert files(folder) == before
 
 
