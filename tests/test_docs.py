@@ -14,13 +14,12 @@ from typing import Any
 
 import pytest
 import yaml
-from hydra import compose, initialize_config_module
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import mpm_warp
 from sgns.cli import COMMANDS
 from sgns.train.command import train
+from sgns_testing.commands import composed
 from sgns_testing.runs import make_run
 from sgns_testing.tiny import MODEL, TRAINING, reduced
 
@@ -88,16 +87,9 @@ def assert_composes(command: str) -> None:
         return
     assert name in COMMANDS, command
     try:
-        compose(name, overrides)
+        composed(*overrides, command=name)
     except Exception as error:
         raise AssertionError(f"{command}: {error}") from error
-
-
-@pytest.fixture
-def hydra() -> Iterator[None]:
-    GlobalHydra.instance().clear()
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -157,14 +149,12 @@ def test_few_blocks_are_not_run() -> None:
     assert sum(reason is not None for page in PAGES for _, reason in blocks(page, "python")) <= 3
 
 
-@pytest.mark.usefixtures("hydra")
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_commands_on_the_pages_have_these_keys(page: Path) -> None:
     for command in dict.fromkeys(commands_of(page.read_text(encoding="utf-8"))):
         assert_composes(command)
 
 
-@pytest.mark.usefixtures("hydra")
 def test_commands_in_help_and_comments_have_these_keys() -> None:
     shown = []
     for file in sorted((ROOT / "conf").rglob("*.yaml")):
@@ -179,7 +169,7 @@ def test_commands_in_help_and_comments_have_these_keys() -> None:
             assert_composes(command)
 
 
-def test_a_wrong_key_on_a_page_is_found(hydra: None) -> None:
+def test_a_wrong_key_on_a_page_is_found() -> None:
     with pytest.raises(AssertionError, match="scene\\.deep"):
         assert_composes("sgns simulate scene.deep=0.1")
     assert parse("sgns train -m seed=0,1 'shard=range(2,5)' hydra/launcher=joblib") == (

@@ -2,39 +2,34 @@
 
     python experiments/effects/run.py
 
-Appends to table.csv (each effect), edge.csv (rate dependence and nonlocality for grains of several sizes) and
-friction.csv (what a little more friction does to the cut) beside this script; rows that are there are not made again.
-Then draws effects.png. About fifteen minutes on one core.
+Appends to table.csv (each effect) and edge.csv (rate dependence and nonlocality for grains of several sizes) beside
+this script; rows that are there are not made again. Then draws effects.png. About fifteen minutes on one core.
 """
 
 from __future__ import annotations
 
-import csv
 import logging
 import math
 import statistics
+import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+import matplotlib.pyplot as plt
 import numpy as np
-from hydra import compose, initialize_config_module
+from common import read_rows, scene_of, write_rows
 
 from mpm_warp import Decision, Effects, Scene, Solver, Tolerances, asymmetry, effects_for
-from sgns.simulate.scene import scene_from_config
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
 REPEATS = 3
 SCENES = {
-    "excavation": [
-        "scene=quick_excavation",
-        "scene.duration=1.0",
-        "scene.bed.headroom=0.5",
-    ],  # elastic soil flies
+    # Elastic soil flies.
+    "excavation": ["scene=quick_excavation", "scene.duration=1.0", "scene.bed.headroom=0.5"],
     "wheel": ["scene=quick_wheel", "scene.duration=1.0"],
     "column": ["scene=column", "scene.duration=0.4"],
     "incline": ["scene=incline", "scene.duration=0.4"],
@@ -43,13 +38,10 @@ SCENES = {
 EFFECTS = ("yielding", "rate_dependence", "fluidity", "nonlocality", "separation", "symmetry", "torque")
 GRAINS = (1e-4, 3e-4, 5e-4, 7e-4, 1e-3, 2e-3, 5e-3)  # diameters for edge.csv [m]
 AIM = 0.03  # what auto leaves out should change force and displacement by less
-SHARES = (1e-6, 1e-4, 1e-3, 5e-3)  # of mu_s, added to it for friction.csv [-]
-DURATIONS = (0.75, 1.0, 1.5)  # of the cut in friction.csv [s]
 
 
 def make_scene(name: str, *more: str) -> Scene:
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        return scene_from_config(compose("simulate", [*SCENES[name], *more]))
+    return scene_of(*SCENES[name], *more)[0]
 
 
 def pair(chosen: Effects, effect: str) -> tuple[Effects, Effects]:
@@ -131,49 +123,18 @@ def at_the_edge(name: str, effect: str, grain: float) -> dict:
     }
 
 
-def with_more_friction(duration: float, share: float) -> dict:
-    """The cut without rate dependence, and with mu_s larger by `share`: how sharply it answers to friction."""
-    scene = make_scene("excavation", f"scene.duration={duration}")
-    material = scene.material
-    more = replace(material, static_friction=material.static_friction * (1.0 + share))
-    effects = replace(effects_for(scene)[0], rate_dependence=False, nonlocality=False)
-    one, two = (play(replace(scene, material=m), effects) for m in (material, more))
-    return {"duration": duration, "share": share, **changes(scene, one, two)}
-
-
-def as_written(value: float | str) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
 def resume(
-    file: Path, keys: tuple[str, ...], names: tuple[str, ...], jobs: list[tuple], make
+    name: str, keys: tuple[str, ...], jobs: list[tuple], make: Callable[..., dict]
 ) -> list[dict[str, str]]:
-    """Rows of `file`, with the columns `names`, made where they are missing and written one by one."""
-    rows = list(csv.DictReader(file.open(newline=""))) if file.exists() else []
-    done = {tuple(row[key] for key in keys) for row in rows}
+    """Rows of the table `name`, made where they are missing; the file is complete after every one."""
+    file = HERE / f"{name}.csv"
+    done = {tuple(row[key] for key in keys) for row in read_rows(file)}
     for job in jobs:
-        if tuple(as_written(part) for part in job) in done:
-            continue
-        row = {key: value if value is None else as_written(value) for key, value in make(*job).items()}
-        logging.info("%s", {key: value for key, value in row.items() if value is not None})
-        new = not file.exists()
-        with file.open("a", newline="") as stream:
-            writer = csv.DictWriter(stream, names, extrasaction="ignore", restval="")
-            if new:
-                writer.writeheader()
-            writer.writerow(row)
-    return list(csv.DictReader(file.open(newline="")))
-
-
-TABLE = (
-    "scene", "effect", "auto", "number", "time_ratio", "force_change", "displacement_change", "seconds_off",
-    "seconds_on",
-)  # fmt: skip
-EDGE = (
-    "scene", "effect", "grain_diameter", "auto", "tolerance", "number", "number_over_tolerance", "force_change",
-    "displacement_change",
-)  # fmt: skip
-FRICTION = ("duration", "share", "force_change", "displacement_change")
+        if tuple(f"{part:.4g}" if isinstance(part, float) else part for part in job) not in done:
+            row = make(*job)
+            logging.info("%s", row)
+            write_rows(file, [*read_rows(file), row])
+    return read_rows(file)
 
 
 def largest(row: dict[str, str]) -> float:
@@ -185,51 +146,33 @@ def largest(row: dict[str, str]) -> float:
 
 
 def draw(table: list[dict[str, str]], edge: list[dict[str, str]]) -> None:
+    """What effects cost; what they change; and that change against `auto`'s number. Filled: auto turns it on."""
     figure, (cost, change, sizes) = plt.subplots(1, 3, figsize=(15, 5), layout="constrained")
-    colours = {name: f"C{i}" for i, name in enumerate(SCENES)}
-    for k, name in enumerate(SCENES):
-        rows = {row["effect"]: row for row in table if row["scene"] == name}
-        at = np.arange(len(EFFECTS)) + 0.16 * (k - 2)
-        times = [float(rows[e]["time_ratio"] or "nan") for e in EFFECTS]
-        cost.barh(at, np.array(times) - 1.0, 0.15, left=1.0, color=colours[name], label=name)
-        for place, effect in zip(at, EFFECTS, strict=True):
-            value = max(largest(rows[effect]), 1e-7)
-            filled = colours[name] if rows[effect]["auto"] == "on" else "white"
-            change.plot(value, place, "o", color=colours[name], mfc=filled, ms=7)
+    for number, name in enumerate(SCENES):
+        colour = f"C{number}"
+
+        def style(row: dict[str, str], colour: str = colour) -> dict[str, str]:
+            return {"color": colour, "mfc": colour if row["auto"] == "on" else "white"}
+
+        for row in (row for row in table if row["scene"] == name):
+            place = EFFECTS.index(row["effect"]) + 0.16 * (number - 2)
+            ratio = float(row["time_ratio"] or "nan")
+            cost.barh(place, ratio - 1.0, 0.15, left=1.0, color=colour)
+            change.plot(max(largest(row), 1e-7), place, "o", **style(row))
+        for row in (row for row in edge if row["scene"] == name):
+            marker = "o" if row["effect"] == "rate_dependence" else "s"
+            sizes.plot(float(row["number_over_tolerance"]), largest(row), marker, **style(row))
+        sizes.plot([], [], "o", color=colour, label=name)
     for axis in (cost, change):
         axis.set_yticks(range(len(EFFECTS)), EFFECTS)
         axis.invert_yaxis()
-        axis.grid(alpha=0.3, axis="x")
-    cost.axvline(1.0, color="k", lw=1)
+        axis.axvline(1.0 if axis is cost else AIM, color="k", ls=":")
     cost.set(xlabel="processor time with the effect / without")
-    cost.legend(fontsize=8)
-    change.axvline(AIM, color="k", ls=":")
-    change.set(
-        xscale="log",
-        xlabel="change of force or displacement, the larger (1e-7: none)\nfilled: auto turns it on",
-    )
-    for row in edge:
-        marker = "o" if row["effect"] == "rate_dependence" else "s"
-        filled = colours[row["scene"]] if row["auto"] == "on" else "white"
-        sizes.plot(
-            float(row["number_over_tolerance"]),
-            largest(row),
-            marker,
-            color=colours[row["scene"]],
-            mfc=filled,
-            ms=7,
-        )
-    sizes.plot([], [], "o", color="0.4", label="rate_dependence")
-    sizes.plot([], [], "s", color="0.4", label="nonlocality")
+    change.set(xscale="log", xlabel="change of force or displacement, the larger (1e-7: none)")
     sizes.axvline(1.0, color="k", lw=1)
     sizes.axhline(AIM, color="k", ls=":", label=f"aim: {AIM:.0%}")
-    sizes.set(
-        xscale="log",
-        yscale="log",
-        xlabel="auto's number / its tolerance, grains of 0.1 to 5 mm",
-        ylabel="change of force or displacement, the larger",
-    )
-    sizes.grid(alpha=0.3)
+    sizes.set(xscale="log", yscale="log", ylabel="change of force or displacement, the larger")
+    sizes.set_xlabel("auto's number / its tolerance (squares: nonlocality)")
     sizes.legend(fontsize=8)
     figure.savefig(HERE / "effects.png", dpi=100)
 
@@ -237,16 +180,14 @@ def draw(table: list[dict[str, str]], edge: list[dict[str, str]]) -> None:
 def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     jobs = [(name, effect) for name in SCENES for effect in EFFECTS]
-    table = resume(HERE / "table.csv", ("scene", "effect"), TABLE, jobs, each_effect)
+    table = resume("table", ("scene", "effect"), jobs, each_effect)
     jobs = [
         (name, effect, grain)
         for name in ("excavation", "wheel", "column", "incline")
         for effect in ("rate_dependence", "nonlocality")
         for grain in GRAINS
     ]
-    edge = resume(HERE / "edge.csv", ("scene", "effect", "grain_diameter"), EDGE, jobs, at_the_edge)
-    jobs = [(duration, share) for duration in DURATIONS for share in SHARES]
-    resume(HERE / "friction.csv", ("duration", "share"), FRICTION, jobs, with_more_friction)
+    edge = resume("edge", ("scene", "effect", "grain_diameter"), jobs, at_the_edge)
     draw(table, edge)
 
 

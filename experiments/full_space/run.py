@@ -11,11 +11,11 @@ beside this script, and a line that is there is not made again; bars.png is draw
 from __future__ import annotations
 
 import argparse
-import csv
 import logging
 import multiprocessing
 import os
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -23,15 +23,17 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from common import read_rows, training_settings, write_rows
 from torch import Tensor
 
 from sgns.data.dataset import Dataset
 from sgns.data.run import Run
+from sgns.evaluate.costs import forget_peak, peak_memory
 from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
 from sgns.evaluate.metrics import VectorErrors, mean_prediction, skill
 from sgns.model.features import BodyTrack
@@ -41,9 +43,6 @@ from sgns.settings import ModelSettings, TrainingSettings
 from sgns.simulator import Simulator
 from sgns.train.command import train as train_subspace
 from sgns.train.lightning_module import SurrogateTraining, prepared
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
 SPACING = 0.015  # of the particles of dataset=quick, and the largest of the body nodes [m]
@@ -63,8 +62,7 @@ FULL_SPACE_TRAINING = {"batch_size": 1, "noise": 0.5, "learning_rate": 2e-3, "wa
 
 def settings(path: Path, model: dict[str, Any] | None = None, **training: Any) -> dict[str, Any]:
     """`conf/train` as plain values, with changes."""
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        plain = OmegaConf.to_container(compose("train", [f"dataset.path={path}"]), resolve=False)
+    plain = training_settings(f"dataset.path={path}")
     plain["model"] |= model or {}
     plain["training"] |= {"threads": 1} | training
     return plain
@@ -86,17 +84,8 @@ def fit_normalisation(
 ) -> Tensor:
     """Give the dynamics the statistics of windows spread evenly over the training runs.
 
-    All particles share one scale per axis: what a particle does must not depend on its number.
-
-    Args:
-        dynamics: Filled in place.
-        windows: The training windows.
-        noise: Deviation of the velocity noise as a share of the velocity's scale.
-        floor: Smallest scale as a share of the quantity's largest.
-        samples: How many windows to read.
-
-    Returns:
-        Deviation of the velocity noise [m], shape (3,).
+    All particles share one scale per axis: what a particle does must not depend on its number. `noise` is a share of
+    the velocity's scale, `floor` the least scale as a share of the largest. Returns the velocity noise [m], shape (3,).
     """
     chosen = torch.linspace(0, len(windows) - 1, min(samples, len(windows))).long().unique().tolist()
     read = [windows.window(index) for index in chosen]
@@ -116,16 +105,9 @@ def fit_normalisation(
 def train(
     dynamics: FullSpaceDynamics, windows: FullSpaceWindows, settings: TrainingSettings, noise_scale: Tensor
 ) -> list[tuple[float, float]]:
-    """Optimise for `settings.max_steps` steps with AdamW, the schedule and the clipping of `settings`.
+    """Optimise as the latent dynamics, without torque and validation; `noise_scale` is that of `fit_normalisation`.
 
-    Args:
-        dynamics: With its statistics; trained in place.
-        windows: To draw from.
-        settings: As for the latent dynamics; there is no torque here and no validation on the way.
-        noise_scale: Of the history's noise [m], shape (3,), as `fit_normalisation` returns it.
-
-    Returns:
-        Losses of acceleration and force of every step [1].
+    Returns the losses of acceleration and force of every step [1].
     """
     optimiser = torch.optim.AdamW(
         dynamics.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
@@ -182,34 +164,23 @@ def timed(action: Callable[[], object], repeats: int) -> list[float]:
     return found
 
 
-def resident(peak: bool) -> float:
-    """Memory of this process now, or the most since `forget_peak` [MB]."""
-    key = "VmHWM:" if peak else "VmRSS:"
-    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith(key))
-    return float(line.split()[1]) / 1024
-
-
-def forget_peak() -> None:
-    Path("/proc/self/clear_refs").write_text("5")
-
-
 def rates(
     step: Callable[[], object], frame: Callable[[], object], frame_rate: float, repeats: int, parameters: int
 ) -> dict[str, Any]:
     """Cost of rolling out frames and of training steps; memory is the most that each adds to the process."""
-    before = resident(peak=False)
     forget_peak()
+    before = peak_memory()
     # Not inference_mode: the subspace network keeps its edges, and those made there cannot be trained with.
     with torch.no_grad():
         frames = timed(frame, repeats)
-    rolled = resident(peak=True)
+    rolled = peak_memory()
     steps = timed(step, repeats)
     return {
         "parameters": parameters,
         "training_s_per_step": statistics.median(steps),
-        "training_memory_MB": resident(peak=True) - before,
+        "training_memory_MB": (peak_memory() - before) / 2**20,
         "rollout_s_per_simulated_s": statistics.median(frames) * frame_rate,
-        "rollout_memory_MB": rolled - before,
+        "rollout_memory_MB": (rolled - before) / 2**20,
         "repeats": repeats,
     }
 
@@ -261,21 +232,14 @@ def cost_subspace(path: Path, name: str, repeats: int) -> dict[str, Any]:
 
 
 def errors(
-    paths: list[Path],
-    training_paths: list[Path],
-    predict: Callable[[Path], tuple[np.ndarray, np.ndarray]],
-    d: int,
+    path: Path, count: int | None, predict: Callable[[Path], tuple[np.ndarray, np.ndarray]], d: int
 ) -> dict[str, float]:
-    """Skill and force NRMSE over runs, the first d frames given, beside the baselines.
+    """Skill and force NRMSE over the first `count` test runs of a dataset, d frames given, beside the baselines.
 
-    Args:
-        paths: runs to predict.
-        training_paths: runs whose mean force is a baseline.
-        predict: positions [m] (T, n, 3) and force [N] (T, 3) of a run.
-        d: frames given.
+    `predict` gives positions [m] (T, n, 3) and force [N] (T, 3) of a run.
     """
-    forces = []
-    for file in training_paths:
+    forces, paths = [], Dataset.open(path).runs("test")[:count]
+    for file in Dataset.open(path).runs("train"):
         with Run(file) as run:
             forces.append(run.force)
     mean = mean_prediction(forces, d)
@@ -297,6 +261,7 @@ def errors(
         force.append(VectorErrors.compare(true_force[d:], predicted[d:]))
         constant.append(VectorErrors.compare(true_force[d:], mean))
     return {
+        "test_runs": len(paths),
         "position_rmse_mm": 1e3 * float(np.sqrt(np.mean(mse["total"]))),
         "frozen_rmse_mm": 1e3 * float(np.sqrt(np.mean(mse["frozen"]))),
         "skill_frozen": skill(mse["total"], mse["frozen"]),
@@ -311,19 +276,14 @@ def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) ->
     plain = settings(path, FULL_SPACE[name], **FULL_SPACE_TRAINING)
     dynamics, training_runs = full_space(path, plain["model"], "train")
     windows = FullSpaceWindows(training_runs, dynamics.history)
-    noise_scale = fit_normalisation(
-        dynamics, windows, plain["training"]["noise"], plain["training"]["normalisation_floor"]
-    )
-    short = TrainingSettings.from_dict(
-        plain["training"]
-        | {"max_steps": 4, "warmup_steps": 0, "learning_rate": 1e-8, "final_learning_rate": 1e-8}
-    )
+    given = plain["training"]
+    noise_scale = fit_normalisation(dynamics, windows, given["noise"], given["normalisation_floor"])
+    slow = {"max_steps": 4, "warmup_steps": 0, "learning_rate": 1e-8, "final_learning_rate": 1e-8}
+    short = TrainingSettings.from_dict(given | slow)
     per_step = statistics.median(timed(lambda: train(dynamics, windows, short, noise_scale), 1)) / 4
     steps = max(1, round(60 * minutes / per_step))
     began = time.process_time()
-    record = train(
-        dynamics, windows, TrainingSettings.from_dict(plain["training"] | {"max_steps": steps}), noise_scale
-    )
+    record = train(dynamics, windows, TrainingSettings.from_dict(given | {"max_steps": steps}), noise_scale)
     taken = time.process_time() - began
     last = max(1, steps // 10)
     logging.warning(
@@ -340,13 +300,8 @@ def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) ->
             positions, force = unroll(dynamics, run.soil(slice(0, dynamics.history))[None], body)
         return positions[0].numpy(), force[0].numpy()
 
-    dataset = Dataset.open(path)
-    found = errors(dataset.runs("test")[:runs], dataset.runs("train"), predict, dynamics.history)
-    return {
-        "trained_processor_s": taken,
-        "trained_steps": steps,
-        "test_runs": len(dataset.runs("test")[:runs]),
-    } | found
+    found = errors(path, runs, predict, dynamics.history)
+    return {"trained_processor_s": taken, "trained_steps": steps} | found
 
 
 def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
@@ -358,13 +313,8 @@ def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> d
     def fit(steps: int, output: Path) -> float:
         changes = {"max_steps": steps, "validate_every": max(1, steps // 10)}
         began = time.process_time()
-        train_subspace(
-            reduced,
-            num_modes=modes,
-            model=plain["model"],
-            training=plain["training"] | changes,
-            output=output,
-        )
+        training = plain["training"] | changes
+        train_subspace(reduced, num_modes=modes, model=plain["model"], training=training, output=output)
         return time.process_time() - began
 
     with tempfile.TemporaryDirectory() as temporary:
@@ -373,7 +323,6 @@ def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> d
         steps = max(1, round(60 * minutes / ((fit(300, folder / "pilot")) / 300)))
         taken = fit(steps, folder / "training")
         simulator = Simulator.load(folder / "training" / "best.ckpt")
-    dataset = Dataset.open(path)
     by_name = {run.name: run for run in reduced.runs("test")}
 
     def predict(file: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -381,15 +330,11 @@ def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> d
         rollout = simulator.rollout(run.pose, latent_history=run.latent[: simulator.history, :modes])
         return simulator.basis.inverse(torch.as_tensor(rollout.latent)).numpy(), rollout.force
 
-    found = errors(dataset.runs("test")[:runs], dataset.runs("train"), predict, simulator.history)
-    return {
-        "trained_processor_s": taken,
-        "trained_steps": steps,
-        "test_runs": len(dataset.runs("test")[:runs]),
-    } | found
+    found = errors(path, runs, predict, simulator.history)
+    return {"trained_processor_s": taken, "trained_steps": steps} | found
 
 
-def solver(path: Path, name: str) -> dict[str, Any]:
+def solver(path: Path) -> dict[str, Any]:
     """Wall time of the solver, as its runs recorded it."""
     found = []
     for split in ("train", "validation", "test"):
@@ -412,51 +357,22 @@ def single_threaded() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
 
 
-def done(table: Path) -> dict[str, dict[str, str]]:
-    """Lines of the table by case."""
-    if not table.exists():
-        return {}
-    with table.open(newline="") as stream:
-        return {row["case"]: row for row in csv.DictReader(stream)}
-
-
-def save(table: Path, rows: dict[str, dict[str, Any]]) -> None:
-    columns = list(dict.fromkeys(key for row in rows.values() for key in row))
-    with table.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, columns, restval="")
-        writer.writeheader()
-        for row in rows.values():
-            writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()})
-
-
-def draw(rows: dict[str, dict[str, str]], file: Path) -> None:
+def draw(rows: list[dict[str, str]], file: Path) -> None:
     """Times, memory and errors side by side."""
     panels = {
         "training_s_per_step": f"training, batch {BATCH} [s/step]",
         "rollout_s_per_simulated_s": "rollout [s per simulated s]",
         "training_memory_MB": "memory of training [MB]",
+        "skill_frozen": "position skill, test runs",
+        "force_nrmse": "force NRMSE, test runs",
     }
-    figure, axes = plt.subplots(1, 4, figsize=(12, 2.6), layout="constrained", sharey=True)
-    names = list(rows)
-    colours = ["0.3" if n == "solver" else "C0" if n == SUBSPACE else "C1" for n in names]
-    for axis, (key, label) in zip(axes, panels.items(), strict=False):
-        values = [float(rows[n].get(key) or "nan") for n in names]
-        bars = axis.barh(names, values, color=colours)
-        axis.bar_label(
-            bars, ["" if np.isnan(v) else f" {v:.0f}" if v >= 100 else f" {v:.2g}" for v in values]
-        )
-        axis.set(xscale="log", xlabel=label)
-        low, high = np.nanmin(values), np.nanmax(values)
-        axis.set_xlim(low / 4, high * 30)
-    place = np.arange(len(names))
-    for shift, key, label in ((-0.2, "skill_frozen", "position skill"), (0.2, "force_nrmse", "force NRMSE")):
-        values = [float(rows[n].get(key) or "nan") for n in names]
-        bars = axes[3].barh(place + shift, values, 0.4, label=label, color="C2" if shift < 0 else "C3")
-        axes[3].bar_label(bars, ["" if np.isnan(v) else f" {v:.2f}" for v in values])
-    axes[3].axvline(0, color="0.2", lw=0.8)
-    axes[3].set(xlabel="test runs, after minutes of training")
-    axes[3].margins(x=0.25)
-    axes[3].legend(fontsize=7, loc="upper right")
+    figure, axes = plt.subplots(1, len(panels), figsize=(14, 2.6), layout="constrained", sharey=True)
+    for axis, (key, label) in zip(axes, panels.items(), strict=True):
+        values = [float(row.get(key) or "nan") for row in rows]
+        bars = axis.barh([row["case"] for row in rows], values)
+        axis.bar_label(bars, ["" if np.isnan(value) else f" {value:.2g}" for value in values])
+        axis.set(xlabel=label, xscale="linear" if key in ("skill_frozen", "force_nrmse") else "log")
+        axis.margins(x=0.3)
     axes[0].invert_yaxis()
     figure.savefig(file, dpi=130)
 
@@ -473,25 +389,23 @@ def main() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     # Freed blocks are kept for the next step: otherwise a third of the time goes into getting zeroed pages anew.
     os.environ |= {"MALLOC_MMAP_THRESHOLD_": "4294967296", "MALLOC_TRIM_THRESHOLD_": "17179869184"}
-    rows: dict[str, dict[str, Any]] = dict(done(options.table))
-    order = ("solver", SUBSPACE, *FULL_SPACE)
-    for name in order:
+    rows: dict[str, dict[str, Any]] = {row["case"]: row for row in read_rows(options.table)}
+    for name in ("solver", SUBSPACE, *FULL_SPACE):
         if name not in rows:
-            cost = cost_subspace if name == SUBSPACE else cost_full_space
-            found = (
-                solver(options.data, name)
-                if name == "solver"
-                else in_fresh_process(cost, options.data, name, options.repeats)
-            )
+            if name == "solver":
+                found = solver(options.data)
+            else:
+                cost = cost_subspace if name == SUBSPACE else cost_full_space
+                found = in_fresh_process(cost, options.data, name, options.repeats)
             rows[name] = {"case": name, **found}
-            save(options.table, rows)
+            write_rows(options.table, rows.values())
             print(rows[name], flush=True)
     for name, learn in ((SUBSPACE, learn_subspace), (TRAINED, learn_full_space)):
         if not rows[name].get("trained_steps"):
             rows[name] |= in_fresh_process(learn, options.data, name, options.minutes, options.runs)
-            save(options.table, rows)
+            write_rows(options.table, rows.values())
             print(rows[name], flush=True)
-    draw(done(options.table), HERE / "bars.png")
+    draw(read_rows(options.table), HERE / "bars.png")
 
 
 if __name__ == "__main__":

@@ -24,14 +24,15 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import warp as wp
-from hydra import compose, initialize_config_module
-from scenes import FARTHEST, FORCE, Case, cases, outcome, write_rows
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
-from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
+import warp as wp
+from common import scene_of, write_rows
+from scenes import FARTHEST, FORCE, Case, cases, outcome
+
+from mpm_warp import Frame, SceneError, Solver, SolverStopped, frames_together
 from mpm_warp.launch import find_device
 from sgns.evaluate.costs import cpu_model
-from sgns.simulate.scene import asked_effects, decided, scene_from_config
 
 HERE = Path(__file__).resolve().parent
 SCENES = ("quick_excavation", "paper_excavation", "paper_wheel")
@@ -59,14 +60,6 @@ def compared(case: Case, device: str) -> dict[str, Any]:
     return row
 
 
-def composed(name: str) -> tuple[Scene, Effects]:
-    """A scene of `conf/` with the effects that `effects=auto` decides on."""
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        cfg = compose("simulate", [f"scene={name}"])
-    scene = scene_from_config(cfg)
-    return scene, decided(scene, asked_effects(cfg))[0]
-
-
 def stretches(frames: Iterator[Any], at_once: int, effort: Effort) -> list[float]:
     """Seconds that a frame takes, for `at_once` scenes together, once warm."""
     list(islice(frames, effort.warm * at_once))
@@ -82,7 +75,7 @@ def stretches(frames: Iterator[Any], at_once: int, effort: Effort) -> list[float
 
 def timed(name: str, device: str, at_once: int, effort: Effort) -> dict[str, Any]:
     """How fast a device computes `at_once` scenes of one kind; each frame is brought to the host."""
-    scene, effects = composed(name)
+    scene, effects = scene_of(f"scene={name}")
     frames = frames_together([scene] * at_once, effects, device, at_once=at_once)
     seconds = [s * scene.frame_rate for s in stretches(frames, at_once, effort)]
     frames.close()

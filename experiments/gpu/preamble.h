@@ -1,6 +1,5 @@
 // Stands before the C++ that Warp writes of a kernel: atomic sums and maxima that hold between threads.
-// Warp's own are plain on the CPU. These are found first, being no templates. With PLAIN they are plain again,
-// which is a planted fault.
+// Warp's own are plain on the CPU. These are found first, being no templates.
 
 #include <atomic>
 #include <cmath>
@@ -26,18 +25,12 @@ inline void stop_now_and_then()
 
 template <typename Number, typename Next> inline Number updated(Number* at, Next next)
 {
-#ifdef PLAIN
-    Number old = *at;
-    stop_now_and_then();
-    *at = next(old);
-#else
     Number old, wanted;
     __atomic_load(at, &old, __ATOMIC_RELAXED);
     do {
         wanted = next(old);
         stop_now_and_then();
     } while (!__atomic_compare_exchange(at, &old, &wanted, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED));
-#endif
     return old;
 }
 

@@ -3,12 +3,10 @@ one scene alone and several in one launch."""
 
 from __future__ import annotations
 
-import csv
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,9 +28,7 @@ from mpm_warp import (
 )
 from mpm_warp.bodies import Box, MeshBody
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
-from sgns_testing.scenes import cut
-
-__all__ = ["FARTHEST", "FORCE", "Case", "Outcome", "cases", "outcome", "write_rows"]
+from sgns_testing.scenes import UNDAMPED, cut
 
 FARTHEST, FORCE = 1e-4, 0.01
 """Ways to compute a case agree if no particle is farther off [m] and the forces differ by no larger share: what the
@@ -49,7 +45,6 @@ BEADS = Material(
     nonlocal_amplitude=0.48,
 )
 BED = Bed(size=(0.48, 0.4, 0.16), spacing=0.02, headroom=0.12)
-UNDAMPED = {"friction_angle": None, "damping": 0.0}  # wheels fall freely
 DYNAMIC = Effects(fluidity=True, nonlocality=True)
 
 
@@ -64,11 +59,6 @@ class Case:
     @property
     def particles(self) -> int:
         return sum(len(scene.initial_positions()) for scene in self.scenes)
-
-    def shortened(self, frames: int) -> Case:
-        """Only so many frames after the first."""
-        scenes = (replace(s, duration=min(s.duration, frames / s.frame_rate)) for s in self.scenes)
-        return replace(self, scenes=tuple(scenes))
 
 
 @dataclass(frozen=True)
@@ -112,15 +102,6 @@ def _frames(case: Case, device: str, precision: str) -> Iterator[tuple[int, Fram
             yield 0, frame
     else:
         yield from frames_together(case.scenes, case.effects, device, precision)
-
-
-def write_rows(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a table of rows with the same keys."""
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: f"{v:.3g}" if isinstance(v, float) else v for k, v in row.items()})
 
 
 def cases(folder: Path) -> list[Case]:

@@ -23,7 +23,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -36,24 +35,12 @@ from unittest import mock
 import numpy as np
 import warp as wp
 
-from mpm_warp import launch as work
 from mpm_warp import solver
 from mpm_warp.kernels import nonlocal_fluidity
 
-__all__ = ["Checked", "Report", "Threads", "compiler", "on_stand_in", "with_graphs"]
-
 HERE = Path(__file__).resolve().parent
 MANY = 0xFFFFFFFF
-FLAGS = (
-    "-std=c++17",
-    "-w",
-    "-DNDEBUG",
-    "-fPIC",
-    "-shared",
-    "-march=native",
-    "-ffp-contract=fast",
-    "-pthread",
-)
+FLAGS = tuple("-std=c++17 -w -DNDEBUG -fPIC -shared -march=native -ffp-contract=fast -pthread".split())
 
 
 @cache
@@ -71,11 +58,6 @@ class Report:
     """What the check found in all launches of one kernel."""
 
     kernel: str
-    variants: int = 0
-    """Of the kernel, compiled for other physics, bodies, walls or numbers."""
-    launches: int = 0
-    items: int = 0
-    accesses: int = 0
     conflicts: int = 0
     """Places of four bytes, counted in every launch."""
     outside: int = 0
@@ -84,23 +66,21 @@ class Report:
     """The first conflict or access outside, in words."""
 
 
-class StandIn(ABC):
+class StandIn:
     """A way to run a kernel's items.
 
     Args:
         atomic: the kernels as a GPU gets them; False, a planted fault: those for one thread.
-        plain: a planted fault: atomic operations are not.
     """
 
     flags: tuple[str, ...]
 
-    def __init__(self, atomic: bool = True, plain: bool = False) -> None:
+    def __init__(self, atomic: bool = True) -> None:
         self.atomic = atomic
-        self._flags = (*self.flags, *(["-DPLAIN"] if plain else []))
 
     def taken_over(self, command: wp.Launch) -> wp.Launch:
         """The recorded launch, which from now on runs this way."""
-        built = _built(_source(command), self._flags)
+        built = _built(_source(command), self.flags)
 
         def forward(bounds: Any, arguments: Any) -> None:
             self.run(command.kernel, built, bounds._obj, arguments._obj)
@@ -108,9 +88,9 @@ class StandIn(ABC):
         command.hooks = SimpleNamespace(forward=forward)
         return command
 
-    @abstractmethod
     def run(self, kernel: wp.Kernel, built: ctypes.CDLL, bounds: Any, arguments: ctypes.Structure) -> None:
         """Run one launch."""
+        raise NotImplementedError
 
 
 class Threads(StandIn):
@@ -118,8 +98,8 @@ class Threads(StandIn):
 
     flags = ("-O2",)
 
-    def __init__(self, count: int = 4, seed: int = 0, plain: bool = False) -> None:
-        super().__init__(plain=plain)
+    def __init__(self, count: int = 4, seed: int = 0) -> None:
+        super().__init__()
         self._count, self._random = count, np.random.default_rng(seed)
         self.launches = 0
 
@@ -145,10 +125,9 @@ class Checked(StandIn):
 
     flags = ("-O1", "-fno-tree-loop-distribute-patterns", "-fsanitize=thread", "-DCHECKED")
 
-    def __init__(self, atomic: bool = True, plain: bool = False) -> None:
-        super().__init__(atomic, plain)
+    def __init__(self, atomic: bool = True) -> None:
+        super().__init__(atomic)
         self._reports: dict[str, Report] = {}
-        self._met: set[str] = set()
 
     def reports(self) -> list[Report]:
         """One for each kernel, by name."""
@@ -172,11 +151,6 @@ class Checked(StandIn):
 
         name = kernel.key.split("__")[-1]
         report = self._reports.setdefault(name, Report(name))
-        report.variants += built._name not in self._met
-        self._met.add(built._name)
-        report.launches += 1
-        report.items += int(bounds.size)
-        report.accesses += found.accesses
         report.conflicts += found.conflicts
         report.outside += found.outside
         if not report.first and found.conflicts:
@@ -206,11 +180,6 @@ def on_stand_in(stand_in: Way) -> Iterator[Way]:
         ),
     ):
         yield stand_in
-
-
-def with_graphs() -> Any:
-    """A context in which launches on the CPU are captured and replayed as graphs, as they are on a GPU."""
-    return mock.patch.object(work, "captures", lambda device: True)
 
 
 Way = TypeVar("Way", bound=StandIn)

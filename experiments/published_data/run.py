@@ -10,26 +10,27 @@ figure.png beside this script; a training that is complete in `--output` is not 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import logging
 import multiprocessing
 import os
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from common import training_settings, write_rows
 
 from sgns.data.published import published_dataset
 from sgns.evaluate.published import scored
 from sgns.evaluate.results import aggregate
-from sgns.reduction.reduce import ReducedRun
+from sgns.reduction.reduce import ReducedDataset, ReducedRun
 from sgns.rollout import single_thread
 from sgns.simulator import Simulator
 from sgns.train.command import train
@@ -41,36 +42,10 @@ PRESETS = ("paper", "released", "default")
 WARM_UP = 60  # steps that tell how long one takes
 
 
-def settings(preset: str, folder: Path, fold: int, overrides: list[str]) -> dict[str, Any]:
-    """All settings of `sgns train`, plain."""
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        config = compose(
-            "train",
-            [
-                f"preset={preset}",
-                "dataset=published",
-                f"dataset.path={folder}",
-                f"dataset.folds={FOLDS}",
-                f"dataset.fold={fold}",
-                "training.threads=1",
-                *overrides,
-            ],
-        )
-    config.output = ""
-    plain = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(plain, dict)
-    return plain
-
-
 def trained(
-    preset: str, folder: Path, fold: int, seconds: float, output: Path, overrides: list[str]
+    config: dict[str, Any], data: ReducedDataset, label: dict[str, str], seconds: float, output: Path
 ) -> float:
     """Train for about so many seconds; returns the seconds it took."""
-    record = output / "training.json"
-    if record.exists():
-        return float(json.loads(record.read_text())["seconds"])
-    config = settings(preset, folder, fold, overrides)
-    data = published_dataset(config["dataset"], config["reduction"]["num_modes"])
     # The last checkpoint is judged, so that nothing is to be chosen: validation is kept short.
     runs = {split: data.runs(split) for split in ("train", "test")}
     data = replace(data, _runs=runs | {"validation": [shortened(runs["train"][0], 20)]})
@@ -79,21 +54,20 @@ def trained(
         torch.manual_seed(0)
         training = config["training"] | {"max_steps": steps, "validate_every": steps, "resume": False}
         training["warmup_steps"] = min(training["warmup_steps"], steps // 10)
-        train(
-            data,
-            num_modes=config["reduction"]["num_modes"],
-            model=config["model"],
-            training=training,
-            output=where,
-            provenance={"preset": preset, "dataset": f"published {folder.name}"},
-        )
-        return float(json.loads((where / "training.json").read_text())["seconds"])
+        modes, model = config["reduction"]["num_modes"], config["model"]
+        train(data, num_modes=modes, model=model, training=training, output=where, provenance=label)
+        return seconds_of(where)
 
     trial = output.with_name(f"{output.name}_trial")
     run(2, trial)
     short = run(2, trial)
     rate = WARM_UP / max(run(WARM_UP + 2, trial) - short, 1e-3)
     return run(max(50, int(seconds * rate)), output)
+
+
+def seconds_of(training: Path) -> float:
+    """That a complete training took."""
+    return float(json.loads((training / "training.json").read_text())["seconds"])
 
 
 def shortened(run: ReducedRun, frames: int) -> ReducedRun:
@@ -107,80 +81,65 @@ def fold_rows(task: tuple[str, str, int, Path, float, Path, list[str]]) -> list[
     preset, kind, fold, folder, seconds, output, overrides = task
     torch.set_num_threads(1)
     where = output / f"{kind}_{preset}_{fold}"
-    took = trained(preset, folder / kind, fold, seconds, where, overrides)
-    simulator = Simulator.load(where / "last.ckpt")
-    config = settings(preset, folder / kind, fold, overrides)
+    published = ["dataset=published", f"dataset.path={folder / kind}"]
+    published += [f"dataset.folds={FOLDS}", f"dataset.fold={fold}", "training.threads=1"]
+    config = training_settings(f"preset={preset}", *published, *overrides)
     data = published_dataset(config["dataset"], config["reduction"]["num_modes"])
+    if not (where / "training.json").exists():
+        trained(config, data, {"preset": preset, "dataset": f"published {kind}"}, seconds, where)
+    simulator = Simulator.load(where / "last.ckpt")
     rows = []
     with single_thread():
         for run in data.runs("test"):
             began = time.perf_counter()
             scores = scored(simulator, run, simulator.mean_force)
-            rows.append(
-                {
-                    "kind": kind,
-                    "preset": preset,
-                    "scores": scores,
-                    "training_s": took,
-                    "rollout_s": time.perf_counter() - began,
-                    "steps": simulator.card["settings"]["training"]["max_steps"],
-                    "batch": simulator.card["settings"]["training"]["batch_size"],
-                }
-            )
+            took = time.perf_counter() - began
+            training = simulator.card["settings"]["training"]
+            rows.append({"kind": kind, "preset": preset, "scores": scores, "rollout_s": took})
+            rows[-1] |= {"training_s": seconds_of(where), "steps": training["max_steps"]}
+            rows[-1]["samples"] = training["max_steps"] * training["batch_size"]
     return rows
 
 
 def table_row(kind: str, preset: str, scores: Any, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """The paper's columns, and beside them skill, baselines and unsigned errors."""
-    force, mean = scores.force, scores.mean_force
-    return {
-        "kind": kind,
-        "preset": preset,
-        "run": scores.name,
-        "mse_1e-4_m2": round(1e4 * scores.mse["network"], 4),
-        "frozen_1e-4_m2": round(1e4 * scores.mse["frozen"], 4),
-        "constant_velocity_1e-4_m2": round(1e4 * scores.mse["constant_velocity"], 4),
-        "skill_frozen": round(scores.skill(), 3),
-        "skill_constant_velocity": round(scores.skill("constant_velocity"), 3),
-        "forward_mpe_percent": round(float(force.mpe[0]), 1),
-        "vertical_mpe_percent": round(float(force.mpe[2]), 1),
-        "forward_abs_mpe_percent": round(float(scores.force.absolute_mpe[0]), 1),
-        "vertical_abs_mpe_percent": round(float(scores.force.absolute_mpe[2]), 1),
-        "forward_mae_N": round(float(force.mae[0]), 2),
-        "vertical_mae_N": round(float(force.mae[2]), 2),
-        "force_nrmse": round(force.overall_nrmse, 3),
-        "mean_force_nrmse": round(mean.overall_nrmse, 3),
-        "training_s": round(float(np.mean([row["training_s"] for row in rows])), 1),
-        "steps": round(float(np.mean([row["steps"] for row in rows]))),
-        "samples": round(float(np.mean([row["steps"] * row["batch"] for row in rows]))),
-        "rollout_s": round(float(np.median([row["rollout_s"] for row in rows])), 3),
+    force = scores.force
+    row = {"kind": kind, "preset": preset, "run": scores.name}
+    for name, key in (("mse", "network"), ("frozen", "frozen"), ("constant_velocity", "constant_velocity")):
+        row[f"{name}_1e-4_m2"] = 1e4 * float(scores.mse[key])
+    row |= {
+        "skill_frozen": float(scores.skill()),
+        "skill_constant_velocity": float(scores.skill("constant_velocity")),
+        "forward_mpe_percent": float(force.mpe[0]),
+        "vertical_mpe_percent": float(force.mpe[2]),
+        "forward_abs_mpe_percent": float(force.absolute_mpe[0]),
+        "vertical_abs_mpe_percent": float(force.absolute_mpe[2]),
+        "forward_mae_N": float(force.mae[0]),
+        "vertical_mae_N": float(force.mae[2]),
+        "force_nrmse": float(force.overall_nrmse),
+        "mean_force_nrmse": float(scores.mean_force.overall_nrmse),
     }
+    row |= {key: float(np.mean([one[key] for one in rows])) for key in ("training_s", "steps", "samples")}
+    return row | {"rollout_s": float(np.median([one["rollout_s"] for one in rows]))}
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Skill and force error of every run."""
+    panels = (("skill_frozen", "skill against frozen (cut at -1)"), ("force_nrmse", "force NRMSE (cut at 2)"))
     figure, axes = plt.subplots(2, 2, figsize=(10, 6.4), layout="constrained")
     for line, kind in zip(axes, KINDS, strict=True):
-        for shift, preset in enumerate(PRESETS):
-            found = [
-                r for r in rows if r["kind"] == kind and r["preset"] == preset and r["run"] != "all runs"
-            ]
-            at = np.arange(len(found)) + 0.26 * (shift - 1)
-            skill = [max(r["skill_frozen"], -1.0) for r in found]
-            line[0].bar(at, skill, 0.24, label=preset)
-            line[1].bar(at, [min(r["force_nrmse"], 2.0) for r in found], 0.24, label=preset)
-        line[1].plot(
-            np.arange(len(found)),
-            [min(r["mean_force_nrmse"], 2.0) for r in found],
-            "k_",
-            ms=14,
-            label="mean force",
-        )
-        for axis, what in zip(
-            line, ("skill against frozen (cut at -1)", "force NRMSE (cut at 2)"), strict=True
-        ):
-            axis.set_xticks(np.arange(len(found)), [r["run"].split("_")[-1] for r in found], fontsize=8)
-            axis.set_title(f"{kind}: {what}", fontsize=10)
+        for axis, (key, label) in zip(line, panels, strict=True):
+            for shift, preset in enumerate(PRESETS):
+                found = [
+                    r for r in rows if (r["kind"], r["preset"]) == (kind, preset) and r["run"] != "all runs"
+                ]
+                at = np.arange(len(found)) + 0.26 * (shift - 1)
+                axis.bar(at, np.clip([r[key] for r in found], -1.0, 2.0), 0.24, label=preset)
+            if key == "force_nrmse":
+                mean = np.clip([r["mean_force_nrmse"] for r in found], -1.0, 2.0)
+                axis.plot(range(len(found)), mean, "k_", ms=14, label="mean force")
+            axis.set_xticks(range(len(found)), [r["run"].split("_")[-1] for r in found], fontsize=8)
+            axis.set_title(f"{kind}: {label}", fontsize=10)
             axis.axhline(0.0, color="0.3", lw=0.8)
             axis.grid(alpha=0.3, axis="y")
     axes[0, 0].legend(fontsize=8)
@@ -215,10 +174,7 @@ def main() -> None:
             rows += [table_row(kind, preset, row["scores"], [row]) for row in own]
             rows.append(table_row(kind, preset, aggregate([row["scores"] for row in own]), own))
             logging.info("%s", rows[-1])
-    with (HERE / "table.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(HERE / "table.csv", rows, digits=6)
     if set(options.presets) == set(PRESETS) and set(options.kinds) == set(KINDS):
         draw(rows, HERE / "figure.png")
 

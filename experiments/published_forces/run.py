@@ -1,37 +1,54 @@
-"""The published excavation runs, simulated at the published settings and compared with the published forces.
+"""The published runs, simulated at the published settings and compared with the published forces and sinkages.
 
-    python experiments/published_forces/run.py <folder of the authors' excavation files>
+    python experiments/published_forces/run.py excavation <folder of the authors' excavation files>
+    python experiments/published_forces/run.py wheel <folder of the authors' wheel files>
 
-Makes one run file per case (about 200 MB each, in data/published_excavation; finished ones are kept), then table.csv
-and histories.png beside this script. With `--scene excavation` the same cuts at the reference setting, into files of
-that name.
+Makes one run file per case (about 200 MB of a blade, 80 MB of a wheel, in data/<scene>; finished ones are kept), then
+a table and a figure beside this script. With `--reference` the same motions on the bed, grid and numerics of
+scene=excavation or scene=wheel.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import logging
-from collections.abc import Callable
+import sys
 from pathlib import Path
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from sgns.data.published import PublishedRun, excavation_case, read_published
+from mpm_warp import Scene, Wheel
+from sgns.data.published import PublishedRun, excavation_case, read_published, wheel_case
 from sgns.data.run import Run
 from sgns.simulate.campaign import Campaign
 from sgns.simulate.command import simulate_campaign
 from sgns.simulate.scene import asked_effects, scene_from_config
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
 HERE = Path(__file__).parent
+sys.path.insert(1, str(HERE.parent))
+
+from common import composed, write_rows  # noqa: E402
+
 WINDOW = 15  # frames of the centred mean: ours are frame means, theirs samples of one substep
 FIRST = 10  # the frames before hold the published runs' settling spike; they enter nowhere
+CASE = {"excavation": excavation_case, "wheel": wheel_case}
+RESULT = {  # kind and whether at the reference setting -> names of table and figure
+    ("excavation", False): ("table", "histories"),
+    ("excavation", True): ("table_excavation", "histories_excavation"),
+    ("wheel", False): ("wheel", "wheel"),
+    ("wheel", True): ("wheel_reference", "wheel_reference"),
+}
+PUBLISHED_DAMPING = 500.0  # of the published wheels' height [1/s]
+THEIR_WHEEL = (  # what scene=published_wheel has of the wheel and its motion, beside what differs between the cases
+    "scene.friction=3",
+    "scene.bilateral=true",
+    f"scene.damping={PUBLISHED_DAMPING}",
+    "scene.settle=4",
+    "scene.clearance=0.0132890365",
+    "scene.duration=9.3333333333",
+)
 
 
 def smoothed(series: np.ndarray) -> np.ndarray:
@@ -39,114 +56,132 @@ def smoothed(series: np.ndarray) -> np.ndarray:
     return np.convolve(series[FIRST:], np.ones(WINDOW) / WINDOW, mode="valid")
 
 
-def first_third(travel: np.ndarray) -> np.ndarray:
-    """Which frames lie in the first third of the blade's way along x, shape (T,)."""
-    return travel < travel[0] + (travel[-1] - travel[0]) / 3.0
-
-
-def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
-    """Means [N], correlation and NRMSE (RMS difference over RMS of the published series)."""
+def nrmse(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """RMS difference over the RMS of the published series."""
     a, b = smoothed(ours), smoothed(theirs)
+    return float(np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2)))
+
+
+def campaign_of(options: argparse.Namespace) -> tuple[list[PublishedRun], Campaign]:
+    """The published runs in the order of their cases, and the campaign that makes them."""
+    bin_size = scene_from_config(composed("simulate", f"scene=published_{options.kind}")).bed.size
+    published = read_published(options.published, bin_size)
+    wanted = [run for run in published if not options.cases or run.case in options.cases]
+    published = sorted(wanted, key=lambda run: run.case)
+    name = options.kind if options.reference else f"published_{options.kind}"
+    theirs = THEIR_WHEEL if name == "wheel" else ()
+    config = composed("simulate", f"scene={name}", *theirs, *options.overrides)
+    scenes = {}
+    for run in published:
+        for key, value in CASE[options.kind](run.case).items():
+            OmegaConf.update(config, f"scene.{key}", value)
+        scenes[f"case_{run.case:03d}"] = scene_from_config(config)
+    folder = options.runs or Path("data") / name
+    split, effects = dict.fromkeys(scenes, "test"), asked_effects(config)
+    campaign = Campaign("published_forces", folder, scenes, split, effects, config.solver.precision, seed=0)
+    return published, campaign
+
+
+def needed(sinkage: np.ndarray, scene: Wheel, damping: float) -> np.ndarray:
+    """The vertical force [N] that carries the wheel on its way down, without its inertia: weight minus damper.
+
+    Args:
+        sinkage: at the frames [mm].
+    """
+    speed = 1e-3 * np.gradient(sinkage, 1.0 / scene.frame_rate)
+    return scene.load - scene.load / scene.gravity * damping * speed
+
+
+def series_of(file: Path, theirs: PublishedRun, scene: Scene) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Our and their forces [N] and sinkages [mm] by name; a shorter scene.duration compares what there is."""
+    # The authors' frame i is our frame i + 1: their poses agree with ours there to 0.1 mm.
+    first = 1 + (round(scene.settle * scene.frame_rate) if isinstance(scene, Wheel) else 0)
+    with Run(file) as run:
+        force, pose = (values[first : first + len(theirs.force)] for values in (run.force, run.pose))
+    published = theirs.force[: len(force)]
+    vertical = force[:, 2], published[:, 2]
+    if not isinstance(scene, Wheel):
+        return {"draft": (-force[:, 0], -published[:, 0]), "vertical": vertical}
+    height = theirs.body_points[: len(force), :, 2].mean(axis=1)
+    sinkage = 1e3 * scene.sinkage(pose), 1e3 * (0.5 * scene.diameter - height)
+    carrying = needed(sinkage[0], scene, scene.damping), needed(sinkage[1], scene, PUBLISHED_DAMPING)
     return {
-        "mean": a.mean(),
-        "published": b.mean(),
-        "correlation": np.corrcoef(a, b)[0, 1],
-        "nrmse": np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2)),
+        "pull": (force[:, 0], published[:, 0]),
+        "vertical": vertical,
+        "sinkage": sinkage,
+        "needed": carrying,
     }
 
 
-def campaign_of(
-    options: argparse.Namespace,
-    values_of: Callable[[int], dict[str, float | str]],
-    published_scene: str,
-    cases: list[int] | None = None,
-) -> tuple[list[PublishedRun], Campaign]:
-    """The published runs in the order of their cases, and the campaign that makes them with `options.scene`.
-
-    Args:
-        options: published, scene, runs and overrides of the command line.
-        values_of: the scene's keys of a case.
-        published_scene: whose bin the published coordinates belong to.
-        cases: only these; None: all.
-    """
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        config = compose("simulate", [f"scene={options.scene}", *options.overrides])
-        theirs = compose("simulate", [f"scene={published_scene}"])
-    published = read_published(options.published, scene_from_config(theirs).bed.size)
-    published = sorted((r for r in published if not cases or r.case in cases), key=lambda run: run.case)
-    scenes = {}
-    for run in published:
-        for key, value in values_of(run.case).items():
-            OmegaConf.update(config, f"scene.{key}", value)
-        scenes[f"case_{run.case:03d}"] = scene_from_config(config)
-    campaign = Campaign(
-        "published_forces",
-        Path(options.runs or f"data/{options.scene}"),
-        scenes,
-        dict.fromkeys(scenes, "test"),
-        asked_effects(config),
-        config.solver.precision,
-        seed=0,
-    )
-    return published, campaign
+def row_of(series: dict[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
+    """Means [N, mm], correlation and NRMSE of every series; of a wheel also what its motion needs."""
+    row = {}
+    for name, (a, b) in ((name, pair) for name, pair in series.items() if name != "needed"):
+        row[f"{name}_mean"], row[f"{name}_published"] = smoothed(a).mean(), smoothed(b).mean()
+        row[f"{name}_correlation"] = np.corrcoef(smoothed(a), smoothed(b))[0, 1]
+        row[f"{name}_nrmse"] = nrmse(a, b)
+    if "needed" in series:
+        carried = [smoothed(one).mean() for one in series["needed"]]
+        row["published_over_needed"] = row["vertical_published"] / carried[1]
+        row["over_needed"] = row["vertical_mean"] / carried[0]
+        # What the published force would be if it carried the published wheel, against ours.
+        row["needed_nrmse"] = nrmse(series["vertical"][0], series["needed"][1])
+        # What the wheel pulls for what it bears: the same if all forces are off by the same factor.
+        row["traction"] = row["pull_mean"] / row["vertical_mean"]
+        row["traction_published"] = row["pull_published"] / row["vertical_published"]
+    return {key: round(float(value), 3) for key, value in row.items()}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("kind", choices=CASE)
     parser.add_argument("published", help="folder with valid.tfrecord and metadata.json")
-    parser.add_argument("--runs", default=None, help="folder for the run files (default: data/<scene>)")
+    parser.add_argument("--reference", action="store_true", help="at the reference setting")
+    parser.add_argument("--runs", type=Path, help="folder for the run files (default: data/<scene>)")
     parser.add_argument(
-        "--scene",
-        default="published_excavation",
-        help="published_excavation, or excavation: the reference setting",
+        "--other-draw", type=Path, help="such a folder, made with another seed, to compare with"
     )
     parser.add_argument("--results", default=HERE, type=Path, help="folder for the table and the figure")
     parser.add_argument("--cases", type=int, nargs="*", help="only these case numbers")
-    parser.add_argument("--workers", type=int, default=None, help="runs at once (default: one per core)")
-    parser.add_argument("overrides", nargs="*", help="changes of the scene, for example scene.courant=0.4")
+    parser.add_argument("--workers", type=int, help="runs at once (default: one per core)")
+    parser.add_argument("overrides", nargs="*", help="changes of the scene, for example scene.friction=0.5")
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-
-    published, campaign = campaign_of(options, excavation_case, "published_excavation", options.cases)
+    published, campaign = campaign_of(options)
     simulate_campaign(campaign, device="cpu", workers=options.workers)
-    suffix = "" if options.scene == "published_excavation" else f"_{options.scene}"
 
-    rows = []
-    figure = plt.figure(figsize=(13, 12), layout="constrained")
-    axes = figure.subplots(4, 3, sharex=True).ravel()
-    for axis, theirs in zip(axes, published, strict=False):
-        with Run(campaign.file(f"case_{theirs.case:03d}")) as run:
-            # The authors' frame i is our frame i + 1: their poses agree with ours there to 0.1 mm.
-            ours, seconds = run.force[1 : 1 + len(theirs.force)], run.wall_time_s / run.time[-1]
-        published_force = theirs.force[: len(ours)]  # a shorter scene.duration compares what there is
-        row = {"case": theirs.case, **excavation_case(theirs.case)}
-        for name, component, sign, colour in (("draft", 0, -1, "C0"), ("vertical", 2, 1, "C1")):
-            a, b = sign * ours[:, component], sign * published_force[:, component]
-            row |= {f"{name}_{key}": round(float(value), 3) for key, value in compared(a, b).items()}
-            time = (FIRST + WINDOW // 2 + 1 + np.arange(len(smoothed(b)))) / 60.0
-            axis.plot(time, smoothed(b), color=colour, lw=1, ls="--", label=f"{name}, published")
-            axis.plot(time, smoothed(a), color=colour, lw=1.4, label=f"{name}, sgns")
-        rows.append(row | {"s_per_simulated_s": round(seconds, 1)})
-        axis.set_title(
-            f"{theirs.case}: {100 * row['depth']:g} cm, {100 * row['speed']:g} cm/s, "
-            f"{row['rake']:g}°, {row['motion']}\n"
-            f"NRMSE {row['draft_nrmse']:.2f} draft, {row['vertical_nrmse']:.2f} vertical",
-            fontsize=9,
-        )
-        axis.grid(alpha=0.3)
-    axes[-1].axis("off")
-    axes[-1].legend(*axes[0].get_legend_handles_labels(), loc="center")
+    rows: list[dict[str, float | str]] = []
+    columns = 3 if options.kind == "wheel" else 2
+    figure = plt.figure(figsize=(14, 2.4 * len(published) + 1), layout="constrained")
+    axes = figure.subplots(len(published), columns, sharex=True, squeeze=False)
+    for line, theirs in zip(axes, published, strict=True):
+        file, scene = campaign.file(f"case_{theirs.case:03d}"), campaign.scenes[f"case_{theirs.case:03d}"]
+        series, values = series_of(file, theirs, scene), CASE[options.kind](theirs.case)
+        row = {"case": theirs.case, **values, **row_of(series)}
+        if options.other_draw and (other := options.other_draw / "runs" / file.name).exists():
+            name, (ours, _) = next(iter(series.items()))
+            row[f"{name}_nrmse_other_draw"] = round(nrmse(series_of(other, theirs, scene)[name][0], ours), 3)
+        rows.append(row)
+        time = (FIRST + WINDOW // 2 + 1 + np.arange(len(smoothed(series["vertical"][0])))) / 60.0
+        for number, (axis, (name, (a, b))) in enumerate(zip(line, series.items(), strict=False)):
+            axis.plot(time, smoothed(b), color=f"C{number}", lw=1, ls="--", label="published")
+            axis.plot(time, smoothed(a), color=f"C{number}", lw=1.4, label="sgns")
+            if name == "vertical" and "needed" in series:
+                axis.plot(time, smoothed(series["needed"][1]), "k:", lw=1, label="needed by their motion")
+            axis.set_title(f"{theirs.case}: {name}, NRMSE {row[f'{name}_nrmse']:.2f}", fontsize=9)
+            axis.set_ylabel("mm" if name == "sinkage" else "N")
+            axis.grid(alpha=0.3)
+        words = ", ".join(f"{key} {v:.3g}" if isinstance(v, float) else str(v) for key, v in values.items())
+        line[0].set_title(f"{line[0].get_title()}\n{words}", fontsize=9)
+    axes[0, 1].legend(fontsize=8)
     figure.supxlabel("time [s]")
-    figure.supylabel("force on the blade, centred mean over 0.25 s [N]")
+    table, picture = RESULT[options.kind, options.reference]
     options.results.mkdir(parents=True, exist_ok=True)
-    figure.savefig(options.results / f"histories{suffix}.png", dpi=100)
-    with (options.results / f"table{suffix}.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    for name in ("draft", "vertical"):
-        errors = [row[f"{name}_nrmse"] for row in rows]
-        logging.info("%s: median NRMSE %.3f, %.3f to %.3f", name, np.median(errors), min(errors), max(errors))
+    figure.savefig(options.results / f"{picture}.png", dpi=80)
+    write_rows(options.results / f"{table}.csv", rows, digits=6)
+    for key in [key for key in rows[0] if "nrmse" in key]:
+        errors = [row[key] for row in rows if key in row]
+        logging.info("%s: median %.3f, %.3f to %.3f", key, np.median(errors), min(errors), max(errors))
 
 
 if __name__ == "__main__":

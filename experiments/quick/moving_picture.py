@@ -9,7 +9,6 @@ It plays in real time: every third frame of 1/60 s. Writes cut.gif beside this f
 from __future__ import annotations
 
 import argparse
-from itertools import pairwise
 from pathlib import Path
 
 import matplotlib
@@ -75,28 +74,11 @@ def picture(truth: Run, network: Run, frame: int, scales: Scales) -> Image.Image
 
 
 def save(pictures: list[Image.Image], file: Path, duration: float) -> None:
-    """As a GIF with one palette; what does not change from frame to frame is left transparent, which packs better."""
+    """As a GIF with one palette; Pillow leaves out what does not change from frame to frame."""
     sample = np.vstack([np.asarray(one) for one in pictures[:: max(1, len(pictures) // 6)]])
     palette = Image.fromarray(sample).quantize(COLOURS, dither=Image.Dither.NONE)
-    indexed = [np.asarray(one.quantize(palette=palette, dither=Image.Dither.NONE)) for one in pictures]
-    still = COLOURS  # an index no picture uses
-    changed = [
-        indexed[0],
-        *(np.where(a == b, still, b) for a, b in pairwise(indexed)),
-    ]
-    images = [Image.fromarray(one.astype(np.uint8), mode="P") for one in changed]
-    for image in images:
-        image.putpalette([*palette.getpalette()[: 3 * COLOURS], 255, 0, 255])
-    images[0].save(
-        file,
-        save_all=True,
-        append_images=images[1:],
-        duration=duration,
-        loop=0,
-        transparency=still,
-        disposal=1,
-        optimize=False,
-    )
+    indexed = [one.quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures]
+    indexed[0].save(file, save_all=True, append_images=indexed[1:], duration=duration, loop=0)
 
 
 if __name__ == "__main__":

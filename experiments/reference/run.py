@@ -2,49 +2,42 @@
 
     python experiments/reference/run.py [--only cut|wheel] [--workers 2]
 
-Every finished run is kept as a line of cut.csv or wheel.csv and is not made again; positions go to data/reference. The
-figures are drawn from the tables (`--draw` does nothing else).
+Every finished run is kept as a line of cut.csv or wheel.csv and is not made again. The figures are drawn from the
+tables (`--draw` does nothing else).
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import logging
 import multiprocessing
 import re
+import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
-import matplotlib
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+import matplotlib.pyplot as plt
 import numpy as np
-from hydra import compose, initialize_config_module
-from scipy.spatial import cKDTree
+from common import composed, read_rows, write_rows
 
 from mpm_warp import Effects, Solver
 from sgns.simulate.scene import scene_from_config
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
 HERE = Path(__file__).parent
-DATA = Path("data/reference")
 DX = {"20": 0.02, "13.3": 0.8 / 60, "10": 0.01, "6.7": 0.8 / 120}
 
 CUT = ["scene=excavation", "scene.depth=0.08", "scene.duration=2.0"]
 WHEEL = ["scene=wheel", "scene.duration=3.0"]
 QUANTITIES = {
-    "cut": [
-        ("draft", "draft, mean of 2 s [N]"),
-        ("draft_second_half", "draft, second half [N]"),
-        ("vertical", "vertical force [N]"),
-    ],
-    "wheel": [
-        ("sinkage_mm", "sinkage [mm]"),
-        ("drawbar_pull", "drawbar pull [N]"),
-        ("torque", "torque [N m]"),
-    ],
+    "cut": {
+        "draft": "draft, mean of 2 s [N]",
+        "draft_second_half": "draft, second half [N]",
+        "vertical": "vertical force [N]",
+    },
+    "wheel": {"sinkage_mm": "sinkage [mm]", "drawbar_pull": "drawbar pull [N]", "torque": "torque [N m]"},
 }
 
 
@@ -87,20 +80,15 @@ def settings(kind: str) -> dict[str, list[str]]:
     }
     base = "dx 13.3, 4 per cell, margin -0.25"
     found |= {f"{base}, {change}": [*at("13.3", 4, "-0.25"), *more] for change, more in changes.items()}
-    for dx, ppc, margin in (
-        ("13.3", 8, "-0.25"),
-        ("6.7", 1, "-0.25"),
-        ("6.7", 1, "-0.75"),
-        ("6.7", 4, "-0.25"),
-    ):
+    others = ("13.3", 8, "-0.25"), ("6.7", 1, "-0.25"), ("6.7", 1, "-0.75"), ("6.7", 4, "-0.25")
+    for dx, ppc, margin in others:
         found[f"dx {dx}, {ppc} per cell, margin {margin}"] = at(dx, ppc, margin)
     return found
 
 
 def measure(kind: str, name: str, overrides: list[str]) -> dict[str, float | str]:
-    """One run; its forces [N], cost, and the file with its profile and displacements."""
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        config = compose("simulate", [*(CUT if kind == "cut" else WHEEL), *overrides])
+    """One run: its forces [N], sinkage and cost."""
+    config = composed("simulate", *(CUT if kind == "cut" else WHEEL), *overrides)
     scene = scene_from_config(config)
     effects = Effects(rate_dependence=bool(config.effects.rate_dependence is not False), symmetry=True)
     solver = Solver(scene, effects)
@@ -108,7 +96,6 @@ def measure(kind: str, name: str, overrides: list[str]) -> dict[str, float | str
     for frame in solver.frames():
         start = start if start is not None else time.process_time()
         frames.append((frame.force, frame.torque, frame.body_pose))
-        last = frame
     cost = (time.process_time() - start) / scene.duration
     force = np.array([f[0] for f in frames])[1:]
     half = len(force) // 2
@@ -136,80 +123,24 @@ def measure(kind: str, name: str, overrides: list[str]) -> dict[str, float | str
             "settled_sinkage_mm": 1e3 * sinkage[round(scene.settle * scene.frame_rate) - 1],
             "sinkage_mm": 1e3 * sinkage[driving].mean(),
         }
-    DATA.mkdir(parents=True, exist_ok=True)
-    surface, moved = on_common_points(scene, last.position)
-    np.savez_compressed(
-        DATA / f"{kind}_{name.replace(' ', '_')}.npz", force=force, surface=surface, moved=moved
-    )
     return {k: round(float(v), 3) if isinstance(v, np.floating) else v for k, v in row.items()}
 
 
-def on_common_points(scene, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The final surface on columns of 2 cm, and displacements near points 2 cm apart, so that different beds compare.
-
-    The height of a column is that of its highest particle, half a particle spacing added.
-    """
-    start, volume = scene.filled
-    lx, ly, lz = scene.bed.size
-    columns = [np.arange(0.0, length - 1e-9, 0.02) for length in (lx, ly)]
-    shape = tuple(len(c) for c in columns)
-    index = [np.clip((position[:, axis] / 0.02).astype(int), 0, shape[axis] - 1) for axis in (0, 1)]
-    surface = np.full(shape, -lz)
-    np.maximum.at(surface, tuple(index), position[:, 2] + 0.5 * volume ** (1.0 / 3.0))
-    points = np.stack(
-        np.meshgrid(*[c + 0.01 for c in columns], np.arange(-lz + 0.01, 0.0, 0.02), indexing="ij"), axis=-1
-    ).reshape(-1, 3)
-    near = cKDTree(start).query(points, k=8)[1]
-    return surface, (position[near] - start[near]).mean(axis=1)
-
-
-def rows_of(kind: str) -> dict[str, dict]:
-    file = HERE / f"{kind}.csv"
-    if not file.exists():
-        return {}
-    with file.open(newline="") as stream:
-        return {row["setting"]: row for row in csv.DictReader(stream)}
-
-
 def save(kind: str, rows: dict[str, dict]) -> None:
-    """The table in the order of the settings, with the distances from the finest run that is there."""
-    order = [name for name in settings(kind) if name in rows]
-    finest = max(order, key=lambda name: float(rows[name]["particles"]) * float(rows[name]["steps_per_s"]))
-    reference = np.load(file_of(kind, finest))
-    for name in order:
-        if not file_of(kind, name).exists():
-            continue  # an earlier sitting's, already measured
-        with np.load(file_of(kind, name)) as run:
-            rows[name] |= {
-                "surface_rms_mm": round(1e3 * rms(run["surface"] - reference["surface"]), 2),
-                "moved_rms_mm": round(1e3 * rms(run["moved"] - reference["moved"]), 2),
-                "reference": finest,
-            }
-    fields = list(dict.fromkeys(key for name in order for key in rows[name]))
-    with (HERE / f"{kind}.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, fields)
-        writer.writeheader()
-        writer.writerows(rows[name] for name in order)
+    """The table in the order of the settings."""
+    write_rows(HERE / f"{kind}.csv", [rows[name] for name in settings(kind) if name in rows], digits=6)
 
 
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def file_of(kind: str, name: str) -> Path:
-    return DATA / f"{kind}_{name.replace(' ', '_')}.npz"
-
-
-def draw(kind: str, rows: dict[str, dict], names: list[tuple[str, str]]) -> None:
+def draw(kind: str, rows: dict[str, dict]) -> None:
     """Left: each quantity over the grid spacing. Right: what one change does at one setting."""
-    figure = plt.figure(figsize=(13, 2.6 * len(names)), layout="constrained")
-    axes = figure.subplots(len(names), 2, width_ratios=(1, 1.4), squeeze=False)
+    figure = plt.figure(figsize=(13, 7.8), layout="constrained")
+    axes = figure.subplots(3, 2, width_ratios=(1, 1.4))
     grid = {
         name: m for name in rows if (m := re.fullmatch(r"dx ([\d.]+), (\d) per cell, (margin \S+)", name))
     }
     base = "dx 13.3, 4 per cell, margin -0.25"
     changed = [name for name in rows if name.startswith(base)]
-    for (left, right), (key, label) in zip(axes, names, strict=True):
+    for (left, right), (key, label) in zip(axes, QUANTITIES[kind].items(), strict=True):
         for ppc, margin in sorted({(m[2], m[3]) for m in grid.values()}):
             points = sorted(
                 (float(m[1]), float(rows[n][key])) for n, m in grid.items() if (m[2], m[3]) == (ppc, margin)
@@ -228,9 +159,7 @@ def draw(kind: str, rows: dict[str, dict], names: list[tuple[str, str]]) -> None
         right.bar(range(len(changed)), values, color=["k"] + ["C0"] * (len(changed) - 1))
         right.axhline(values[0], color="k", lw=0.8)
         right.set_xticks(range(len(changed)), [n.removeprefix(base).strip(", ") or base for n in changed])
-        right.tick_params(axis="x", rotation=60, labelsize=7)
-        for tick in right.get_xticklabels():
-            tick.set_horizontalalignment("right")
+        plt.setp(right.get_xticklabels(), rotation=60, fontsize=7, ha="right")
         if right is not axes[-1, 1]:
             right.set_xticklabels([])
         right.grid(alpha=0.3, axis="y")
@@ -247,11 +176,12 @@ def main() -> None:
     parser.add_argument("--draw", action="store_true", help="only draw the figures from the tables")
     options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    tables = {kind: rows_of(kind) for kind in ("cut", "wheel") if options.only in (None, kind)}
+    kinds = (options.only,) if options.only else ("cut", "wheel")
+    tables = {kind: {row["setting"]: row for row in read_rows(HERE / f"{kind}.csv")} for kind in kinds}
     if not options.draw:
         compute(tables, options.workers)
     for kind, rows in tables.items():
-        draw(kind, rows, QUANTITIES[kind])
+        draw(kind, rows)
 
 
 def compute(tables: dict[str, dict[str, dict]], workers: int) -> None:

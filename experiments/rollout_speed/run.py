@@ -1,4 +1,4 @@
-"""How fast are training and rollout, and what does each rearrangement of the network gain?
+"""How fast are training and rollout, and what do the rearrangements of the network gain?
 
     python experiments/rollout_speed/run.py [--threads 1 2 4]
 
@@ -10,33 +10,32 @@ random: time does not depend on them. Writes table.csv and bars.png beside this 
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import statistics
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-import matplotlib
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+import matplotlib.pyplot as plt
 import torch
-from forms import forms_of, multiplications, onednn
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from common import training_settings, write_rows
 from torch import Tensor
 
 from sgns.evaluate.costs import cpu_model
-from sgns.model.algebra import GraphStepper, product
+from sgns.model import algebra
 from sgns.model.features import BodyTrack
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.settings import ModelSettings
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
 HERE = Path(__file__).parent
+Row = dict[str, object]
+Job = Callable[[], object]
 MODES = 8
 BODY_POINTS = 15
-PARTICLES = 29_700
 NETWORKS = {
     "paper's size": ["model.body_nodes=points"],
     "default": [],
@@ -46,10 +45,9 @@ NETWORKS = {
 
 def dynamics_of(overrides: list[str]) -> LatentDynamics:
     """An untrained network without context, on 8 modes."""
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        model = OmegaConf.to_container(compose("train", overrides).model)
+    model = training_settings(*overrides)["model"] | {"context": []}
     torch.manual_seed(0)
-    dynamics = LatentDynamics(ModelSettings(**(model | {"context": []})), MODES).requires_grad_(False)
+    dynamics = LatentDynamics(ModelSettings(**model), MODES).requires_grad_(False)
     # Small changes: a path of random weights stays in the range of numbers of a trained one.
     dynamics.change.scale.fill_(1e-3)
     return dynamics
@@ -71,86 +69,33 @@ def track_of(dynamics: LatentDynamics, paths: int, frames: int, turning: bool = 
 
 
 def in_turn(
-    jobs: dict[str, Callable[[], object]], rounds: int, calls: int, warm: int = 2
+    jobs: dict[str, Job], rounds: int, calls: int, warm: int = 2, wall: bool = False
 ) -> dict[str, float]:
-    """Median processor time of a call [s], the jobs in turn; after some calls that warm the caches."""
+    """Time of a call [s], the jobs in turn: the median of processor times, or the shortest by the clock."""
+    now = time.perf_counter if wall else time.thread_time
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(rounds):
         for name, job in jobs.items():
             for _ in range(warm):
                 job()
             for _ in range(calls):
-                began = time.thread_time()
+                began = now()
                 job()
-                times[name].append(time.thread_time() - began)
-    return {name: statistics.median(values) for name, values in times.items()}
+                times[name].append(now() - began)
+    return {name: min(values) if wall else statistics.median(values) for name, values in times.items()}
 
 
-def best_by_the_clock(jobs: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Shortest time of a call [s], the jobs in turn."""
-    best = dict.fromkeys(jobs, float("inf"))
-    for _ in range(rounds):
-        for name, job in jobs.items():
-            job()
-            for _ in range(3):
-                began = time.perf_counter()
-                job()
-                best[name] = min(best[name], time.perf_counter() - began)
-    return best
+@contextmanager
+def onednn(allowed: bool) -> Iterator[None]:
+    """oneDNN's products allowed or not."""
+    before, algebra._AVAILABLE = algebra._AVAILABLE, allowed and algebra._AVAILABLE
+    try:
+        yield
+    finally:
+        algebra._AVAILABLE = before
 
 
-def time_forms(name: str, dynamics: LatentDynamics, rounds: int) -> list[dict[str, object]]:
-    """One step of the network, form by form, beside dense products of as many multiplications."""
-    network, body = dynamics.network, 1 if dynamics.settings.body_nodes == "pose" else BODY_POINTS
-    edge_index = dynamics.edge_index(MODES, body, torch.device("cpu"))
-    nodes = torch.randn(1, MODES + body, network.encode_nodes.first.in_features)
-    edges = torch.randn(1, edge_index.shape[1], network.encode_edges.first.in_features)
-    width, work = network.process[0].width, multiplications(network, MODES + body, edge_index.shape[1])
-    rows = round(work / width**2)
-    left, right, out = torch.randn(rows, width), torch.randn(width, width), torch.empty(rows, width)
-    stepper = GraphStepper(network, edge_index, MODES + body, body)
-
-    def without_onednn(job: Callable[[], object]) -> Callable[[], object]:
-        def called() -> None:
-            with onednn(False):
-                job()
-
-        return called
-
-    jobs: dict[str, Callable[[], object]] = {
-        form: without_onednn(lambda f=f: f(nodes, edges))
-        for form, f in forms_of(network, edge_index, MODES + body).items()
-    }
-    with onednn(False):
-        plain_stepper = GraphStepper(network, edge_index, MODES + body, body)
-    jobs |= {
-        "all matrices merged once, memory kept": lambda: plain_stepper(nodes[0], edges[0]),
-        "oneDNN's products": lambda: stepper(nodes[0], edges[0]),
-    }
-    if body > 1:
-        jobs["edges within the body kept"] = lambda: stepper(nodes[0], edges[0], same_body=True)
-    jobs |= {
-        "one dense product, torch.mm": lambda: torch.mm(left, right, out=out),
-        "one dense product, oneDNN": lambda: product(left, right),
-    }
-    with torch.inference_mode():
-        found = in_turn(jobs, rounds, 20)
-    return [
-        {
-            "part": "network step",
-            "network": name,
-            "what": form,
-            "us": seconds * 1e6,
-            "times_faster_than_plain": found["plain"] / seconds,
-            "times_torch_mm": seconds / found["one dense product, torch.mm"],
-            "times_onednn_product": seconds / found["one dense product, oneDNN"],
-            "note": f"{2e-6 * work:.1f} MFLOP",
-        }
-        for form, seconds in found.items()
-    ]
-
-
-def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[dict[str, object]]:
+def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[Row]:
     """Whole steps with features, force and torque: advance, a path, a path whose body turns, paths side by side."""
     frames, d = 123, dynamics.history
     latent = torch.randn(1, d, MODES, 3).double()
@@ -170,7 +115,7 @@ def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[dict
         finally:
             dynamics.network.forward = forward
 
-    jobs: dict[str, Callable[[], object]] = {
+    jobs: dict[str, Job] = {
         "advance, plain network": plainly,
         "advance": advanced,
         "a path": lambda: dynamics.unroll(latent, track),
@@ -202,36 +147,34 @@ def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[dict
 
 def time_training(
     name: str, dynamics: LatentDynamics, threads: list[int], cores: set[int], rounds: int
-) -> list[dict[str, object]]:
-    """Optimiser steps of the network with batches of 32: on one thread its processor time, form by form, the median; on
-    more the wall clock, plain and fast, the best of the rounds."""
-    network = dynamics.network.requires_grad_(True)
+) -> list[Row]:
+    """Optimiser steps of the network, plain and as it is, with batches of 32: on one thread its processor time, the
+    median; on more the wall clock, the best of the rounds."""
+    network, batch = dynamics.network.requires_grad_(True), 32
     body = 1 if dynamics.settings.body_nodes == "pose" else BODY_POINTS
     edge_index = dynamics.edge_index(MODES, body, torch.device("cpu"))
-    batch = 32
     nodes = torch.randn(batch, MODES + body, network.encode_nodes.first.in_features)
     edges = torch.randn(batch, edge_index.shape[1], network.encode_edges.first.in_features)
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4, fused=True)
 
-    def trained(form: Callable[[Tensor, Tensor], Tensor], fast_products: bool) -> None:
+    def trained(form: Callable[..., Tensor], fast_products: bool) -> None:
         with onednn(fast_products):
             optimizer.zero_grad()
-            form(nodes, edges).square().mean().backward()
+            form(nodes, edges, edge_index).square().mean().backward()
             optimizer.step()
 
-    jobs: dict[str, Callable[[], object]] = {
-        form: lambda f=f: trained(f, False) for form, f in forms_of(network, edge_index, MODES + body).items()
+    jobs: dict[str, Job] = {
+        "plain": lambda: trained(network.plain, False),
+        "oneDNN's products": lambda: trained(network, True),
     }
-    jobs["oneDNN's products"] = lambda: trained(lambda *x: network(*x, edge_index), True)
-    rows: list[dict[str, object]] = []
+    rows: list[Row] = []
     for count in threads:
         torch.set_num_threads(count)
         os.sched_setaffinity(0, cores if count > 1 else {min(cores)})
         if count == 1:
             found, clock = in_turn(jobs, rounds, 2, warm=1), "processor time, median"
         else:
-            ends = {form: jobs[form] for form in ("plain", "oneDNN's products")}
-            found, clock = best_by_the_clock(ends, rounds), "wall clock, best round"
+            found, clock = in_turn(jobs, rounds, 3, warm=1, wall=True), "wall clock, best round"
         rows += [
             {
                 "part": "training",
@@ -249,67 +192,30 @@ def time_training(
     return rows
 
 
-def time_with_basis(dynamics: LatentDynamics, device: str, rounds: int) -> dict[str, object]:
-    """The paper's variant: particles to modes and back in every step, on `device`."""
-    dynamics = dynamics.to(device)
-    basis = torch.linalg.qr(torch.randn(PARTICLES, MODES))[0].to(device)
-    mean = torch.randn(PARTICLES, 3, device=device)
-    track = BodyTrack(*(part.to(device) for part in track_of(dynamics, 1, dynamics.history)))
-    stepper = dynamics.stepper(BODY_POINTS)
-    history = torch.randn(1, dynamics.history, MODES, 3, device=device).double()
-
-    def step() -> None:
-        following = stepper.advance(history, track).latent[0].float()
-        soil = basis @ following + mean
-        latent = basis.T @ (soil - mean)
-        if device == "cuda":
-            torch.cuda.synchronize()
-        assert latent.shape == (MODES, 3)
-
-    with torch.inference_mode():
-        seconds = best_by_the_clock({"": step}, 10 * rounds)[""]
-    dynamics.to("cpu")
-    return {
-        "part": "with PCA and inverse",
-        "network": "paper's size",
-        "what": f"one step, {device}",
-        "us": 1e6 * seconds,
-        "note": f"{PARTICLES} particles, wall clock, best round",
-    }
-
-
-def draw(rows: list[dict[str, object]]) -> None:
-    """Bars: forms of the step at the paper's size, training there, whole steps of the three networks."""
-    figure, axes = plt.subplots(1, 3, figsize=(15, 3.8), layout="constrained")
+def draw(rows: list[Row]) -> None:
+    """Bars: whole steps and training of the three networks, on one core."""
+    figure, axes = plt.subplots(1, 2, figsize=(12, 3.8), layout="constrained")
     panels = (
-        ("network step, paper's size, one core [µs]", "network step", "us", lambda r: r["network"] == "paper's size"),
-        ("training, paper's size, one thread [samples/s]", "training", "samples_per_s",
-         lambda r: r["network"] == "paper's size" and r["threads"] == 1),
-        ("whole step per path, one core [µs]", "rollout", "us", lambda r: True),
-    )  # fmt: skip
-    for axis, (title, part, key, chosen) in zip(axes, panels, strict=True):
-        shown = [row for row in rows if row["part"] == part and chosen(row)]
-        prefix = part == "rollout"
-        names = [f"{row['network']}: {row['what']}" if prefix else str(row["what"]) for row in shown]
-        values = [float(row[key]) for row in shown]
-        colours = ["0.5" if "dense" in n or "plain" in n else "C0" for n in names]
-        axis.bar_label(axis.barh(names, values, color=colours), fmt=" %.0f", fontsize=7)
+        ("rollout", "us", "whole step per path [µs]"),
+        ("training", "samples_per_s", "training [samples/s]"),
+    )
+    for axis, (part, key, title) in zip(axes, panels, strict=True):
+        shown = [row for row in rows if row["part"] == part and row.get("threads", 1) == 1]
+        names = [f"{row['network']}: {row['what']}" for row in shown]
+        colours = ["0.5" if "plain" in name else "C0" for name in names]
+        bars = axis.barh(names, [row[key] for row in shown], color=colours)
+        axis.bar_label(bars, fmt=" %.0f", fontsize=7)
         axis.set_title(title, fontsize=9)
-        axis.set_xlim(0, 1.2 * max(values))
+        axis.margins(x=0.2)
         axis.tick_params(labelsize=7)
         axis.invert_yaxis()
     figure.savefig(HERE / "bars.png", dpi=130)
 
 
-def in_digits(row: dict[str, object]) -> dict[str, object]:
-    """Numbers with four digits."""
-    return {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()}
-
-
-def told(rows: list[dict[str, object]]) -> list[dict[str, object]]:
+def told(rows: list[Row]) -> list[Row]:
     """The rows, printed."""
     for row in rows:
-        print(*(f"{key}={value}" for key, value in in_digits(row).items() if key != "note"), flush=True)
+        print(*(f"{key}={value}" for key, value in row.items() if key != "note"), flush=True)
     return rows
 
 
@@ -321,23 +227,13 @@ def main() -> None:
     torch.set_num_threads(1)
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})
-    rows: list[dict[str, object]] = []
+    rows: list[Row] = []
     for name, overrides in NETWORKS.items():
         dynamics = dynamics_of(overrides)
-        rows += told(time_forms(name, dynamics, options.rounds))
         rows += told(time_rollouts(name, dynamics, max(2, options.rounds // 3)))
-        if name == "paper's size":
-            for device in ("cpu", *(["cuda"] if torch.cuda.is_available() else [])):
-                rows += told([time_with_basis(dynamics, device, options.rounds)])
         rows += told(time_training(name, dynamics, options.threads, cores, options.rounds))
     machine = f"{cpu_model()}, {len(cores)} of {os.cpu_count()} cores"
-    with (HERE / "table.csv").open("w", newline="") as stream:
-        keys = ["part", "network", "what", "threads", "us", "samples_per_s", "times_faster_than_plain",
-                "times_torch_mm", "times_onednn_product", "note", "machine"]  # fmt: skip
-        writer = csv.DictWriter(stream, keys)
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({"threads": 1} | in_digits(row) | {"machine": machine})
+    write_rows(HERE / "table.csv", [{"threads": 1} | row | {"machine": machine} for row in rows])
     draw(rows)
 
 

@@ -10,16 +10,18 @@ only: its speed does not depend on how good it is. Writes table.csv and bars.png
 from __future__ import annotations
 
 import argparse
-import csv
 import logging
 import os
 import statistics
+import sys
 import tempfile
 from pathlib import Path
 
-import matplotlib
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+import matplotlib.pyplot as plt
 import torch
-from hydra import compose, initialize_config_module
+from common import composed, training_settings, write_rows
 from omegaconf import OmegaConf
 
 from sgns.data.dataset import Dataset
@@ -32,9 +34,6 @@ from sgns.simulate.scene import asked_effects, decided, scene_from_config
 from sgns.simulator import Simulator
 from sgns.train.command import train
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
 HERE = Path(__file__).parent
 
 
@@ -45,16 +44,10 @@ def make_simulator(config, folder: Path) -> Simulator:
     settings = {"name": "speed", "path": folder / "data", "draw": {"depth": [0.03, 0.05, 0.08]}}
     campaign = plan(settings, short, asked_effects(config), "float32", seed=0)
     simulate_campaign(campaign, device="cpu", workers=1)
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        learning = OmegaConf.to_container(compose("train", ["training.max_steps=20"]), resolve=False)
+    learning = training_settings("training.max_steps=20")
     reduced = reduce_dataset(Dataset.open(campaign.path), learning["reduction"], progress=False)
-    train(
-        reduced,
-        num_modes=8,
-        model=learning["model"],
-        training=learning["training"],
-        output=folder / "training",
-    )
+    settings = {key: learning[key] for key in ("model", "training")}
+    train(reduced, num_modes=8, **settings, output=folder / "training")
     return Simulator.load(folder / "training" / "best.ckpt")
 
 
@@ -65,10 +58,8 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     torch.set_num_threads(1)
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        config = compose(
-            "simulate", ["scene=paper_excavation", "scene.depth=0.08", "scene.speed=0.10", "scene.rake=10"]
-        )
+    cut = ("scene.depth=0.08", "scene.speed=0.10", "scene.rake=10")
+    config = composed("simulate", "scene=paper_excavation", *cut)
     scene = scene_from_config(config)
     effects, _ = decided(scene, asked_effects(config))
     with tempfile.TemporaryDirectory() as temporary:
@@ -97,20 +88,17 @@ def main() -> None:
             {
                 "what": what,
                 "included": included,
-                "s_per_simulated_s": f"{median:.4g}",
-                "min": f"{min(values):.4g}",
-                "max": f"{max(values):.4g}",
+                "s_per_simulated_s": median,
+                "min": min(values),
+                "max": max(values),
                 "repeats": len(values),
-                "times_faster_than_solver": f"{reference / median:.4g}",
+                "times_faster_than_solver": reference / median,
                 "machine": f"one core of {cpu_model()}",
             }
         )
-    with (HERE / "table.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(HERE / "table.csv", rows)
     figure, axis = plt.subplots(figsize=(7, 2.2), layout="constrained")
-    names, times = [r["what"] for r in rows], [float(r["s_per_simulated_s"]) for r in rows]
+    names, times = [r["what"] for r in rows], [r["s_per_simulated_s"] for r in rows]
     bars = axis.barh(names, times, color=["0.3", "C0", "C0"])
     axis.bar_label(bars, [f" {t:.3g} s" for t in times])
     axis.axvline(1.0, color="C3", ls="--", lw=1)
@@ -119,7 +107,9 @@ def main() -> None:
     axis.invert_yaxis()
     figure.savefig(HERE / "bars.png", dpi=130)
     for row in rows:
-        print(*(row[key] for key in ("what", "s_per_simulated_s", "times_faster_than_solver")), sep="  ")
+        print(
+            row["what"], f"{row['s_per_simulated_s']:.4g}", f"{row['times_faster_than_solver']:.4g}", sep="  "
+        )
     print(f"solver: {statistics.median(rates) / 1e6:.2f} M particle-steps/s")
 
 

@@ -18,7 +18,6 @@ A command with a row in the table is not repeated.
 from __future__ import annotations
 
 import argparse
-import csv
 import importlib.util
 import json
 import logging
@@ -48,69 +47,24 @@ from sgns.model.checkpoint import load_surrogate, read_checkpoint
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import read_reduced
 
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+from common import read_rows, write_rows
+
 log = logging.getLogger(__name__)
 
-BED = [
-    "scene=quick_excavation",
-    "scene.bed.size=[0.4,0.2,0.16]",
-    "scene.bed.spacing=0.04",
-    "scene.blade.length=0.1",
-    "scene.blade.width=0.1",
-    "scene.blade.thickness=0.08",
-]
-SIMULATE = [
-    "simulate",
-    "dataset=quick",
-    "dataset.path={data}",
-    "dataset.draw=[{rake:[0.0,10.0,20.0],depth:[0.02,0.04]}]",
-    "dataset.runs=4",
-    *BED[1:],
-    "scene.speed=0.04",
-    "scene.duration=2.0",
-]
-REDUCE = [
-    "reduce",
-    "dataset.path={data}",
-    "reduction.max_modes=24",
-    "reduction.num_modes=8",
-    "output={folder}",
-]
-TRAIN = [
-    "train",
-    "dataset.path={data}",
-    "reduction.max_modes=24",
-    "reduction.num_modes=8",
-    "model.hidden_width=16",
-    "model.message_passing_steps=1",
-    "training.max_steps=100",
-    "training.validate_every=20",
-    "training.warmup_steps=10",
-    "training.threads=1",
-    "output={folder}",
-]
-TRAIN_POLYNOMIAL = [
-    "train",
-    "dataset.path={data}",
-    "model=polynomial",
-    "reduction.max_modes=24",
-    "reduction.num_modes=8",
-    "training.threads=1",
-    "output={folder}",
-]
-ROLLOUT = [
-    "rollout",
-    *BED,
-    "scene.rake=15.0",
-    "scene.speed=0.003",
-    "scene.duration=60.0",
-    "checkpoint={checkpoint}",
-    "output={folder}/rollout.h5",
-]
+BED = """scene.bed.size=[0.4,0.2,0.16] scene.bed.spacing=0.04
+    scene.blade.length=0.1 scene.blade.width=0.1 scene.blade.thickness=0.08"""
+MODES = "reduction.max_modes=24 reduction.num_modes=8 output={folder}"
+ROLLOUT = f"""rollout scene=quick_excavation {BED} scene.rake=15.0 scene.speed=0.003 scene.duration=60.0
+    checkpoint={{checkpoint}} output={{folder}}/rollout.h5"""
 COMMANDS = {
-    "simulate": SIMULATE,
-    "reduce": REDUCE,
-    "train": TRAIN,
-    "train polynomial": TRAIN_POLYNOMIAL,
+    "simulate": f"""simulate dataset=quick dataset.path={{data}} {BED} scene.speed=0.04 scene.duration=2.0
+        dataset.draw=[{{rake:[0.0,10.0,20.0],depth:[0.02,0.04]}}] dataset.runs=4""",
+    "reduce": f"reduce dataset.path={{data}} {MODES}",
+    "train": f"""train dataset.path={{data}} {MODES} model.hidden_width=16 model.message_passing_steps=1
+        training.max_steps=100 training.validate_every=20 training.warmup_steps=10 training.threads=1""",
+    "train polynomial": f"train dataset.path={{data}} model=polynomial {MODES} training.threads=1",
     "rollout": ROLLOUT,
     "rollout polynomial": ROLLOUT,
 }
@@ -120,37 +74,31 @@ TRAINED = {"rollout": "train", "rollout polynomial": "train polynomial"}
 
 @dataclass
 class Row:
-    """What happened to one command."""
+    """What happened to one command; numbers of kills and of files."""
 
     command: str
-    kills: int = 0
-    """SIGKILLs that hit a running process; the next four add up to them."""
-    before_work: int = 0
-    """Kills before the command had read its settings."""
-    at_work: int = 0
-    """Kills between that and the command's end without a half-written file."""
-    while_writing: int = 0
-    """Kills that left a hidden half of a file."""
-    after_work: int = 0
-    """Kills between the command's last word and the end of the process."""
-    at_a_write: int = 0
-    """Kills of all these that came at a call of `os.fsync` or `os.replace` and not by the clock."""
-    of_workers: int = 0
-    """Kills of all these that hit a campaign's worker process instead of the command itself."""
-    with_results: int = 0
-    """Kills of all these after which some files of the result were complete."""
-    corrupt: int = 0
+    kills: float = 0
+    """SIGKILLs that hit a running process."""
+    while_writing: float = 0  # of them, with a hidden half of a file left
+    at_a_write: float = 0  # of them, at a call of `os.fsync` or `os.replace` and not by the clock
+    of_workers: float = 0  # of them, a campaign's worker process was hit
+    corrupt: float = 0
     """Files under their final name that were not whole."""
-    completed: int = 0
+    completed: float = 0
     """Times that the command was complete at last, each after some kills."""
-    equal: int = 0
+    equal: float = 0
     """Those of them whose result was that of the undisturbed command, bit for bit."""
-    orphans: int = 0
+    orphans: float = 0
     """Processes that outlived the command by more than half a minute."""
-    leftovers: int = 0
+    leftovers: float = 0
     """Hidden files beside a complete result."""
     undisturbed_s: float = 0.0
     """Processor time of the undisturbed command, the imports of its first process left out [s]."""
+
+    @property
+    def nothing_lost(self) -> bool:
+        """Whether the command came through."""
+        return self.equal == self.completed > 0 and self.corrupt == self.orphans == self.leftovers == 0
 
 
 def main() -> int:
@@ -164,9 +112,13 @@ def main() -> int:
     asked = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     torch.set_num_threads(1)
-    for command, *_ in COMMANDS.values():  # here, so that no time of the commands goes into imports
-        importlib.import_module(cli.COMMANDS[command].module)
-    done = {row.command: row for row in read_rows(asked.table)}
+    for line in COMMANDS.values():  # here, so that no time of the commands goes into imports
+        importlib.import_module(cli.COMMANDS[line.split()[0]].module)
+    numbers = [field.name for field in fields(Row)[1:]]
+    done = {
+        row["command"]: Row(row["command"], **{key: float(row[key]) for key in numbers})
+        for row in read_rows(asked.table)
+    }
     with tempfile.TemporaryDirectory(prefix="sgns_kills_") as name:
         bench = Bench(Path(name), asked.data)
         for command in asked.commands or COMMANDS:
@@ -175,14 +127,9 @@ def main() -> int:
                 continue
             chance = np.random.default_rng([asked.seed, list(COMMANDS).index(command)])
             done[command] = bench.killed_often(command, asked.kills, chance)
-            write_rows(asked.table, [done[name] for name in COMMANDS if name in done])
+            write_rows(asked.table, [asdict(done[name]) for name in COMMANDS if name in done])
             log.info("%s", done[command])
-    return int(any(not nothing_lost(done[name]) for name in asked.commands or COMMANDS))
-
-
-def nothing_lost(row: Row) -> bool:
-    """Whether the command came through."""
-    return row.equal == row.completed > 0 and row.corrupt == row.orphans == row.leftovers == 0
+    return int(any(not done[name].nothing_lost for name in asked.commands or COMMANDS))
 
 
 class Bench:
@@ -216,7 +163,7 @@ class Bench:
 
     def killed(self, row: Row, folder: Path, chance: np.random.Generator) -> bool:
         """Begin the command and kill it; says whether it was hit, or complete before."""
-        given = self.given(row.command, folder)
+        self.give(row.command, folder)
         moments = self.writes[row.command] if row.command != "simulate" else 0
         if moments and chance.integers(2):
             begun = self.begin(row.command, folder, fatal=int(chance.integers(moments)))
@@ -233,50 +180,37 @@ class Bench:
         row.corrupt += len(wrong)
         for line in wrong:
             log.info("%s: %s", row.command, line)
-        if hit:
-            files = [path for path in folder.rglob("*") if path.is_file() and path not in given]
-            writing = any(path.suffix == ".partial" for path in files)
-            row.kills += 1
-            row.while_writing += writing
-            row.before_work += not writing and begun.stage == BEFORE
-            row.at_work += not writing and begun.stage == WORK
-            row.after_work += not writing and begun.stage == AFTER
-            row.with_results += any(path.suffix in READERS and path.name[0] != "." for path in files)
+        row.kills += hit
+        row.while_writing += hit and any(folder.rglob("*.partial"))
         return hit
 
     def undisturbed(self, command: str) -> Path:
         """Folder of the result of the undisturbed command."""
         folder = self.folder / command.replace(" ", "_")
         if command not in self.seconds:
-            self.given(command, folder)
+            self.give(command, folder)
             begun = self.begin(command, folder)
             begun.wait()
             self.seconds[command], self.writes[command] = begun.spent, begun.writes
         return folder
 
-    def given(self, command: str, folder: Path) -> set[Path]:
-        """Files that a command finds in its folder: the dataset, beside which the reduced runs go."""
+    def give(self, command: str, folder: Path) -> None:
+        """Put the dataset there, beside which the reduced runs go."""
         folder.mkdir(parents=True, exist_ok=True)
-        if "dataset.path={data}" not in COMMANDS[command] or command == "simulate":
-            return set()
-        source, data = self.data or self.undisturbed("simulate") / "data", folder / "data"
-        if not data.exists():
-            shutil.copytree(source, data)
-        return {data / path.relative_to(source) for path in source.rglob("*")}
+        if "dataset.path={data}" in COMMANDS[command] and command != "simulate":
+            source = self.data or self.undisturbed("simulate") / "data"
+            if not (folder / "data").exists():
+                shutil.copytree(source, folder / "data")
 
     def begin(self, command: str, folder: Path, fatal: int | None = None) -> Begun:
         """Begin a command with its result in `folder`; a checkpoint is that of the undisturbed training."""
         places = {"folder": folder, "data": folder / "data", "checkpoint": ""}
         if command in TRAINED:
             places["checkpoint"] = self.undisturbed(TRAINED[command]) / "best.ckpt"
-        arguments = COMMANDS[command]
+        arguments = COMMANDS[command].split()
         for name, place in places.items():
             arguments = [argument.replace(f"{{{name}}}", str(place)) for argument in arguments]
         return Begun(arguments, self.folder / "log.txt", fatal)
-
-
-BEFORE, WORK, AFTER = range(3)
-"""Stages of a command: settings are read; the command itself; its process ends."""
 
 
 class Begun:
@@ -295,20 +229,15 @@ class Begun:
         self.spent = 0.0
         """Processor time of them all [s]."""
         self.status: int | None = None
-        self._shared = np.frombuffer(mmap.mmap(-1, 16), np.int64)
+        self._shared = np.frombuffer(mmap.mmap(-1, 8), np.int64)
         self.pid = os.fork()
         if self.pid == 0:
             self._be(arguments, fatal)
 
     @property
-    def stage(self) -> int:
-        """The stage in which the command is, or ended."""
-        return int(self._shared[0])
-
-    @property
     def writes(self) -> int:
         """Moments at writes that have passed."""
-        return int(self._shared[1])
+        return int(self._shared[0])
 
     def _be(self, arguments: list[str], fatal: int | None) -> None:
         status = 1
@@ -320,8 +249,6 @@ class Begun:
             # So that worker processes begin as those of `python -m sgns` do, without this file and its imports.
             sys.modules["__main__"] = types.ModuleType("__main__")
             sys.modules["__main__"].__spec__ = importlib.util.find_spec("sgns.__main__")
-            module = importlib.import_module(cli.COMMANDS[arguments[0]].module)
-            module.main = self._staged(module.main)
             for name in ("fsync", "replace"):
                 setattr(os, name, self._counted(getattr(os, name), fatal))
             status = cli.main()
@@ -332,20 +259,11 @@ class Begun:
             sys.stderr.flush()
             os._exit(status)
 
-    def _staged(self, main: Callable[..., Any]) -> Callable[..., Any]:
-        def staged(*args: Any) -> Any:
-            self._shared[0] = WORK
-            result = main(*args)
-            self._shared[0] = AFTER
-            return result
-
-        return staged
-
     def _counted(self, write: Callable[..., Any], fatal: int | None) -> Callable[..., Any]:
         def moment() -> None:
             if self.writes == fatal:
                 os.kill(os.getpid(), signal.SIGKILL)
-            self._shared[1] += 1
+            self._shared[0] += 1
 
         def counted(*args: Any, **settings: Any) -> Any:
             moment()
@@ -521,26 +439,6 @@ def as_bytes(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: as_bytes(one) for key, one in value.items()}
     return [as_bytes(one) for one in value] if isinstance(value, (list, tuple)) else value
-
-
-def read_rows(table: Path) -> list[Row]:
-    """Rows of an earlier call."""
-    if not table.exists():
-        return []
-    kinds = {field.name: type(field.default) for field in fields(Row) if field.name != "command"}
-    with table.open(newline="") as file:
-        return [
-            Row(**{k: kinds[k](v) if k in kinds else v for k, v in row.items()})
-            for row in csv.DictReader(file)
-        ]
-
-
-def write_rows(table: Path, rows: list[Row]) -> None:
-    """The table of all rows."""
-    with table.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(Row)])
-        writer.writeheader()
-        writer.writerows(map(asdict, rows))
 
 
 if __name__ == "__main__":

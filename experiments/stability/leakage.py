@@ -7,8 +7,6 @@ Writes leakage.csv beside this script; under a minute on one core.
 
 from __future__ import annotations
 
-import csv
-import logging
 import sys
 from pathlib import Path
 
@@ -18,7 +16,9 @@ from mpm_warp import Excavation, Plate, SceneError, Solver
 from mpm_warp.diagnostics import leakage
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(1, str(HERE.parents[1] / "support"))
+sys.path[1:1] = [str(HERE.parent), str(HERE.parents[1] / "support")]
+
+from common import write_rows  # noqa: E402
 
 from sgns_testing.scenes import cut  # noqa: E402
 
@@ -30,9 +30,8 @@ CUTTING = 0.4  # the draft is the mean from here on [s]
 
 def pushed_plate(thickness: float, margin: float) -> Excavation:
     """A plate that goes 4 cm down and then 10 cm forward, as in test_plates_do_not_leak."""
-    spacing = cut().bed.spacing
     return cut(
-        blade=Plate(length=0.2, width=0.193, thickness=thickness * spacing),
+        blade=Plate(length=0.2, width=0.193, thickness=thickness * cut().bed.spacing),
         contact_margin=margin,
         motion="path",
         path=tuple((t, x, 0.2, z, 0, 0, 0, 1) for t, x, z in PATH),
@@ -41,29 +40,18 @@ def pushed_plate(thickness: float, margin: float) -> Excavation:
     )
 
 
-def measure(thickness: float, margin: float) -> tuple[float, float, float]:
+def measure(thickness: float, margin: float) -> dict[str, float | str]:
     """Shares of the soil that go through the outline and further than half a spacing from its edges; draft [N]."""
-    scene = pushed_plate(thickness, margin)
-    frames = list(Solver(scene).frames())
-    draft = -np.mean([f.force[0] for f in frames if f.time >= CUTTING])
-    return leakage(frames, scene.body), leakage(frames, scene.body, 0.5 * scene.bed.spacing), draft
-
-
-def main() -> None:
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    with (HERE / "leakage.csv").open("w", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["thickness", "contact_margin", "through", "through_inside", "draft", "refused"])
-        for thickness in THICKNESSES:
-            for margin in MARGINS:
-                try:
-                    through, inside, draft = measure(thickness, margin)
-                    row = [thickness, margin, f"{through:.4f}", f"{inside:.4f}", f"{draft:.1f}", ""]
-                except SceneError as error:
-                    row = [thickness, margin, "", "", "", str(error)]
-                logging.info("%s", row)
-                writer.writerow(row)
+    row: dict[str, float | str] = {"thickness": thickness, "contact_margin": margin}
+    try:
+        scene = pushed_plate(thickness, margin)
+        frames = list(Solver(scene).frames())
+    except SceneError as error:
+        return row | {"refused": str(error)}
+    row["through"] = leakage(frames, scene.body)
+    row["through_inside"] = leakage(frames, scene.body, 0.5 * scene.bed.spacing)
+    return row | {"draft": -float(np.mean([f.force[0] for f in frames if f.time >= CUTTING]))}
 
 
 if __name__ == "__main__":
-    main()
+    write_rows(HERE / "leakage.csv", [measure(one, other) for one in THICKNESSES for other in MARGINS])

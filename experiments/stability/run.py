@@ -9,7 +9,6 @@ table.csv and margins.png beside this script when all cases have been measured.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import logging
 import math
@@ -18,17 +17,22 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 from hard_cases import AREAS, Case, Row, cases
-from margins import draw
 
 from sgns.data.files import write_whole
 
 HERE = Path(__file__).resolve().parent
+sys.path.insert(1, str(HERE.parent))
+
+from common import write_rows  # noqa: E402
+
 log = logging.getLogger(__name__)
 LONGEST = 1800.0  # seconds that a case may take
+LEAST, MOST = 1e-4, 1e2  # measured / limit that the figure shows
 
 
 def row_file(folder: Path, area: str, name: str) -> Path:
@@ -69,33 +73,39 @@ def measure(area: str, case: Case, folder: Path) -> Row:
     if row is None:
         row = case.row(area, (math.nan, note), time.perf_counter() - start)
         keep(file, row)
-    log.info(
-        "%-4s %s: %s: %.3g %s (limit %g), %.0f s %s",
-        row.result,
-        area,
-        row.name,
-        row.measured,
-        row.unit,
-        row.limit,
-        row.seconds,
-        row.note,
-    )
+    words = f"{row.result:4} {area}: {row.name}: {row.measured:.3g} {row.unit} (limit {row.limit:g})"
+    log.info("%s, %.0f s %s", words, row.seconds, row.note)
     return row
 
 
 def write_table(file: Path, rows: list[Row]) -> None:
     """All rows as CSV."""
-    with file.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, [f.name for f in fields(Row)])
-        writer.writeheader()
-        for row in rows:
-            numbers = {
-                "measured": f"{row.measured:.4g}",
-                "limit": f"{row.limit:g}",
-                "margin": f"{row.margin:.3f}",
-                "seconds": f"{row.seconds:.1f}",
-            }
-            writer.writerow(asdict(row) | numbers)
+    formats = {"measured": ".4g", "limit": "g", "margin": ".3f", "seconds": ".1f"}
+    write_rows(
+        file,
+        [asdict(row) | {key: f"{getattr(row, key):{to}}" for key, to in formats.items()} for row in rows],
+    )
+
+
+def draw(rows: list[Row], file: Path) -> None:
+    """Measured over limit of every case on a logarithmic axis; what broke down is at its end."""
+    figure, axis = plt.subplots(figsize=(9.0, 0.2 * len(rows) + 1.5), layout="constrained")
+    for place, row in enumerate(rows):
+        known = math.isfinite(row.measured) and row.limit > 0.0
+        share = row.measured / row.limit if known else LEAST if row.passed else MOST
+        share = min(max(share, LEAST), MOST)
+        axis.barh(
+            place, share - LEAST, left=LEAST, color="tab:green" if row.passed else "tab:red", height=0.7
+        )
+        text = f" {row.measured:.2g} {row.unit}" if math.isfinite(row.measured) else " broke down"
+        axis.text(min(share, MOST / 8.0), place, text, va="center", fontsize=6.5)
+    axis.axvline(1.0, color="black", linewidth=1.0)
+    axis.set(xscale="log", xlim=(LEAST, MOST), ylim=(len(rows) - 0.4, -0.6))
+    axis.set_yticks(range(len(rows)), [f"{row.area}: {row.name}" for row in rows], fontsize=7)
+    axis.set_xlabel("measured / limit (1: at the limit)")
+    axis.grid(axis="x", linewidth=0.3)
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
 
 
 def main() -> None:
@@ -108,24 +118,22 @@ def main() -> None:
     options = parser.parse_args()
     if options.one:
         area, name = options.one
-        row = cases(area)[name].run(area)
-        keep(row_file(options.rows, area, name), row)
+        keep(row_file(options.rows, area, name), cases(area)[name].run(area))
         return
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    wanted = [(area, case) for area in AREAS for case in cases(area).values()]
-    chosen = [(area, case) for area, case in wanted if options.only in f"{area} {case.name}"]
-    missing = [
-        (area, case)
-        for area, case in chosen
-        if options.fresh or not stored(row_file(options.rows, area, case.name), case)
-    ]
+    files = {
+        (area, case): row_file(options.rows, area, case.name)
+        for area in AREAS
+        for case in cases(area).values()
+    }
+    chosen = [(area, case) for area, case in files if options.only in f"{area} {case.name}"]
+    missing = [one for one in chosen if options.fresh or not stored(files[one], one[1])]
     log.info("%d cases, %d to measure", len(chosen), len(missing))
     with ThreadPoolExecutor(options.workers) as pool:
         list(pool.map(lambda item: measure(*item, options.rows), missing))
-    rows = [stored(row_file(options.rows, area, case.name), case) for area, case in wanted]
-    done = [row for row in rows if row is not None]
-    log.info("%d of %d cases measured, %d fail", len(done), len(wanted), sum(not row.passed for row in done))
-    if len(done) == len(wanted):
+    done = [row for (_, case), file in files.items() if (row := stored(file, case))]
+    log.info("%d of %d cases measured, %d fail", len(done), len(files), sum(not row.passed for row in done))
+    if len(done) == len(files):
         write_table(HERE / "table.csv", done)
         draw(done, HERE / "margins.png")
 

@@ -75,39 +75,27 @@ def main() -> None:
     else:
         soil = bed(options.particles)
         # Frames so short that the clock is looked at often, also with many particles.
-        steps = max(1, round(BLOCK / len(soil.filled[0])))
-        scene = Scene(
-            bed=soil,
-            material=MATERIAL,
-            duration=60.0,
-            frame_rate=1.0 / (steps * time_step(options.particles)),
-        )
+        rate = 1.0 / (max(1, round(BLOCK / len(soil.filled[0]))) * time_step(options.particles))
+        scene = Scene(bed=soil, material=MATERIAL, duration=60.0, frame_rate=rate)
         effects = Effects(rate_dependence=False)
     solver = Solver(scene, effects)
-    frames = solver.frames()
+    frames, seconds = solver.frames(), options.seconds
     begin, warm = time.process_time(), 0
-    while (
-        warm < (options.warm if options.blade else 3) or time.process_time() - begin < 0.3 * options.seconds
-    ):
+    while warm < (options.warm if options.blade else 3) or time.process_time() - begin < 0.3 * seconds:
         next(frames)
         warm += 1
-    rates, costs, stop = [], [], time.process_time() + options.seconds
-    while len(rates) < 3 or time.process_time() < stop:
+    times, stop = [], time.process_time() + seconds
+    while len(times) < 3 or time.process_time() < stop:
         begin = time.process_time()
         next(frames)
-        spent = time.process_time() - begin
-        rates.append(solver.particle_count * solver.substeps_per_frame / spent)
-        costs.append(spent * scene.frame_rate)
-    print(
-        json.dumps(
-            {
-                "version": f"warp {wp.__version__}",
-                "particles": solver.particle_count,
-                "rates": rates,
-                "s_per_simulated_s": costs,
-            }
-        )
-    )
+        times.append(time.process_time() - begin)
+    found = {
+        "version": f"warp {wp.__version__}",
+        "particles": solver.particle_count,
+        "rates": [solver.particle_count * solver.substeps_per_frame / spent for spent in times],
+        "s_per_simulated_s": [spent * scene.frame_rate for spent in times],
+    }
+    print(json.dumps(found))
 
 
 if __name__ == "__main__":

@@ -53,38 +53,18 @@ CASES = [  # grid spacing [m], particles per cell, share of the largest time ste
 def measure() -> list[dict]:
     rows = []
     for spacing, ppc, courant in CASES:
-        scene = layer(spacing, ppc, courant)
-        for height, speed, steady in zip(*profile(scene), strict=True):
-            rows.append(
-                {
-                    "spacing": spacing,
-                    "particles_per_cell": ppc,
-                    "courant": courant,
-                    "height": height,
-                    "speed": speed,
-                    "theory": steady,
-                }
-            )
+        layers = zip(*profile(layer(spacing, ppc, courant)), strict=True)
+        case = {"spacing": spacing, "particles_per_cell": ppc, "courant": courant}
+        rows += [case | {"height": z, "speed": speed, "theory": steady} for z, speed, steady in layers]
     return rows
 
 
-def draw(figure, rows: list[dict]) -> None:
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, ppc in zip(axes, (1, 8), strict=True):
-        for spacing, _, courant in [c for c in CASES if c[1] == ppc]:
-            key = (spacing, ppc, courant)
-            found = [r for r in rows if (r["spacing"], r["particles_per_cell"], r["courant"]) == key]
-            axis.plot(
-                [r["speed"] for r in found],
-                [1e3 * r["height"] for r in found],
-                "o-" if courant > 0.5 else "s--",
-                ms=3,
-                label=f"dx {1e3 * spacing:g} mm, courant {courant}",
-            )
-        height = np.linspace(0.0, THICKNESS, 200)
-        axis.plot(layer(0.003, 1).steady_velocity(height), 1e3 * height, "k-", lw=1, label="theory")
-        axis.set_title(f"{ppc} per cell")
-        axis.set_xlabel("speed after 2 s [m/s]")
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
-    axes[0].set_ylabel("height [mm]")
+PLOT = {
+    "x": "height",
+    "y": "speed",
+    "theory": "theory",
+    "curves": ["spacing", "courant"],
+    "panels": ["particles_per_cell"],
+    "xlabel": "height [m]",
+    "ylabel": "speed after 2 s [m/s]",
+}

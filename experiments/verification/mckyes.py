@@ -10,9 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mpm_warp import Bed, Effects, Material, MeshBody, Plate, Scene, Solver, Walls
-from mpm_warp.bodies import Tool
-from mpm_warp.poses import about_y, rotate
+from mpm_warp import Bed, Effects, Material, MeshBody, Scene, Solver, Walls
 
 ANGLE = math.degrees(math.atan(0.76))  # of friction, of the paper's sand [degrees]
 WALL_ANGLE = math.atan(0.3)  # of friction between soil and blade [rad]
@@ -32,7 +30,7 @@ class BuriedBlade(Scene):
     """A raked blade whose lower front edge is at `depth`, with an open trench behind it, moves along x."""
 
     kind: str = "buried_blade"
-    blade: Tool = field(default_factory=Plate)
+    blade: MeshBody = field(kw_only=True)
     rake: float = 0.0
     """Of the front from vertical, tip leading [degrees]."""
     depth: float = 0.08
@@ -41,7 +39,7 @@ class BuriedBlade(Scene):
     """[m/s]"""
 
     @property
-    def body(self) -> Tool:
+    def body(self) -> MeshBody:
         return self.blade
 
     @property
@@ -53,7 +51,7 @@ class BuriedBlade(Scene):
         trench = (
             (x < front) & (z > -self.depth) & (np.abs(y - 0.5 * self.bed.size[1]) < self.blade.half_size[1])
         )
-        return positions[~(trench | self._inside(positions))], volume
+        return positions[~trench], volume
 
     @cached_property
     def gap(self) -> float:
@@ -64,62 +62,36 @@ class BuriedBlade(Scene):
         off = x[facing] - FACE + (z[facing] + self.depth) * math.tan(lean)
         return float(np.min(off)) - self.contact_distance / math.cos(lean)
 
-    def _inside(self, positions: np.ndarray) -> np.ndarray:
-        """Which soil would stand within a plate's square end."""
-        if not isinstance(self.blade, Plate):
-            return np.zeros(len(positions), dtype=bool)
-        turned = about_y(-math.radians(self.rake))
-        local = np.abs(rotate(turned * (-1.0, -1.0, -1.0, 1.0), positions - self._centre(turned)))
-        return np.all(local < self.blade.half_size + self.contact_distance, axis=1)
-
     @property
     def soil_volume(self) -> float:
         positions, volume = self.filled
         return len(positions) * volume
 
-    def _centre(self, turned: np.ndarray) -> np.ndarray:
-        """Where the blade's origin is with its lower front edge at FACE, shape (3,)."""
-        if isinstance(self.blade, Plate):
-            edge = rotate(turned, self.blade.half_size * (1.0, 0.0, -1.0))
-        else:
-            edge = np.array([np.max(self.blade.mesh[0][:, 0]), 0.0, np.min(self.blade.mesh[0][:, 2])])
-        return np.array([FACE, 0.5 * self.bed.size[1], -self.depth]) - edge
-
     def poses_at(self, time: np.ndarray) -> np.ndarray:
         poses = super().poses_at(time)
-        if isinstance(self.blade, Plate):
-            poses[:, 3:] = about_y(-math.radians(self.rake))
-        poses[:, :3] = self._centre(poses[0, 3:])
+        corners = self.blade.mesh[0]
+        edge = np.array([np.max(corners[:, 0]), 0.0, np.min(corners[:, 2])])  # the lower front one
+        poses[:, :3] = [FACE, 0.5 * self.bed.size[1], -self.depth] - edge
         poses[:, 0] += self.gap + self.speed * np.atleast_1d(time)
         return poses
 
 
-def level_blade(file: Path, rake: float, size: tuple[float, float, float], friction: float) -> MeshBody:
+def level_blade(rake: float, width: float) -> MeshBody:
     """A blade like the plate of the excavations but cut off level below, so that only its front meets soil.
 
     Args:
-        file: OBJ file to write; the blade's axes are those of the bin.
         rake: of the front from vertical, tip leading [degrees].
-        size: height, width, and thickness across the front [m].
-        friction: between soil and blade [-].
+        width: [m].
     """
-    height, width, thickness = size
-    back, lean = thickness / math.cos(math.radians(rake)), height * math.tan(math.radians(rake))
-    section = [(0.0, 0.0), (-lean, height), (-lean - back, height), (-back, 0.0)]
+    back, lean = THICKNESS / math.cos(math.radians(rake)), HEIGHT * math.tan(math.radians(rake))
+    section = [(0.0, 0.0), (-lean, HEIGHT), (-lean - back, HEIGHT), (-back, 0.0)]
     vertices = [(x, y, z) for y in (-0.5 * width, 0.5 * width) for x, z in section]
     faces = ["4 3 2 1", "5 6 7 8", "1 2 6 5", "2 3 7 6", "3 4 8 7", "4 1 5 8"]
     lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {face}" for face in faces]
-    file.write_text("\n".join(lines) + "\n")
-    return MeshBody(file=str(file), friction=friction)
-
-
-def blade_of(end: str, rake: float, width: float) -> Tool:
-    """A blade with a level end, or the plate, the back edge of whose square end is lower than the front edge."""
-    friction = math.tan(WALL_ANGLE)
-    if end == "square":
-        return Plate(HEIGHT, width, THICKNESS, friction)
     with tempfile.TemporaryDirectory() as folder:
-        return level_blade(Path(folder) / "blade.obj", rake, (HEIGHT, width, THICKNESS), friction)
+        file = Path(folder) / "blade.obj"
+        file.write_text("\n".join(lines) + "\n")
+        return MeshBody(file=str(file), friction=math.tan(WALL_ANGLE))
 
 
 def buried_blade(
@@ -127,7 +99,6 @@ def buried_blade(
     rake: float = 0.0,
     depth: float = 0.08,
     spacing: float = 0.02,
-    end: str = "level",
     bin_width: float = 0.0,
 ) -> BuriedBlade:
     """A blade in soil with the numerics of `scene=excavation`; endless in y if `bin_width` is 0."""
@@ -141,7 +112,7 @@ def buried_blade(
     return BuriedBlade(
         bed=bed,
         material=Material(friction_angle=ANGLE, friction_map=friction_map),
-        blade=blade_of(end, rake, WIDTH if bin_width else 1.0),
+        blade=level_blade(rake, WIDTH if bin_width else 1.0),
         rake=rake,
         depth=depth,
         duration=MEASURED[1] / BuriedBlade.speed,
@@ -192,25 +163,12 @@ def cases() -> list[dict]:
     plane = [
         {"friction_map": m, "rake": rake, "spacing": h} for h in SPACINGS for m in MAPS for rake in RAKES
     ]
-    square = [
-        {"friction_map": m, "rake": rake, "spacing": h, "end": "square"}
-        for h in SPACINGS
+    bins = [(0.04, 0.02, 1.2), (0.06, 0.02, 1.2), *((0.08, h, w) for w in (1.2, 0.6) for h in (0.02, 0.01))]
+    return plane + [
+        {"friction_map": m, "depth": depth, "spacing": h, "bin_width": width}
         for m in MAPS
-        for rake in RAKES[1:]
+        for depth, h, width in bins
     ]
-    wide = [
-        {"friction_map": m, "depth": depth, "spacing": h, "bin_width": bin_width}
-        for m in MAPS
-        for depth, h, bin_width in (
-            (0.04, 0.02, 1.2),
-            (0.06, 0.02, 1.2),
-            (0.08, 0.02, 1.2),
-            (0.08, 0.01, 1.2),
-            (0.08, 0.02, 0.6),
-            (0.08, 0.01, 0.6),
-        )
-    ]
-    return plane + square + wide
 
 
 def measure() -> list[dict]:
@@ -225,7 +183,6 @@ def measure() -> list[dict]:
             "rake": scene.rake,
             "depth": scene.depth,
             "spacing": scene.bed.spacing,
-            "end": case.get("end", "level"),
             "bin_width": case.get("bin_width", math.inf),
             "draft": along,
             "down": down,
@@ -237,32 +194,13 @@ def measure() -> list[dict]:
     return rows
 
 
-def draw(figure, rows: list[dict]) -> None:
-    axes = figure.subplots(1, 3, sharey=True)
-    for axis, (friction_map, end) in zip(
-        axes, (("sin", "level"), ("tan", "level"), ("tan", "square")), strict=True
-    ):
-        found = [
-            r
-            for r in rows
-            if (r["friction_map"], r["end"]) == (friction_map, end) and math.isinf(r["bin_width"])
-        ]
-        for spacing, marker in zip(SPACINGS, "sdo", strict=True):
-            points = [(r["rake"], r["draft"]) for r in found if r["spacing"] == spacing]
-            axis.plot(
-                *zip(*points, strict=True),
-                f"C0{marker}",
-                mfc="none",
-                label=f"solver, dx {1e3 * spacing:.1f} mm",
-            )
-        rakes = np.linspace(0.0, 35.0, 36)
-        angles = {round(found[0]["angle_own"], 2): "k-", round(ANGLE, 2): "k--"}
-        for angle, style in angles.items():
-            theory = [wedge(angle, rake, 0.08)[0] for rake in rakes]
-            axis.plot(rakes, theory, style, lw=1, label=f"McKyes, φ = {angle:.1f}°")
-        axis.set_title(f"μs = {friction_map} {ANGLE:.1f}°, {end} end", fontsize=10)
-        axis.set_xlabel("rake from vertical [°]")
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=7)
-    axes[0].set_ylim(0.0, None)
-    axes[0].set_ylabel("draft per width, 8 cm deep [N/m]")
+PLOT = {
+    "x": "rake",
+    "y": "draft",
+    "theory": "draft_own",
+    "curves": ["spacing"],
+    "panels": ["friction_map"],
+    "where": {"bin_width": math.inf},
+    "xlabel": "rake from vertical [°]",
+    "ylabel": "draft per width, 8 cm deep [N/m]",
+}

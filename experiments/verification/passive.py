@@ -72,35 +72,19 @@ def measure() -> list[dict]:
     for friction in (0.3, 0.5):
         for cells, ppc in ((8, 1), (12, 1), (16, 1), (8, 8), (12, 8)):
             scene = retaining_wall(friction, cells, ppc)
+            case = {"friction": friction, "cells": cells, "particles_per_cell": ppc}
             for i, value in enumerate(coefficient(scene), start=1):
-                rows.append(
-                    {
-                        "friction": friction,
-                        "cells": cells,
-                        "particles_per_cell": ppc,
-                        "travel": scene.speed * i / scene.frame_rate,
-                        "coefficient": value,
-                        "theory": expected(friction),
-                    }
-                )
+                travel = scene.speed * i / scene.frame_rate
+                rows.append(case | {"travel": travel, "coefficient": value, "theory": expected(friction)})
     return rows
 
 
-def draw(figure, rows: list[dict]) -> None:
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, friction in zip(axes, (0.3, 0.5), strict=True):
-        for cells, ppc in sorted({(r["cells"], r["particles_per_cell"]) for r in rows}):
-            key = (friction, cells, ppc)
-            found = [r for r in rows if (r["friction"], r["cells"], r["particles_per_cell"]) == key]
-            axis.plot(
-                [1e3 * r["travel"] for r in found],
-                [r["coefficient"] for r in found],
-                "-" if ppc == 1 else "--",
-                label=f"{cells} cells deep, {ppc} per cell",
-            )
-        axis.axhline(expected(friction), color="k", lw=1, label="(1 + μs)/(1 − μs)")
-        axis.set_title(f"μs = {friction}")
-        axis.set_xlabel("travel of the wall [mm]")
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
-    axes[0].set_ylabel("passive coefficient")
+PLOT = {
+    "x": "travel",
+    "y": "coefficient",
+    "theory": "theory",
+    "curves": ["cells", "particles_per_cell"],
+    "panels": ["friction"],
+    "xlabel": "travel of the wall [m]",
+    "ylabel": "passive coefficient",
+}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 
 import numpy as np
@@ -55,6 +56,7 @@ def _distance(scene: Column, position: np.ndarray) -> np.ndarray:
 
 ASPECTS = (0.5, 1.0, 1.5, 3.0, 5.0, 8.0)
 EXPONENTS = {"cylinder": (1.0, 0.5), "slab": (1.0, 2.0 / 3.0)}
+"""Of squat and tall columns, as measured by others."""
 
 
 def exponents(rows: list[dict], shape: str) -> tuple[float, float]:
@@ -67,29 +69,22 @@ def exponents(rows: list[dict], shape: str) -> tuple[float, float]:
 
 
 def measure() -> list[dict]:
-    return [
+    rows = [
         {"shape": shape, "aspect": aspect} | pile(collapse(shape, aspect))
         for shape in EXPONENTS
         for aspect in ASPECTS
     ]
+    for shape, known in EXPONENTS.items():
+        logging.info("%s: exponents %s, known %s", shape, exponents(rows, shape), known)
+    return rows
 
 
-def draw(figure, rows: list[dict]) -> None:
-    axis = figure.subplots()
-    for colour, shape in (("C0", "cylinder"), ("C1", "slab")):
-        found = [r for r in rows if r["shape"] == shape]
-        aspect, runout = (np.array([r[key] for r in found]) for key in ("aspect", "runout"))
-        squat, tall = exponents(rows, shape)
-        known = " and ".join(f"{power:.2f}" for power in EXPONENTS[shape])
-        label = f"{shape}: exponents {squat:.2f} and {tall:.2f}; lines {known}"
-        axis.loglog(aspect, runout, "o", color=colour, label=label)
-        for part, power in zip((aspect <= 1.5, aspect >= 3.0), EXPONENTS[shape], strict=True):
-            scale = np.exp(np.mean(np.log(runout[part]) - power * np.log(aspect[part])))
-            axis.loglog(aspect[part], scale * aspect[part] ** power, "-", color=colour, lw=1)
-    axis.set_xticks(ASPECTS, [f"{a:g}" for a in ASPECTS])
-    axis.set_yticks([0.25, 0.5, 1, 2, 4, 8], ["0.25", "0.5", "1", "2", "4", "8"])
-    axis.minorticks_off()
-    axis.set_xlabel("height over radius")
-    axis.set_ylabel("run-out over radius")
-    axis.grid(alpha=0.3, which="both")
-    axis.legend()
+PLOT = {
+    "x": "aspect",
+    "y": "runout",
+    "curves": ["shape"],
+    "xscale": "log",
+    "yscale": "log",
+    "xlabel": "height over radius",
+    "ylabel": "run-out over radius",
+}

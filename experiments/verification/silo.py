@@ -84,18 +84,11 @@ def measure() -> list[dict]:
     return rows
 
 
-def draw(figure, rows: list[dict]) -> None:
-    axis = figure.subplots()
-    for colour, friction in (("C0", 0.2), ("C1", 0.4)):
-        found = [r for r in rows if r["friction"] == friction]
-        filled = [r["height_over_width"] for r in found]
-        axis.plot(
-            filled, [r["pressure"] for r in found], "o", color=colour, label=f"wall friction {friction}"
-        )
-        axis.plot(filled, [r["janssen"] for r in found], "-", color=colour, label="Janssen, K = ν/(1 − ν)")
-    axis.plot(filled, [r["hydrostatic"] for r in found], "k:", label="weight")
-    axis.set_ylim(0.0, 9000.0)
-    axis.set_xlabel("height over width")
-    axis.set_ylabel("pressure on the bottom [Pa]")
-    axis.grid(alpha=0.3)
-    axis.legend()
+PLOT = {
+    "x": "height_over_width",
+    "y": "pressure",
+    "theory": "janssen",
+    "curves": ["friction"],
+    "xlabel": "height over width",
+    "ylabel": "pressure on the bottom [Pa]",
+}

@@ -48,17 +48,11 @@ def measure() -> list[dict]:
     ]
 
 
-def draw(figure, rows: list[dict]) -> None:
-    axis = figure.subplots()
-    for style, ppc in (("o", 1), ("s", 8)):
-        found = [r for r in rows if r["particles_per_cell"] == ppc]
-        axis.plot(
-            [r["tilt"] for r in found], [r["acceleration"] for r in found], style, label=f"{ppc} per cell"
-        )
-    tilts = np.linspace(25.0, 44.0, 200)
-    axis.plot(tilts, [expected(t) for t in tilts], "k-", lw=1, label="block on its base")
-    axis.axvline(math.degrees(math.atan(SOIL.static_friction)), color="k", ls=":", label="atan mu_s")
-    axis.set_xlabel("tilt [degrees]")
-    axis.set_ylabel("acceleration down the slope [m/s²]")
-    axis.grid(alpha=0.3)
-    axis.legend()
+PLOT = {
+    "x": "tilt",
+    "y": "acceleration",
+    "theory": "theory",
+    "curves": ["particles_per_cell"],
+    "xlabel": "tilt [degrees]",
+    "ylabel": "acceleration down the slope [m/s²]",
+}

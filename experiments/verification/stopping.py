@@ -23,11 +23,10 @@ def beads(law: str) -> Material:
     return replace(BEADS, youngs_modulus=1.0e5, nonlocal_amplitude=0.48, rate_law=law)
 
 
-def stopping_height(law: str, tilt: float | np.ndarray) -> np.ndarray:
+def stopping_height(law: str, tilt: float) -> float:
     """(pi / 2) xi, in grains."""
     soil = beads(law)
-    xi = [soil.cooperativity_length(math.tan(math.radians(t))) for t in np.atleast_1d(tilt)]
-    return 0.5 * math.pi * np.array(xi) / soil.grain_diameter
+    return 0.5 * math.pi * soil.cooperativity_length(math.tan(math.radians(tilt))) / soil.grain_diameter
 
 
 def final_speed(law: str, tilt: float, grains: float, cells_per_grain: float) -> float:
@@ -58,53 +57,22 @@ def measure() -> list[dict]:
     rows = []
     for law, cells, tilts in CASES:
         for tilt in tilts:
-            theory = float(stopping_height(law, tilt)[0])
+            theory = stopping_height(law, tilt)
             grains = theory * np.array(SHARES)
             speed = np.array([final_speed(law, tilt, g, cells) for g in grains])
             # Close above the stopping height the speed grows from zero in proportion to what is above it.
             slope = (speed[2] - speed[1]) / (grains[2] - grains[1])
-            rows += [
-                {
-                    "law": law,
-                    "cells_per_grain": cells,
-                    "tilt": tilt,
-                    "grains": g,
-                    "speed": v,
-                    "stopping_height": grains[1] - speed[1] / slope,
-                    "theory": theory,
-                }
-                for g, v in zip(grains, speed, strict=True)
-            ]
+            case = {"law": law, "cells_per_grain": cells, "tilt": tilt}
+            found = {"stopping_height": grains[1] - speed[1] / slope, "theory": theory}
+            rows += [case | {"grains": g, "speed": v} | found for g, v in zip(grains, speed, strict=True)]
     return rows
 
 
-def draw(figure, rows: list[dict]) -> None:
-    heights, speeds = figure.subplots(1, 2)
-    tilts = np.linspace(22.5, 31.0, 200)
-    for (law, cells, _), marker, colour in zip(CASES, "osD", ("C0", "C1", "C2"), strict=True):
-        found = [r for r in rows if (r["law"], r["cells_per_grain"]) == (law, cells)]
-        label = f"{law}, {cells} cells in a grain"
-        if cells == 3:
-            heights.plot(tilts, stopping_height(law, tilts), colour, lw=1, label=f"(π/2) ξ, {law}")
-        heights.plot(
-            [r["tilt"] for r in found],
-            [r["stopping_height"] for r in found],
-            marker,
-            color=colour,
-            ms=5,
-            label=label,
-        )
-        for tilt in sorted({r["tilt"] for r in found}):
-            layers = [r for r in found if r["tilt"] == tilt]
-            share = [r["grains"] / r["theory"] for r in layers]
-            speed = [1e3 * r["speed"] for r in layers]
-            speeds.plot(share, speed, marker + "-", color=colour, ms=4, lw=0.5)
-    heights.set_xlabel("tilt [degrees]")
-    heights.set_ylabel("height at which flow stops [grains]")
-    speeds.set_xticks((1.0, *SHARES))
-    speeds.axvline(1.0, color="k", ls=":", lw=1)
-    speeds.set_xlabel("height of the layer / (π/2) ξ")
-    speeds.set_ylabel("final speed of the surface [mm/s]")
-    heights.legend(fontsize=8)
-    for axis in (heights, speeds):
-        axis.grid(alpha=0.3)
+PLOT = {
+    "x": "tilt",
+    "y": "stopping_height",
+    "theory": "theory",
+    "curves": ["law", "cells_per_grain"],
+    "xlabel": "tilt [degrees]",
+    "ylabel": "height at which flow stops [grains]",
+}

@@ -65,17 +65,12 @@ def measure() -> list[dict]:
     ]
 
 
-def draw(figure, rows: list[dict]) -> None:
-    axis = figure.subplots()
-    for colour, kind in zip(("C0", "C1"), ("compression", "shear"), strict=True):
-        for style, ppc in (("o-", 1), ("s--", 8)):
-            found = [r for r in rows if r["wave"] == kind and r["particles_per_cell"] == ppc]
-            cells, errors = ([r[key] for r in found] for key in ("cells", "error"))
-            axis.loglog(cells, errors, style, color=colour, label=f"{kind}, {ppc} per cell")
-    axis.loglog([8, 64], [0.12, 0.12 / 64], "k:", label="second order")
-    axis.set_xticks([8, 16, 32, 64], ["8", "16", "32", "64"])
-    axis.minorticks_off()
-    axis.set_xlabel("grid spacings in a wavelength")
-    axis.set_ylabel("relative error of velocity after one period")
-    axis.grid(alpha=0.3, which="both")
-    axis.legend()
+PLOT = {
+    "x": "cells",
+    "y": "error",
+    "curves": ["wave", "particles_per_cell"],
+    "xscale": "log",
+    "yscale": "log",
+    "xlabel": "grid spacings in a wavelength",
+    "ylabel": "relative error of velocity after one period",
+}

@@ -7,17 +7,16 @@ Makes two runs in data/wheel (kept), then side.png beside this script.
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
-import matplotlib
-from hydra import compose, initialize_config_module
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
-matplotlib.use("Agg")
+from common import scene_of
 
 from sgns.data.run import Run
 from sgns.evaluate.views import common_scales, side_views
 from sgns.simulate.run import simulate_scene
-from sgns.simulate.scene import asked_effects, decided, scene_from_config
 
 HERE, DATA = Path(__file__).parent, Path("data/wheel")
 SLIPS = (0.2, 0.7)
@@ -28,11 +27,9 @@ def main() -> None:
     runs = {}
     for slip in SLIPS:
         file = DATA / f"slip_{slip}.h5"
-        with initialize_config_module("sgns.conf", version_base="1.3"):
-            config = compose("simulate", [*SCENE, f"scene.slip={slip}"])
-        scene = scene_from_config(config)
+        scene, effects = scene_of(*SCENE, f"scene.slip={slip}")
         if not file.exists():
-            simulate_scene(scene, file, effects=decided(scene, asked_effects(config))[0])
+            simulate_scene(scene, file, effects=effects)
         runs[f"slip {100 * slip:.0f} %"] = Run(file)
     for title, run in runs.items():
         print(title, scene.summary(run.force, run.torque, run.pose))

@@ -28,6 +28,7 @@ __all__ = [
     "composed",
     "environment",
     "files",
+    "python",
     "refusal",
     "refused",
     "sgns",
@@ -97,15 +98,22 @@ def refusal(folder: Path, *arguments: str) -> str:
     return done.stderr
 
 
-def composed(*overrides: str) -> DictConfig:
-    """The settings of `sgns simulate <overrides>`."""
+def composed(*overrides: str, command: str = "simulate") -> DictConfig:
+    """The settings of `sgns <command> <overrides>`."""
+    GlobalHydra.instance().clear()
     with initialize_config_module("sgns.conf", version_base="1.3"):
-        return compose("simulate", list(overrides))
+        return compose(command, list(overrides))
 
 
 def environment() -> dict[str, str]:
     """Of a process that finds this package, too."""
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+def python(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Another process that runs some code with these arguments."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment())
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -121,7 +129,5 @@ def files(folder: Path) -> dict[str, bytes]:
 def small_dataset(folder: Path) -> None:
     """Synthetic runs of as many particles as the small scene has, and that say they are of it: what is trained on them
     can roll the scene out."""
-    GlobalHydra.instance().clear()
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        scene = scene_from_config(compose("simulate", SMALL))
+    scene = scene_from_config(composed(*SMALL))
     make_dataset(folder, n=len(scene.stored), arrangement_hash=scene.arrangement_hash, scene=scene.to_dict())

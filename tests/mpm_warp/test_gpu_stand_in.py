@@ -1,17 +1,33 @@
-"""The kernels that a GPU gets, checked on the CPU access by access (experiments/gpu)."""
+"""The kernels that a GPU gets, checked on the CPU access by access (experiments/gpu).
 
-from __future__ import annotations
+(No `from __future__ import annotations`: Warp reads the types of the kernels.)
+"""
 
 import pytest
 import warp as wp
 from stand_in import Checked, Threads, compiler, on_stand_in
-from threads import beyond_the_end, from_neighbour, one_more
 
 from mpm_warp import Bed, Plate, Solver
-from mpm_warp.launch import Launch, Program, Work, Worker, find_device
+from mpm_warp.launch import Launch, Program, Work, Worker, find_device, scene_kernel
 from sgns_testing.scenes import cut
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="needs g++ on Linux")
+
+
+@scene_kernel()
+def from_neighbour(i: int, a: wp.array(dtype=float)):
+    if i + 1 < a.shape[0]:
+        a[i] = a[i + 1]
+
+
+@scene_kernel()
+def beyond_the_end(i: int, a: wp.array(dtype=float)):
+    a[i + 1] = 1.0
+
+
+@scene_kernel()
+def one_more(i: int, a: wp.array(dtype=float)):
+    a[i] = a[i] + 1.0
 
 
 def small_cut():

@@ -5,17 +5,21 @@ Every hostile file tries to leave a canary; none may appear.
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import io
 import json
 import math
 import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
 import time
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +42,7 @@ from sgns.frontier.measure import read_record
 from sgns.frontier.observation import read_observation
 from sgns.frontier.point import read_points
 from sgns.frontier.study import Store
-from sgns.model.checkpoint import load_surrogate, read_checkpoint
+from sgns.model.checkpoint import load_surrogate
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, read_reduced, reduce_dataset
 from sgns.simulate.scene import read_path
@@ -75,73 +79,45 @@ class Touch:
 # --- checkpoints ------------------------------------------------------------------------------------------
 
 
-def test_pickles_in_checkpoints(trained, tmp_path, canary) -> None:
-    Touch(canary).__reduce__()[0](canary)
-    assert canary.exists()  # the canary works
-    canary.unlink()
-    content = torch.load(trained, weights_only=True)
-    hostile = tmp_path / "a.ckpt"
-    for place in ("state_dict", "hyper_parameters"):
-        torch.save(content | {place: content[place] | {"x": Touch(canary)}}, hostile)
-        with pytest.raises(UserError, match="cannot be read as a checkpoint"):
-            load_surrogate(hostile)
-    hostile.write_bytes(pickle.dumps({"state_dict": Touch(canary)}))
-    with pytest.raises(UserError, match="cannot be read as a checkpoint"):
-        read_checkpoint(hostile)
-    torch.save(content | {"callbacks": Touch(canary)}, hostile, _use_new_zipfile_serialization=False)
-    with pytest.raises(UserError, match="cannot be read as a checkpoint"):
-        read_checkpoint(hostile)
-    assert not canary.exists()
+def archived(content: object, **how: Any) -> bytes:
+    """What `torch.save` writes."""
+    file = io.BytesIO()
+    torch.save(content, file, **how)
+    return file.getvalue()
 
 
-def test_a_hostile_last_checkpoint_is_not_gone_on_from(halfway, canary) -> None:
-    data, output = halfway
-    content = torch.load(output / "last.ckpt", weights_only=True)
-    torch.save(content | {"loops": Touch(canary)}, output / "last.ckpt")
-    with pytest.raises(UserError, match="cannot be read as a checkpoint"):
-        train(data, num_modes=4, model=MODEL, training=BRIEF, output=output)
-    assert not canary.exists()
+def with_card(content: dict[str, Any], **changes: Any) -> bytes:
+    """A checkpoint with other values in its card."""
+    return archived(content | {"hyper_parameters": content["hyper_parameters"] | changes})
 
 
-def test_targets_in_checkpoints(trained, tmp_path, canary) -> None:
-    content = torch.load(trained, weights_only=True)
-    call = {"_target_": "pathlib.Path.touch", "_args_": [str(canary)]}
-    for card in (call, content["hyper_parameters"] | {"model": call}, content["hyper_parameters"] | call):
-        torch.save(content | {"hyper_parameters": card}, tmp_path / "a.ckpt")
-        try:
-            load_surrogate(tmp_path / "a.ckpt")
-        except UserError as error:
-            assert "\n" not in str(error)
-    assert not canary.exists()
+def with_weights(content: dict[str, Any], name: str, value: Any) -> bytes:
+    return archived(content | {"state_dict": content["state_dict"] | {name: value}})
 
 
-@pytest.mark.parametrize(
-    ("key", "value"), [("message_passing_steps", 10**12), ("hidden_width", 10**9), ("history", 10**9)]
-)
-def test_a_checkpoint_that_describes_a_larger_network_than_it_holds(trained, tmp_path, key, value) -> None:
-    content = torch.load(trained, weights_only=True)
-    card = content["hyper_parameters"]
-    torch.save(
-        content | {"hyper_parameters": card | {"model": card["model"] | {key: value}}}, tmp_path / "a.ckpt"
-    )
-    with pytest.raises(UserError, match="do not fit together"):
-        load_surrogate(tmp_path / "a.ckpt")
-
-
-def test_a_checkpoint_that_claims_more_values_than_it_holds(trained, tmp_path) -> None:
-    content = torch.load(trained, weights_only=True)
-    huge = {"surrogate.start_positions": torch.zeros(1).expand(10**12)}
-    torch.save(content | {"state_dict": content["state_dict"] | huge}, tmp_path / "a.ckpt")
-    with pytest.raises(UserError, match="claims more values"):
-        load_surrogate(tmp_path / "a.ckpt")
+def deflated(content: dict[str, Any]) -> bytes:
+    """Parts that are packed: small files that may unfold to anything."""
+    packed = io.BytesIO()
     with (
-        zipfile.ZipFile(trained) as old,
-        zipfile.ZipFile(tmp_path / "b.ckpt", "w", zipfile.ZIP_DEFLATED) as new,
+        zipfile.ZipFile(io.BytesIO(archived(content))) as old,
+        zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as new,
     ):
         for part in old.infolist():
             new.writestr(part.filename, old.read(part))
-    with pytest.raises(UserError, match="cannot be read as a checkpoint"):
-        load_surrogate(tmp_path / "b.ckpt")
+    return packed.getvalue()
+
+
+def overlapping() -> bytes:
+    """A part that is named many times is read many times."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("a/x", b"x" * 10_000)
+        for number in range(10):
+            twin = copy.copy(archive.infolist()[0])
+            twin.filename = f"a/{number}"
+            archive.filelist.append(twin)
+            archive.NameToInfo[twin.filename] = twin
+    return file.getvalue()
 
 
 def endless() -> list:
@@ -158,51 +134,70 @@ def doubled(value: object, times: int = 40) -> object:
     return value
 
 
-UNFIT = {
-    "in itself": endless,
-    "many lists": lambda: doubled("x"),
-    "much text": lambda: doubled("x" * 1000, 16),
-    "huge number": lambda: 1 << 100,
-    "tensor": lambda: torch.ones(1),
+UNREADABLE = "cannot be read as a checkpoint"
+ODD_CARD = r"a\.ckpt has a card that cannot be used"
+HOSTILE: dict[str, list[Callable[[dict[str, Any], Touch], bytes]]] = {
+    UNREADABLE: [
+        lambda good, touch: with_weights(good, "x", touch),
+        lambda good, touch: with_card(good, x=touch),
+        lambda good, touch: pickle.dumps({"state_dict": touch}),
+        lambda good, touch: archived(good | {"callbacks": touch}, _use_new_zipfile_serialization=False),
+        lambda good, _: deflated(good),
+    ],
+    f"{UNREADABLE}.*overlap": [lambda good, _: overlapping()],
+    "claims more values": [lambda good, _: with_weights(good, "surrogate.x", torch.zeros(1).expand(10**12))],
+    "do not fit together": [
+        lambda good, _, key=key: with_card(good, model=good["hyper_parameters"]["model"] | {key: 10**12})
+        for key in ("message_passing_steps", "hidden_width", "history")
+    ],
+    ODD_CARD: [
+        lambda good, _: with_card(good, x=endless()),
+        lambda good, _: with_card(good, x=doubled("x")),
+        lambda good, _: with_card(good, x=doubled("x" * 1000, 16)),
+        lambda good, _: with_card(good, x=1 << 100),
+        lambda good, _: with_card(good, x=torch.ones(1)),
+        *(
+            lambda good, _, settings=settings: with_card(good, settings=settings)
+            for settings in (3, {"training": []}, {"validation_runs": [3]}, {"training": {"batch_size": "x"}})
+        ),
+    ],
 }
+"""Words of a refusal -> files, made of a good checkpoint and what leaves the canary."""
 
 
-@pytest.mark.parametrize("kind", UNFIT)
-def test_cards_that_unfold_without_end_or_are_not_plain(trained, tmp_path, kind) -> None:
-    value = UNFIT[kind]()
-    content = torch.load(trained, weights_only=True)
-    torch.save(
-        content | {"hyper_parameters": content["hyper_parameters"] | {"x": value}}, tmp_path / "a.ckpt"
-    )
+@pytest.mark.parametrize(("words", "make"), [(words, make) for words in HOSTILE for make in HOSTILE[words]])
+def test_hostile_checkpoints(trained, tmp_path, canary, words, make) -> None:
+    (tmp_path / "a.ckpt").write_bytes(make(torch.load(trained, weights_only=True), Touch(canary)))
     began = time.process_time()
-    with pytest.raises(UserError, match=r"a\.ckpt has a card that cannot be used"):
-        read_checkpoint(tmp_path / "a.ckpt")
+    with pytest.raises(UserError) as caught:
+        load_surrogate(tmp_path / "a.ckpt")
     assert time.process_time() - began < 2.0
+    assert re.search(words, f"{caught.value} {caught.value.__cause__}")
+    assert not canary.exists()
 
 
-@pytest.mark.parametrize(
-    "settings", [3, {"training": []}, {"validation_runs": [3]}, {"training": {"batch_size": "x"}}]
-)
-def test_cards_with_odd_settings(trained, tmp_path, settings) -> None:
+def test_the_canary_works(canary) -> None:
+    pickle.loads(pickle.dumps(Touch(canary)))
+    assert canary.exists()
+
+
+def test_a_hostile_last_checkpoint_is_not_gone_on_from(halfway, canary) -> None:
+    data, output = halfway
+    content = torch.load(output / "last.ckpt", weights_only=True)
+    torch.save(content | {"loops": Touch(canary)}, output / "last.ckpt")
+    with pytest.raises(UserError, match=UNREADABLE):
+        train(data, num_modes=4, model=MODEL, training=BRIEF, output=output)
+    assert not canary.exists()
+
+
+def test_targets_in_checkpoints(trained, tmp_path, canary) -> None:
     content = torch.load(trained, weights_only=True)
-    card = content["hyper_parameters"] | {"settings": settings}
-    torch.save(content | {"hyper_parameters": card}, tmp_path / "a.ckpt")
-    with pytest.raises(UserError, match="a card that cannot be used"):
-        read_checkpoint(tmp_path / "a.ckpt")
-
-
-def test_a_checkpoint_whose_parts_overlap(trained, tmp_path) -> None:
-    """A part that is named many times is read many times."""
-    with zipfile.ZipFile(tmp_path / "a.ckpt", "w") as archive:
-        archive.writestr("a/x", b"x" * 10_000)
-        for number in range(10):
-            twin = copy.copy(archive.infolist()[0])
-            twin.filename = f"a/{number}"
-            archive.filelist.append(twin)
-            archive.NameToInfo[twin.filename] = twin
-    with pytest.raises(UserError, match="cannot be read as a checkpoint") as caught:
-        read_checkpoint(tmp_path / "a.ckpt")
-    assert "overlap" in str(caught.value.__cause__)
+    call = {"_target_": "pathlib.Path.touch", "_args_": [str(canary)]}
+    for card in (call, content["hyper_parameters"] | {"model": call}, content["hyper_parameters"] | call):
+        torch.save(content | {"hyper_parameters": card}, tmp_path / "a.ckpt")
+        with contextlib.suppress(UserError):
+            load_surrogate(tmp_path / "a.ckpt")
+    assert not canary.exists()
 
 
 @pytest.fixture
@@ -271,46 +266,6 @@ def test_a_complete_training_whose_summary_is_damaged(halfway, text) -> None:
 # --- settings ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "override",
-    [
-        "+scene.x={_target_: pathlib.Path.touch, _args_: [CANARY]}",
-        "+hydra.callbacks.x={_target_: pathlib.Path.touch, _args_: [CANARY]}",
-        "hydra.launcher._target_=pathlib.Path.touch",
-        "++hydra.sweeper._target_=pathlib.Path.touch",
-        "++hydra.job_logging.handlers.console={class: pathlib.Path.touch, self: CANARY}",
-        "++hydra.job_logging.handlers.console.stream=ext://hostile_module.x",
-    ],
-)
-def test_targets_in_overrides(empty_folder, canary, override, monkeypatch) -> None:
-    (empty_folder / "hostile_module.py").write_text(f"open({str(canary)!r}, 'w')")
-    monkeypatch.syspath_prepend(empty_folder)
-    said = refused("simulate", override.replace("CANARY", str(canary)))
-    assert "cannot name Python objects" in said
-    assert not canary.exists()
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "scene:\n  x:\n    _target_: pathlib.Path.touch\n    _args_: ['CANARY']",
-        "hydra:\n  callbacks:\n    x:\n      _target_: pathlib.Path.touch\n      _args_: ['CANARY']",
-        "hydra:\n  job_logging:\n    handlers:\n      x:\n        (): pathlib.Path.touch\n        self: CANARY",
-        "scene:\n  name: !!python/object/apply:pathlib.Path.touch ['CANARY']",
-        "scene:\n  name: !!python/object/new:pathlib.Path ['CANARY']",
-    ],
-)
-def test_files_of_settings(empty_folder, canary, text, monkeypatch) -> None:
-    folder = empty_folder / "conf" / "experiment"
-    folder.mkdir(parents=True)
-    (folder / "x.yaml").write_text("# @package _global_\n" + text.replace("CANARY", str(canary)))
-    said = refused("simulate", "--config-dir", "conf", "experiment=x")
-    assert "cannot name Python objects" in said or "could not determine a constructor" in said
-    assert not canary.exists()
-
-
-# --- sweeps -----------------------------------------------------------------------------------------------
-
 TOUCH = "_target_: pathlib.Path.touch, _args_: [CANARY]"
 LAUNCHER = """
 import pathlib
@@ -332,39 +287,57 @@ ConfigStore.instance().store(group="hydra/launcher", name="elsewhere", node=targ
 """
 
 
+FILES = {
+    "good": "seed: 3",
+    "bad": f"scene: {{x: {{{TOUCH}}}}}",
+    "callback": f"hydra: {{callbacks: {{x: {{{TOUCH}}}}}}}",
+    "sweep": f"hydra: {{sweeper: {{params: {{+x: '1,{{{TOUCH}}}'}}}}}}",
+    "tag": "scene: {name: !!python/object/apply:pathlib.Path.touch [CANARY]}",
+    "class": "scene: {name: !!python/object/new:pathlib.Path [CANARY]}",
+}
+"""Files of settings; the first is a good one."""
+
+
 @pytest.fixture
 def experiments(empty_folder, canary) -> Path:
-    """Folder of a good and three hostile files of settings."""
-    hostile = f"{{{TOUCH.replace('CANARY', str(canary))}}}"
+    """Folder of the files."""
     folder = empty_folder / "conf" / "experiment"
     folder.mkdir(parents=True)
-    for name, text in {
-        "good": "seed: 3",
-        "bad": f"scene: {{x: {hostile}}}",
-        "callback": f"hydra: {{callbacks: {{x: {hostile}}}}}",
-        "sweep": f"hydra: {{sweeper: {{params: {{+x: '1,{hostile}'}}}}}}",
-    }.items():
-        (folder / f"{name}.yaml").write_text(f"# @package _global_\n{text}\n")
+    for name, text in FILES.items():
+        (folder / f"{name}.yaml").write_text(f"# @package _global_\n{text}\n".replace("CANARY", str(canary)))
     return empty_folder / "conf"
 
 
+NAMED, SWEPT = "cannot name Python objects", "Sweeping over Hydra's configuration is not supported"
+TAGGED = "could not determine a constructor"
+
+
 @pytest.mark.parametrize(
-    "overrides",
+    ("words", "arguments"),
     [
-        ["seed=1,2", "+x._target_=os.system"],
-        [f"+x={{a: 1}},[{{{TOUCH}}}]"],
-        ["seed=1,2", f"+hydra.callbacks.x={{{TOUCH}}}"],
-        ["seed=1,2", "hydra.launcher._target_=pathlib.Path.touch"],
-        ["experiment=sweep"],
-        ["experiment=good,callback"],
-        ["experiment=good,bad", "hydra.sweeper.max_batch_size=2"],
+        (NAMED, [f"+scene.x={{{TOUCH}}}"]),
+        (NAMED, ["++hydra.sweeper._target_=pathlib.Path.touch"]),
+        (NAMED, ["++hydra.job_logging.handlers.console.stream=ext://hostile_module.x"]),
+        (TAGGED, ["experiment=tag"]),
+        (TAGGED, ["experiment=class"]),
+        (NAMED, ["-m", "seed=1,2", "+x._target_=os.system"]),
+        (NAMED, ["-m", f"+x={{a: 1}},[{{{TOUCH}}}]"]),
+        (NAMED, ["-m", "seed=1,2", f"+hydra.callbacks.x={{{TOUCH}}}"]),
+        (NAMED, ["-m", "seed=1,2", "hydra.launcher._target_=pathlib.Path.touch"]),
+        (NAMED, ["-m", "experiment=sweep"]),
+        (NAMED, ["-m", "experiment=good,callback"]),
+        (NAMED, ["-m", "experiment=good,bad", "hydra.sweeper.max_batch_size=2"]),
+        (SWEPT, ["-m", f"+hydra.callbacks.x={{a: 1}},{{{TOUCH}}}"]),
+        (SWEPT, ["-m", "hydra.launcher._target_=os.system,pathlib.Path.touch"]),
     ],
 )
-def test_targets_in_sweeps_before_the_first_job(experiments, canary, overrides, monkeypatch) -> None:
+def test_targets_in_settings(experiments, canary, words, arguments, monkeypatch) -> None:
+    """Refused before the first job; single commands are in tests/sgns/cli/test_settings.py."""
+    (experiments.parent / "hostile_module.py").write_text(f"open({str(canary)!r}, 'w')")
+    monkeypatch.syspath_prepend(experiments.parent)
     monkeypatch.setattr("sgns.simulate.command.main", lambda cfg: canary.touch())
-    arguments = [override.replace("CANARY", str(canary)) for override in overrides]
-    said = refused("simulate", "-m", "--config-dir", str(experiments), *arguments)
-    assert "cannot name Python objects" in said
+    given = [argument.replace("CANARY", str(canary)) for argument in arguments]
+    assert words in refused("simulate", "--config-dir", str(experiments), *given)
     assert not canary.exists()
 
 
@@ -375,16 +348,6 @@ def test_targets_in_a_later_batch_of_a_sweep(experiments, canary, monkeypatch) -
     sweep = ["-m", "--config-dir", str(experiments), "experiment=good,bad", batches]
     assert "cannot name Python objects" in refused("simulate", *sweep).splitlines()[-1]
     assert seeds == [3] and not canary.exists()
-
-
-@pytest.mark.parametrize(
-    "override",
-    [f"+hydra.callbacks.x={{a: 1}},{{{TOUCH}}}", "hydra.launcher._target_=os.system,pathlib.Path.touch"],
-)
-def test_hydras_own_settings_cannot_be_swept_over(empty_folder, canary, override, monkeypatch) -> None:
-    said = refused("simulate", "-m", override.replace("CANARY", str(canary)))
-    assert "Sweeping over Hydra's configuration is not supported" in said
-    assert not canary.exists()
 
 
 @pytest.mark.parametrize(("swept", "launched"), [("good,good", True), ("good,bad", False)])

@@ -70,9 +70,8 @@ MAKE = f"""
 import sys, pathlib
 from sgns_testing.campaigns import campaign
 from sgns.simulate.workers import simulate_campaign
-if __name__ == "__main__":
-    made = campaign(pathlib.Path(sys.argv[1]), runs=4, draw={DRAW})
-    simulate_campaign(made, device="cpu", workers=1)
+made = campaign(pathlib.Path(sys.argv[1]), runs=4, draw={DRAW})
+simulate_campaign(made, device="cpu", workers=1)
 """
 RECORD = """
 import os, sys
@@ -98,23 +97,15 @@ def begin(code: str, *arguments: str) -> subprocess.Popen[str]:
 def test_two_processes_one_of_them_killed_and_repeated(tmp_path) -> None:
     alone = campaign(tmp_path / "alone", runs=4, draw=DRAW)
     simulate_campaign(alone, device="cpu", workers=1)
-    script = tmp_path / "make.py"
-    script.write_text(MAKE)
-
-    def start() -> subprocess.Popen[str]:
-        command = [sys.executable, str(script), str(tmp_path / "shared")]
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-        return subprocess.Popen(command, text=True, env=environment(), **pipes)
-
-    one, two = start(), start()
+    one, two = begin(MAKE, str(tmp_path / "shared")), begin(MAKE, str(tmp_path / "shared"))
     deadline = time.monotonic() + 60.0
     while not list(tmp_path.glob("shared/tiny/runs/*.h5")) and time.monotonic() < deadline:
         time.sleep(0.02)
     one.kill()
     one.communicate()
-    for begin_next in (lambda: two, start):  # the third makes or clears away what the killed one had begun
-        process = begin_next()
-        said = process.communicate(timeout=100)[0]
+    for process in (two, None):  # another makes or clears away what the killed one had begun
+        process = process or begin(MAKE, str(tmp_path / "shared"))
+        said = process.communicate(timeout=100)
         assert process.returncode == 0, said
     assert broken(tmp_path / "shared") == []
     assert same(tmp_path / "alone", tmp_path / "shared")

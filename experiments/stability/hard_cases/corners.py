@@ -9,7 +9,6 @@ import numpy as np
 
 from mpm_warp import Bed, Effects, Excavation, Material, Plate, Solver, SolverStopped, Wheel
 
-from .case import Case
 from .measures import blade_shares, frames_of, shares, top_speed, volume_gain
 
 CUT_BED = Bed(spacing=0.02)
@@ -83,41 +82,34 @@ def light_wheel() -> tuple[float, str]:
     return 1000.0 * bounce, f"{solver.substeps_per_frame} substeps per frame"
 
 
-MUST = "force, speed, leakage and volume stay bounded"
-CARRIED = "the load is carried; sinkage, pull, speed and volume stay bounded"
-
-
-def _cut(depth: float, speed: float, rake: float, motion: str, hard: str) -> Case:
-    name = f"blade {100 * depth:g} cm, {100 * speed:g} cm/s, {rake:g}°, {motion}"
-    measure = partial(excavation, depth, speed, rake, motion)
-    return Case(name, hard, MUST, "largest share of a limit", 1.0, "", measure)
-
-
-def _wheel(name: str, hard: str, **values) -> Case:
-    return Case(name, hard, CARRIED, "largest share of a limit", 1.0, "", partial(wheel, **values))
-
-
-CASES = [
-    _cut(0.10, 0.15, 45.0, "curved", "deepest, fastest, steepest rake"),
-    _cut(0.10, 0.15, 45.0, "ramp", "deepest, fastest, steepest rake, sharp turns"),
-    _cut(0.10, 0.15, 0.0, "curved", "deepest, fastest, upright"),
-    _cut(0.10, 0.01, 45.0, "ramp", "deepest, slowest"),
-    _cut(0.02, 0.15, 45.0, "ramp", "shallower than a cell, fastest"),
-    _cut(0.02, 0.01, 0.0, "curved", "shallower than a cell, slowest"),
-    _wheel("wheel 5 cm, 70 %, Moon, 25 N", "small wheel, high slip, low gravity, highest load of its size",
-           diameter=0.05, slip=0.7, gravity=1.62, load=25.0, width=0.0833),
-    _wheel("wheel 30 cm, 70 %, Moon, 225 N", "heaviest body in the lowest gravity: 139 kg",
-           diameter=0.30, slip=0.7, gravity=1.62, load=225.0, width=0.125),
-    _wheel("wheel 30 cm, 20 %, Earth, 225 N, 43°", "strongest soil: mu_s just below mu_2",
-           diameter=0.30, slip=0.2, load=225.0, width=0.125, friction_angle=43.0),
-    _wheel("wheel 5 cm, 70 %, Earth, 25 N, 30°", "weakest soil under the highest pressure",
-           diameter=0.05, slip=0.7, load=25.0, width=0.0833, friction_angle=30.0),
-    _wheel("wheel on soil at the K0 limit", f"friction angle {K0_ANGLE:.2f}°: the bed at rest is at yield",
-           load=60.0, friction_angle=K0_ANGLE, duration=2.0),
-    Case("wheel on soil with mu_s at 1, above mu_2", "the rate law has no flow between mu_s and mu_2",
-         f"mu_2 is raised with a warning; {CARRIED}", "largest share of a limit", 1.0, "", raised_limit),
-    Case("wheel 5 cm, 70 %, Moon, 225 N", "far more than the soil can bear", "carried, or stopped with what to do",
-         "largest share of a limit", 1.0, "", too_heavy),
-    Case("wheel of 10 g", "a body lighter than the soil it touches", "comes to rest", "movement after 0.5 s", 0.1,
-         "mm", light_wheel),
-]  # fmt: skip
+MEASURES = {
+    **{
+        f"blade {depth} cm, {speed} cm/s, {rake}°, {motion}": partial(
+            excavation, depth / 100, speed / 100, rake, motion
+        )
+        for depth, speed, rake, motion in (
+            (10, 15, 45, "curved"),
+            (10, 15, 45, "ramp"),
+            (10, 15, 0, "curved"),
+            (10, 1, 45, "ramp"),
+            (2, 15, 45, "ramp"),
+            (2, 1, 0, "curved"),
+        )
+    },
+    "wheel 5 cm, 70 %, Moon, 25 N": partial(
+        wheel, diameter=0.05, slip=0.7, gravity=1.62, load=25.0, width=0.0833
+    ),
+    "wheel 30 cm, 70 %, Moon, 225 N": partial(
+        wheel, diameter=0.30, slip=0.7, gravity=1.62, load=225.0, width=0.125
+    ),
+    "wheel 30 cm, 20 %, Earth, 225 N, 43°": partial(
+        wheel, diameter=0.30, slip=0.2, load=225.0, width=0.125, friction_angle=43.0
+    ),
+    "wheel 5 cm, 70 %, Earth, 25 N, 30°": partial(
+        wheel, diameter=0.05, slip=0.7, load=25.0, width=0.0833, friction_angle=30.0
+    ),
+    "wheel on soil at the K0 limit": partial(wheel, load=60.0, friction_angle=K0_ANGLE, duration=2.0),
+    "wheel on soil with mu_s at 1, above mu_2": raised_limit,
+    "wheel 5 cm, 70 %, Moon, 225 N": too_heavy,
+    "wheel of 10 g": light_wheel,
+}

@@ -15,7 +15,6 @@ from mpm_warp.kernels.fluidity import soil_parameters, soil_struct
 from mpm_warp.launch import start_warp
 from sgns_testing.scenes import block, cut
 
-from .case import Case
 from .measures import frames_of
 
 SAND = Material()
@@ -182,35 +181,19 @@ def inverted() -> tuple[float, str]:
     return worst, ""
 
 
-CASES = [
-    *(
-        Case(f"no pressure: {law}",
-             "p down to 1e-30 Pa and a block that flies apart: square roots and quotients of p",
-             "finite, shear stress within the cone, momentum conserved", "largest share of a bound", 1.01, "",
-             partial(no_pressure, law), quick=law == "saturating mu(I)")
-        for law in LAWS
-    ),
-    *(
-        Case(f"mu at mu_{'s' if friction == 'static' else '2'}{which}",
-             f"the rate is zero or infinite there; xi has a pole{seed}", "mu does not jump and stays below mu_2",
-             "jump of mu beyond that of the trial", limit, "", partial(near, friction, laws))
-        for friction in ("static", "limit")
-        for which, laws, limit, seed in (
-            ("", ("saturating mu(I)", "steady nonlocality"), 1e-6, ""),
-            (", dynamic fluidity", ("dynamic fluidity",), 0.01, "; beyond mu_s the fluidity is seeded"),
+MEASURES = {
+    **{f"no pressure: {law}": partial(no_pressure, law) for law in LAWS},
+    **{
+        f"mu at mu_{number}{which}": partial(near, friction, laws)
+        for friction, number in (("static", "s"), ("limit", "2"))
+        for which, laws in (
+            ("", ("saturating mu(I)", "steady nonlocality")),
+            (", dynamic fluidity", ("dynamic fluidity",)),
         )
-    ),
-    *(
-        Case(f"grains of 1 nm, {name}", "d -> 0: rates of 1e15 1/s in the formulas", "the force of constant friction",
-             "change of the force", 1.0, "%", partial(tiny_grains, effects))
-        for name, effects in (
-            ("mu(I)", Effects()),
-            ("dynamic fluidity", Effects(fluidity=True)),
-            ("steady nonlocality", Effects(nonlocality=True)),
-        )
-    ),
-    Case("grains of 10 m", "I far beyond I_0", "no more force than with friction mu_2", "force beyond it", 2.0, "%",
-         huge_grains),
-    Case("particles turned inside out", "the log of a negative number", "finite, shear stress within the cone",
-         "shear stress over its bound", 1.01, "", inverted, quick=True),
-]  # fmt: skip
+    },
+    "grains of 1 nm, mu(I)": partial(tiny_grains, Effects()),
+    "grains of 1 nm, dynamic fluidity": partial(tiny_grains, Effects(fluidity=True)),
+    "grains of 1 nm, steady nonlocality": partial(tiny_grains, Effects(nonlocality=True)),
+    "grains of 10 m": huge_grains,
+    "particles turned inside out": inverted,
+}

@@ -13,20 +13,6 @@ from mpm_warp.diagnostics import leakage
 from mpm_warp.poses import rotate
 from sgns.config import UserError
 
-__all__ = [
-    "blade_force",
-    "blade_shares",
-    "energies",
-    "frames_of",
-    "refused",
-    "shares",
-    "stopped_with",
-    "top_speed",
-    "unsaid",
-    "volume_gain",
-    "work_on_soil",
-]
-
 
 def frames_of(scene: Scene, every: int = 1, **settings) -> list[Frame]:
     """All frames of a scene, or one of `every` and the last."""

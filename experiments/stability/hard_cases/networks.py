@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import tempfile
 from dataclasses import replace
 from functools import cache
@@ -10,25 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import OmegaConf
+from common import training_settings
 
 from sgns.config import UserError
 from sgns.data.dataset import Dataset
+from sgns.data.files import file_lock
 from sgns.reduction.reduce import ReducedDataset, reduce_dataset
 from sgns.simulator import Simulator
 from sgns.train.command import train
 from sgns_testing import tiny
-
-__all__ = [
-    "fresh_data",
-    "poisoned",
-    "quick_data",
-    "quick_network",
-    "simulator_of",
-    "synthetic_data",
-    "synthetic_network",
-    "train_synthetic",
-]
 
 ROOT = Path(__file__).resolve().parents[3]
 # Kept until the process ends.
@@ -83,30 +72,18 @@ def quick_data() -> ReducedDataset:
     path = ROOT / "data" / "quick"
     if not (path / "dataset.yaml").exists():
         raise UserError("this case needs the dataset quick; make it with: sgns simulate dataset=quick")
-    settings = OmegaConf.to_container(OmegaConf.load(ROOT / "conf" / "reduction" / "default.yaml"))
-    return reduce_dataset(Dataset.open(path), settings, progress=False)
+    return reduce_dataset(Dataset.open(path), training_settings()["reduction"], progress=False)
 
 
 def quick_network() -> Path:
     """Checkpoint of the default network, trained on the dataset quick once and then kept in outputs/."""
     output = ROOT / "outputs" / "stability" / "network"
-    output.mkdir(parents=True, exist_ok=True)
-    model, training = (
-        OmegaConf.to_container(OmegaConf.load(ROOT / "conf" / group / "default.yaml"))
-        for group in ("model", "training")
-    )
-    data = quick_data()
+    settings, data = training_settings("training.threads=1"), quick_data()
+    chosen = {key: settings[key] for key in ("model", "training")}
+    about = {"preset": "default", "dataset": "quick"}
     # Two processes may want it at once: the second waits and finds it complete.
-    with (output / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        train(
-            data,
-            num_modes=data.num_modes,
-            model=model,
-            training=training | {"threads": 1},
-            output=output,
-            provenance={"preset": "default", "dataset": "quick"},
-        )
+    with file_lock(output.with_suffix(".lock"), wait=True):
+        train(data, num_modes=data.num_modes, **chosen, output=output, provenance=about)
     return output / "best.ckpt"
 
 

@@ -6,7 +6,7 @@ Letters: t frames, n particles, r modes.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -20,10 +20,7 @@ from sgns.reduction.pca import IncrementalPCA
 from sgns.reduction.reduce import reduce_dataset
 from sgns_testing.tiny import REDUCTION, make_dataset
 
-from .case import Case
 from .measures import unsaid
-
-__all__ = ["CASES"]
 
 
 def soil(t: int = 40, n: int = 60, rank: int | None = None, offset: float = 0.0, seed: int = 0) -> np.ndarray:
@@ -178,19 +175,15 @@ def truncated_stream() -> tuple[float, str]:
     return 100 * (1 - got / best), ""
 
 
-def poisoned(split: str, value: float) -> Callable[[], tuple[float, str]]:
+def poisoned(split: str, value: float) -> tuple[float, str]:
     """One particle of one frame of one run is no number."""
-
-    def measure() -> tuple[float, str]:
-        name = {"train": "b", "validation": "f"}[split]
-        with tempfile.TemporaryDirectory() as folder:
-            dataset = make_dataset(Path(folder))
-            with h5py.File(Path(folder) / "runs" / f"{name}.h5", "r+") as file:
-                file["particles/soil/position/value"][9, 31, 1] = value
-            words = f"{name}.h5", "particle 31", "along y", "frame 9", str(value)
-            return unsaid(lambda: reduce_dataset(dataset, REDUCTION), *words)
-
-    return measure
+    name = {"train": "b", "validation": "f"}[split]
+    with tempfile.TemporaryDirectory() as folder:
+        dataset = make_dataset(Path(folder))
+        with h5py.File(Path(folder) / "runs" / f"{name}.h5", "r+") as file:
+            file["particles/soil/position/value"][9, 31, 1] = value
+        words = f"{name}.h5", "particle 31", "along y", "frame 9", str(value)
+        return unsaid(lambda: reduce_dataset(dataset, REDUCTION), *words)
 
 
 def beyond_the_rank() -> tuple[float, str]:
@@ -216,45 +209,28 @@ ORTHONORMAL = "modes stay orthonormal"
 NO_MODES = "no mode is made of nothing"
 NAMED = "refused in one line that says what and where"
 
-CASES = [
-    Case("rank 5 of 60", "directions beyond the rank are round-off", NO_MODES, "modes too many or too few", 0, "modes",
-         rank_deficient, quick=True),
-    Case("soil that never moves", "all variances are zero", NO_MODES, "modes", 0, "modes", constant, quick=True),
-    Case("dataset that never moves", "there is no subspace", NAMED, "words lacking", 0, "words", constant_dataset),
-    Case("every particle and frame several times", "columns and rows depend on each other",
-         "twins stay twins, modes orthonormal", "largest deviation", 1e-9, "", duplicates, quick=True),
-    Case("bed 1000 km from the origin", "layout 1e7 times the motion", "the same subspace as at the origin",
-         "sine of the angle between", 1e-6, "", huge_offset, quick=True),
-    Case("1000 km in float32, motion below rounding", "all variation is rounding", NO_MODES, "modes", 0, "modes",
-         huge_offset_in_float32, quick=True),
-    Case("100 m from the origin in float32", "rounding is full-rank noise", NO_MODES, "modes too many or too few", 0,
-         "modes", offset_in_float32, quick=True),
-    Case("100 000 particles, 4 frames", "many more columns than rows", ORTHONORMAL, "largest entry of |U'U - 1|", 1e-12,
-         "", wide),
-    Case("3 particles, 20 000 frames", "many more rows than columns", "all modes reconstruct everything",
-         "largest error", 1e-12, "m", tall, quick=True),
-    Case("one particle", "one column", "all modes reconstruct everything", "largest error", 1e-12, "m", one_particle,
-         quick=True),
-    Case("one frame", "nothing to compare with", NAMED, "words lacking", 0, "words", one_frame, quick=True),
-    Case("one training run, all modes", "rows follow each other", ORTHONORMAL, "largest entry of |U'U - 1|", 1e-12, "",
-         one_run),
-    Case("batches of one frame", "blocks fill up frame by frame", "how the stream is cut does not matter",
-         "largest difference of modes", 0, "", batches_of_one, quick=True),
-    Case("modes from 1 m down to 1 pm", "a Gram matrix squares the singular values", ORTHONORMAL,
-         "largest entry of |U'U - 1|", 1e-12, "", modes_of_all_sizes, quick=True),
-    Case("all variances alike", "eigenvectors are not determined", ORTHONORMAL, "largest entry of |U'U - 1|", 1e-12,
-         "", equal_modes, quick=True),
-    Case("soil moves by a nanometre", "motion is 1e-9 of the layout", "the same subspace as of a large motion",
-         "sine of the angle between", 1e-5, "", tiny_motion, quick=True),
-    Case("300 alike directions, 24 tracked", "what is dropped comes back", "little is lost against the exact modes",
-         "variance lost", 5, "%", truncated_stream),
-    Case("NaN in a training run", "one number spoils a basis", NAMED, "words lacking", 0, "words",
-         poisoned("train", np.nan), quick=True),
-    Case("infinity in a training run", "one number spoils a basis", NAMED, "words lacking", 0, "words",
-         poisoned("train", np.inf)),
-    Case("NaN in a validation run", "one number spoils the choice of checkpoint", NAMED, "words lacking", 0, "words",
-         poisoned("validation", np.nan), quick=True),
-    Case("more modes than the data has", "5 particles that move in 3 ways", NAMED, "words lacking", 0, "words",
-         beyond_the_rank, quick=True),
-    Case("runs of two beds", "columns mean different particles", NAMED, "words lacking", 0, "words", mixture_of_beds),
-]  # fmt: skip
+
+MEASURES = {
+    "rank 5 of 60": rank_deficient,
+    "soil that never moves": constant,
+    "dataset that never moves": constant_dataset,
+    "every particle and frame several times": duplicates,
+    "bed 1000 km from the origin": huge_offset,
+    "1000 km in float32, motion below rounding": huge_offset_in_float32,
+    "100 m from the origin in float32": offset_in_float32,
+    "100 000 particles, 4 frames": wide,
+    "3 particles, 20 000 frames": tall,
+    "one particle": one_particle,
+    "one frame": one_frame,
+    "one training run, all modes": one_run,
+    "batches of one frame": batches_of_one,
+    "modes from 1 m down to 1 pm": modes_of_all_sizes,
+    "all variances alike": equal_modes,
+    "soil moves by a nanometre": tiny_motion,
+    "300 alike directions, 24 tracked": truncated_stream,
+    "NaN in a training run": partial(poisoned, "train", np.nan),
+    "infinity in a training run": partial(poisoned, "train", np.inf),
+    "NaN in a validation run": partial(poisoned, "validation", np.nan),
+    "more modes than the data has": beyond_the_rank,
+    "runs of two beds": mixture_of_beds,
+}

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -23,11 +24,8 @@ from sgns.train.callbacks import StepProgress
 from sgns.train.lightning_module import SurrogateTraining
 from sgns.train.windows import TrainingWindows
 
-from .case import Case
 from .measures import unsaid
 from .networks import fresh_data, poisoned, synthetic_data, synthetic_network, train_synthetic
-
-__all__ = ["CASES"]
 
 
 @contextmanager
@@ -42,38 +40,30 @@ def content(path: Path) -> dict[str, Any]:
     return torch.load(path, weights_only=True)
 
 
-def poison(split: str, what: str) -> Callable[[], tuple[float, str]]:
+def poison(split: str, what: str) -> tuple[float, str]:
     """One number of one frame of one run is none."""
-
-    def measure() -> tuple[float, str]:
-        name = {"train": "b", "validation": "f"}[split]
-        with folder() as output:
-            words = f"reduced run {name}", "frame 7", f"sgns check {name}.h5"
-            return unsaid(lambda: train_synthetic(poisoned(synthetic_data(), split, what), output), *words)
-
-    return measure
+    name = {"train": "b", "validation": "f"}[split]
+    with folder() as output:
+        words = f"reduced run {name}", "frame 7", f"sgns check {name}.h5"
+        return unsaid(lambda: train_synthetic(poisoned(synthetic_data(), split, what), output), *words)
 
 
-def exploding_rate(factor: float) -> Callable[[], tuple[float, str]]:
+def exploding_rate(factor: float) -> tuple[float, str]:
     """The rate grows from step 12 on; step 10 was judged and saved, and nothing of it may be lost."""
+    rate = TrainingSettings.rate
 
-    def measure() -> tuple[float, str]:
-        rate = TrainingSettings.rate
+    def ill(settings: TrainingSettings, step: int) -> float:
+        return rate(settings, step) * (factor if step > 11 else 1.0)
 
-        def ill(settings: TrainingSettings, step: int) -> float:
-            return rate(settings, step) * (factor if step > 11 else 1.0)
-
-        with folder() as output:
-            with patch.object(TrainingSettings, "rate", ill):
-                lacking, note = unsaid(
-                    lambda: train_synthetic(synthetic_data(), output, max_steps=60),
-                    "learning_rate", "at step 1", "best.ckpt",
-                )  # fmt: skip
-            steps = content(output / "best.ckpt")["global_step"]
-            finite = np.isfinite(Simulator.load(output / "best.ckpt").rollout(a_path()).latent).all()
-            return lacking + abs(steps - 10) + (not finite), note
-
-    return measure
+    with folder() as output:
+        with patch.object(TrainingSettings, "rate", ill):
+            lacking, note = unsaid(
+                lambda: train_synthetic(synthetic_data(), output, max_steps=60),
+                "learning_rate", "at step 1", "best.ckpt",
+            )  # fmt: skip
+        steps = content(output / "best.ckpt")["global_step"]
+        finite = np.isfinite(Simulator.load(output / "best.ckpt").rollout(a_path()).latent).all()
+        return lacking + abs(steps - 10) + (not finite), note
 
 
 def a_path() -> np.ndarray:
@@ -116,35 +106,32 @@ class Interrupted(Exception):
     """In place of a key or a power cut."""
 
 
-def resumed(stops: tuple[int, ...], **training: Any) -> Callable[[], tuple[float, str]]:
+def resumed(stops: tuple[int, ...], **training: Any) -> tuple[float, str]:
     """Largest difference of weights, optimiser and schedule between a training that was interrupted and one that was
     not."""
 
-    def measure() -> tuple[float, str]:
-        def run(output: Path) -> float:
-            return train_synthetic(synthetic_data(), output, max_steps=24, validate_every=6, **training)
+    def run(output: Path) -> float:
+        return train_synthetic(synthetic_data(), output, max_steps=24, validate_every=6, **training)
 
-        with folder() as output:
-            whole = run(output / "whole")
-            for stop in stops:
+    with folder() as output:
+        whole = run(output / "whole")
+        for stop in stops:
 
-                def interrupt(callback: Any, trainer: Any, *args: Any, at: int = stop) -> None:
-                    if trainer.global_step == at:
-                        raise Interrupted
+            def interrupt(callback: Any, trainer: Any, *args: Any, at: int = stop) -> None:
+                if trainer.global_step == at:
+                    raise Interrupted
 
-                try:
-                    with patch.object(StepProgress, "on_train_batch_end", interrupt):
-                        run(output / "parts")
-                except Interrupted:
-                    continue
-                return math.nan, f"it was not interrupted at step {stop}"
-            difference = abs(run(output / "parts") - whole)
-            a, b = (content(output / name / "last.ckpt") for name in ("whole", "parts"))
-            for key in ("state_dict", "optimizer_states", "lr_schedulers", "global_step", "first_loss"):
-                difference = max(difference, unlike(a[key], b[key]))
-            return difference, f"interrupted after steps {', '.join(map(str, stops))}"
-
-    return measure
+            try:
+                with patch.object(StepProgress, "on_train_batch_end", interrupt):
+                    run(output / "parts")
+            except Interrupted:
+                continue
+            return math.nan, f"it was not interrupted at step {stop}"
+        difference = abs(run(output / "parts") - whole)
+        a, b = (content(output / name / "last.ckpt") for name in ("whole", "parts"))
+        for key in ("state_dict", "optimizer_states", "lr_schedulers", "global_step", "first_loss"):
+            difference = max(difference, unlike(a[key], b[key]))
+        return difference, f"interrupted after steps {', '.join(map(str, stops))}"
 
 
 def unlike(a: Any, b: Any) -> float:
@@ -249,23 +236,19 @@ class Cast(nn.Module):
         return self.network(nodes.to(self.dtype), edges.to(self.dtype), index).to(nodes.dtype)
 
 
-def precision(dtype: torch.dtype) -> Callable[[], tuple[float, str]]:
+def precision(dtype: torch.dtype) -> tuple[float, str]:
     """RMS difference of a rollout's modes from that of the network in float64, in share of the soil's movement."""
-
-    def measure() -> tuple[float, str]:
-        run = synthetic_data().runs("test")[0]
-        paths = {}
-        for kind in (torch.float64, dtype):
-            simulator = Simulator.load(synthetic_network())
-            dynamics: LatentDynamics = simulator._dynamics
-            dynamics.network = Cast(dynamics.network, kind)
-            # Through `advance`: the fast stepper multiplies weights out itself.
-            paths[kind] = stepped(simulator, run.pose)
-        exact = paths[torch.float64]
-        moved = float(np.sqrt(np.square(exact - exact[:1]).mean()))
-        return 100 * float(np.sqrt(np.square(paths[dtype] - exact).mean())) / moved, ""
-
-    return measure
+    run = synthetic_data().runs("test")[0]
+    paths = {}
+    for kind in (torch.float64, dtype):
+        simulator = Simulator.load(synthetic_network())
+        dynamics: LatentDynamics = simulator._dynamics
+        dynamics.network = Cast(dynamics.network, kind)
+        # Through `advance`: the fast stepper multiplies weights out itself.
+        paths[kind] = stepped(simulator, run.pose)
+    exact = paths[torch.float64]
+    moved = float(np.sqrt(np.square(exact - exact[:1]).mean()))
+    return 100 * float(np.sqrt(np.square(paths[dtype] - exact).mean())) / moved, ""
 
 
 def stepped(simulator: Simulator, path: np.ndarray) -> np.ndarray:
@@ -289,49 +272,25 @@ def wrong_modes() -> tuple[float, str]:
     )
 
 
-NAMED = "refused in one line that says what and where"
-STOPS = "stops in one line, the checkpoint of before is kept"
-SAME = "to the bit the training that was not interrupted"
-DIFFERENCE = "largest difference of weights, optimiser and schedule"
-
-CASES = [
-    Case("NaN in a mode", "one window spoils all weights", NAMED, "words lacking", 0, "words",
-         poison("train", "latent"), quick=True),
-    Case("NaN in a force", "one window spoils all weights", NAMED, "words lacking", 0, "words",
-         poison("train", "force")),
-    Case("NaN in a pose", "one window spoils all weights", NAMED, "words lacking", 0, "words",
-         poison("train", "pose")),
-    Case("NaN in a validation run", "no checkpoint can be chosen", NAMED, "words lacking", 0, "words",
-         poison("validation", "latent"), quick=True),
-    Case("learning rate 1e3 times too high from step 12", "the loss grows but is finite", STOPS,
-         "words lacking and steps lost", 0, "", exploding_rate(1e3), quick=True),
-    Case("learning rate 1e8 times too high from step 12", "the loss overflows", STOPS, "words lacking and steps lost",
-         0, "", exploding_rate(1e8)),
-    Case("learning rate 1e30 from the start", "no step is sound", "stops in one line, no checkpoint is written",
-         "words lacking and checkpoints", 0, "", far_too_high_rate),
-    Case("a gradient that is not finite", "the loss was finite", STOPS, "words lacking and checkpoints spoilt", 0, "",
-         spoilt_gradient),
-    Case("interrupted once", "Adam, schedule, noise and order of windows go on", SAME, DIFFERENCE, 0, "",
-         resumed((15,)), quick=True),
-    Case("interrupted three times, twice before the first save", "nothing is there to go on from", SAME, DIFFERENCE, 0,
-         "", resumed((3, 5, 19))),
-    Case("interrupted with a horizon and fewer modes", "chance picks the modes of a step", SAME, DIFFERENCE, 0, "",
-         resumed((8, 13), horizon=3, fewer_modes=0.5)),
-    Case("runs that are all the same", "features without variance", "normalised numbers stay of order one",
-         "largest feature or target", 100, "deviations", no_variance),
-    Case("a tool that feels nothing", "targets without variance", "the force stays nothing", "largest force", 1, "N",
-         no_force),
-    Case("all modes at one place", "edges of no length in the gradient of three steps", "gradients stay finite",
-         "gradients that are not", 0, "", coinciding_nodes),
-    Case("runs of four frames, batches of 512", "more windows in a batch than there are", "it trains",
-         "0, or no finite skill", 0, "", lambda: few_frames(batch_size=512)),
-    Case("horizon longer than the runs", "no window is left", NAMED, "words lacking", 0, "words", horizon_too_long,
-         quick=True),
-    Case("network in float32", "1e-7 in every step", "the rollout of float64", "RMS difference / movement", 0.1, "%",
-         precision(torch.float32), quick=True),
-    Case("network in bfloat16", "4e-3 in every step", "errors do not grow", "RMS difference / movement", 10, "%",
-         precision(torch.bfloat16), quick=True),
-    Case("a weight that is not finite", "every answer would be NaN", NAMED, "words lacking", 0, "words",
-         unfit_checkpoint, quick=True),
-    Case("more modes than trained", "nobody taught them", NAMED, "words lacking", 0, "words", wrong_modes, quick=True),
-]  # fmt: skip
+MEASURES = {
+    "NaN in a mode": partial(poison, "train", "latent"),
+    "NaN in a force": partial(poison, "train", "force"),
+    "NaN in a pose": partial(poison, "train", "pose"),
+    "NaN in a validation run": partial(poison, "validation", "latent"),
+    "learning rate 1e3 times too high from step 12": partial(exploding_rate, 1000.0),
+    "learning rate 1e8 times too high from step 12": partial(exploding_rate, 100000000.0),
+    "learning rate 1e30 from the start": far_too_high_rate,
+    "a gradient that is not finite": spoilt_gradient,
+    "interrupted once": partial(resumed, (15,)),
+    "interrupted three times, twice before the first save": partial(resumed, (3, 5, 19)),
+    "interrupted with a horizon and fewer modes": partial(resumed, (8, 13), horizon=3, fewer_modes=0.5),
+    "runs that are all the same": no_variance,
+    "a tool that feels nothing": no_force,
+    "all modes at one place": coinciding_nodes,
+    "runs of four frames, batches of 512": partial(few_frames, batch_size=512),
+    "horizon longer than the runs": horizon_too_long,
+    "network in float32": partial(precision, torch.float32),
+    "network in bfloat16": partial(precision, torch.bfloat16),
+    "a weight that is not finite": unfit_checkpoint,
+    "more modes than trained": wrong_modes,
+}
