@@ -7,7 +7,7 @@ from itertools import islice, repeat
 from typing import Any
 
 from .effects import Effects
-from .launch import Work, Worker, find_device
+from .launch import Executor, Job, find_device
 from .scene import Scene
 from .solver import Frame, Solver
 from .state import SceneError, SolverStopped
@@ -44,7 +44,7 @@ def frames_together(
 
     def frames(
         scene: Scene, effects: Effects | None
-    ) -> Generator[Frame | SceneError | SolverStopped | Work, None, None]:
+    ) -> Generator[Frame | SceneError | SolverStopped | Job, None, None]:
         try:
             yield from Solver(scene, effects, device, precision).stages()
         except (SceneError, SolverStopped) as error:
@@ -65,25 +65,25 @@ def all_together(
         device: where they compute.
 
     Yields:
-        A task's number and what it yielded, unless that was work. Work is done when all have asked for some.
+        A task's number and what it yielded, unless that was a job: jobs are run when all tasks have asked for one.
     """
-    worker = Worker(find_device(device))
+    worker = Executor(find_device(device))
     waiting = enumerate(tasks)
     running = list(islice(waiting, at_once))
     try:
         while running:
-            works: list[Work] = []
+            works: list[Job] = []
             while len(works) < len(running):
                 place = len(works)
                 number, task = running[place]
                 item = next(task, None)
-                if isinstance(item, Work):
+                if isinstance(item, Job):
                     works.append(item)
                 elif item is not None:
                     yield number, item
                 else:
                     running[place : place + 1] = islice(waiting, 1)
-            worker.do(works)
+            worker.run(works)
     finally:
         for _, task in running:
             task.close()

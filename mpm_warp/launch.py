@@ -225,7 +225,7 @@ class Launch:
         return wp.launch(self.kernel.alone, self.count, self.arguments, device=self.device, record_cmd=True)
 
 
-class Together:
+class BatchedLaunch:
     """The same kernel over the items of several scenes.
 
     Args:
@@ -276,7 +276,7 @@ class Program:
 
 
 @dataclass
-class Work:
+class Job:
     """A program and the number of its steps; with none of them its kernels are loaded and nothing runs."""
 
     program: Program
@@ -290,7 +290,7 @@ def captures(device: wp.Device) -> bool:
     return device.is_cuda
 
 
-class _Stack:
+class _Batch:
     """Programs of the same kernels as one; on a GPU the whole of it is one CUDA graph."""
 
     def __init__(self, programs: Sequence[Program], device: wp.Device) -> None:
@@ -301,16 +301,16 @@ class _Stack:
         self._step = self._serving([p.step for p in programs])
         self._end = self._serving([p.end for p in programs])
 
-    def _serving(self, parts: Sequence[Sequence[Launch]]) -> list[Launch | Together]:
+    def _serving(self, parts: Sequence[Sequence[Launch]]) -> list[Launch | BatchedLaunch]:
         """What runs in place of the programs' launches, in order."""
         if len(parts) == 1:
             for launch in parts[0]:
                 launch.load()
             return list(parts[0])
-        made: dict[tuple[Launch, ...], Together] = {}
+        made: dict[tuple[Launch, ...], BatchedLaunch] = {}
         for launches in zip(*parts, strict=True):
             if launches not in made:
-                made[launches] = Together(launches, self._steps)
+                made[launches] = BatchedLaunch(launches, self._steps)
         return [made[launches] for launches in zip(*parts, strict=True)]
 
     def run(self, steps: Sequence[int]) -> None:
@@ -339,7 +339,7 @@ class _Stack:
             launch.launch()
 
 
-class Worker:
+class Executor:
     """Has a device do what scenes ask for.
 
     Args:
@@ -348,17 +348,17 @@ class Worker:
 
     def __init__(self, device: wp.Device) -> None:
         self._device = device
-        self._stacks: dict[object, _Stack] = {}  # kernels → the programs that last asked for them
+        self._batches: dict[object, _Batch] = {}  # kernels → the programs that last asked for them
 
-    def do(self, works: Sequence[Work]) -> None:
-        """Do works that do not touch each other's arrays, those of the same kernels together."""
-        alike: dict[object, list[Work]] = {}
-        for work in works:
-            work.shared_by = len(works)
-            alike.setdefault(work.program.kernels, []).append(work)
+    def run(self, jobs: Sequence[Job]) -> None:
+        """Run jobs that do not touch each other's arrays, those of the same kernels together."""
+        alike: dict[object, list[Job]] = {}
+        for job in jobs:
+            job.shared_by = len(jobs)
+            alike.setdefault(job.program.kernels, []).append(job)
         for kernels, group in alike.items():
-            programs = [work.program for work in group]
-            stack = self._stacks.get(kernels)
-            if stack is None or stack.programs != programs:
-                stack = self._stacks[kernels] = _Stack(programs, self._device)
-            stack.run([work.steps for work in group])
+            programs = [job.program for job in group]
+            batch = self._batches.get(kernels)
+            if batch is None or batch.programs != programs:
+                batch = self._batches[kernels] = _Batch(programs, self._device)
+            batch.run([job.steps for job in group])

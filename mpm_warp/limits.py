@@ -210,7 +210,7 @@ def speed_bound(scene: Scene, time_step: float) -> float:
     return 4.0 * (start + top_body_speed(scene, time_step) + fall) + 0.5 * scene.material.wave_speed
 
 
-class Guard:
+class PhysicalLimits:
     """Knows what soil cannot do, and what is to blame when it does.
 
     Args:
@@ -220,7 +220,7 @@ class Guard:
 
     def __init__(self, scene: Scene, time_step: float) -> None:
         self._time_step = time_step
-        self.speed_bound = speed_bound(scene, time_step)
+        self.top_speed = speed_bound(scene, time_step)
         # Compressed soil is stiffer: its waves are faster by sqrt(1 - ln J).
         stable = damped_share(scene) * scene.bed.spacing / scene.material.wave_speed
         self._most_compression = min(LARGEST_STRAIN, (STABLE_COURANT * stable / time_step) ** 2 - 1.0)
@@ -228,7 +228,7 @@ class Guard:
     def too_fast(self, speed: float) -> str:
         """The cause for soil faster than the bound."""
         return (
-            f"it moves at {speed:.3g} m/s, which nothing here can cause ({self.speed_bound:.3g} m/s at most): lower "
+            f"it moves at {speed:.3g} m/s, which nothing here can cause ({self.top_speed:.3g} m/s at most): lower "
             "scene.courant"
         )
 

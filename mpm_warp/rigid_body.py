@@ -21,14 +21,8 @@ from .poses import rotation_vectors
 from .state import SolverStopped
 
 if TYPE_CHECKING:
+    from .effects import Effects
     from .scene import Scene
-
-
-# --- A body whose height is free: it carries a load and rests on the soil -------------------------------
-# One thread on the device moves it once per substep with the impulse the soil gave it, so nothing waits for the
-# host and the step can be part of a captured graph. Height and speed are kept in double precision whatever the
-# solver's: in single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that sinks slower
-# than one such step per substep would hang in the air.
 
 
 def stable_step(mass: float, contacts: float, stiffness: float, damping: float) -> float:
@@ -69,7 +63,7 @@ def longest_step(scene: Scene) -> float:
 
     Counted as if the whole lower half of the box around the body touched a particle per (particle spacing)^2.
     """
-    if scene.axle is None:
+    if scene.axle is None or scene.body is None:
         return math.inf
     volume = scene.bed.particle_volume
     hx, hy, hz = scene.body.half_size
@@ -82,59 +76,53 @@ class RigidBody:
 
     Args:
         scene: with a body.
+        effects: with `symmetry` half of the soil's impulse is computed; with `torque` its moment is added up.
         real: precision.
         device: where it lives.
         substeps: per frame.
-        dt: substep [s].
-        particles: how many there are.
-        volume: of a particle [m^3].
-        share: of the soil's impulse that is computed: 1/2 with mirror symmetry.
-        torque: whether the moment of that impulse is added up.
+        time_step: substep [s].
+        particles: how many are computed.
     """
 
     def __init__(
         self,
         scene: Scene,
+        effects: Effects,
         real: type,
         device: wp.Device,
         substeps: int,
-        dt: float,
+        time_step: float,
         particles: int,
-        volume: float,
-        share: float = 1.0,
-        torque: bool = True,
     ) -> None:
         vec3 = wp.types.vector(3, real)
-        self.scene, self.substeps, self.dt = scene, substeps, dt
-        shape, axle = scene.body, scene.axle
-        self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, torque)
-        data = body_struct(real, self.law)()
-        h = scene.bed.spacing
+        self.scene, self.substeps, self.time_step = scene, substeps, time_step
+        shape, axle, h = scene.body, scene.axle, scene.bed.spacing
+        assert shape is not None
+        self._shape = shape
+        self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, effects.torque)
+        self.data = data = body_struct(real, self.law)()
+        """The struct that kernels take."""
         data.margin = scene.contact_distance
         data.layer = HOLDING_LAYER * h if scene.bilateral else 0.0
         outermost = max(0.0, scene.contact_distance + float(data.layer))
         data.shape, self._mesh = shape_data(shape, real, outermost, device)
         data.reach = shape.reach + math.sqrt(3.0) * outermost + h
         data.friction = shape.friction
-        data.stiffness, data.damping = contact_spring(scene, volume)
+        data.stiffness, data.damping = contact_spring(scene, scene.filled[1])
         data.separation_speed = 0.01 * scene.material.wave_speed
-        data.position = wp.zeros(substeps, dtype=vec3, device=device)
-        data.rotation = wp.zeros(substeps, dtype=wp.types.quaternion(real), device=device)
-        data.velocity = wp.zeros(substeps, dtype=vec3, device=device)
-        data.spin = wp.zeros(substeps, dtype=vec3, device=device)
-        data.stick = wp.zeros(particles, dtype=vec3, device=device)
-        data.impulse = wp.zeros(1 + torque, dtype=vec3, device=device)
+        data.position, data.velocity, data.spin = (wp.zeros(substeps, vec3, device) for _ in range(3))
+        data.rotation = wp.zeros(substeps, wp.types.quaternion(real), device)
+        data.stick = wp.zeros(particles, vec3, device)
+        data.impulse = wp.zeros(1 + effects.torque, vec3, device)
         self.launches: list[Launch] = []
         """What has to run in every substep after the soil's push was added up."""
         self._axle: wp.array | None = None
         if axle is not None:
             height = scene.poses_at(np.zeros(1))[0, 2]
-            self._axle = wp.array([height, 0.0, 0.0], dtype=wp.float64, device=device)
-            data.axle = self._axle
-            values = [self._axle, data.impulse, dt, share * axle.mass, scene.gravity, axle.damping]
+            self._axle = data.axle = wp.array([height, 0.0, 0.0], dtype=wp.float64, device=device)
+            mass = axle.mass * (0.5 if effects.symmetry else 1.0)
+            values = [self._axle, data.impulse, time_step, mass, scene.gravity, axle.damping]
             self.launches.append(Launch(axle_step(real), 1, values, device))
-        self.data = data
-        """The struct that kernels take."""
 
     def start_frame(self, frame: int) -> None:
         """Load the prescribed motion of the frame that begins at `frame`, and forget the impulse.
@@ -145,11 +133,11 @@ class RigidBody:
         self.data.impulse.zero_()
         if self._axle is not None:
             self._axle[2:].zero_()
-        times = (frame * self.substeps + np.arange(self.substeps + 1)) * self.dt
+        times = (frame * self.substeps + np.arange(self.substeps + 1)) * self.time_step
         poses = self.scene.poses_at(times)
         self._require_steady(frame, times, poses[:, :3])
-        velocity = np.diff(poses[:, :3], axis=0) / self.dt
-        spin = rotation_vectors(poses[:-1, 3:], poses[1:, 3:]) / self.dt
+        velocity = np.diff(poses[:, :3], axis=0) / self.time_step
+        spin = rotation_vectors(poses[:-1, 3:], poses[1:, 3:]) / self.time_step
         for array, values in (
             (self.data.position, poses[:-1, :3]),
             (self.data.rotation, poses[:-1, 3:]),
@@ -192,7 +180,7 @@ class RigidBody:
                 f"the body moves up or down at {rate:.3g} m/s by {time:.3f} s, which nothing here can cause "
                 f"({speed_bound:.3g} m/s at most): lower scene.courant or raise scene.damping"
             )
-        if not height - self.scene.body.half_size[2] > -self.scene.bed.size[2]:
+        if not height - self._shape.half_size[2] > -self.scene.bed.size[2]:
             raise SolverStopped(
                 f"the body reached the floor of the bin by {time:.3f} s: make scene.bed.size deeper or the load smaller"
             )
@@ -200,7 +188,7 @@ class RigidBody:
     def _require_steady(self, frame: int, times: np.ndarray, position: np.ndarray) -> None:
         """A body that is somewhere else in the next substep does not push soil: it appears in its midst."""
         way, angle = self.scene.displacement(times)
-        farthest, most = way + self.scene.body.reach * angle, LONGEST_WAY * self.scene.bed.spacing
+        farthest, most = way + self._shape.reach * angle, LONGEST_WAY * self.scene.bed.spacing
         far = ~(farthest <= most)
         if not far.any():
             return
@@ -208,9 +196,9 @@ class RigidBody:
         at = ", ".join(f"{c:.4f}" for c in position[substep])
         raise SolverStopped(
             f"the body jumps by {way[substep]:.3g} m from ({at}) m and turns by {math.degrees(angle[substep]):.3g} "
-            f"degrees within substep {substep} of frame {frame + 1}, {self.dt:.3g} s long, at {times[substep]:.5f} s: "
-            f"its farthest point moves {farthest[substep]:.3g} m, allowed: {most:.3g} m, half a grid spacing; make its "
-            "path smooth or slower there; the frames before it are good"
+            f"degrees within substep {substep} of frame {frame + 1}, {self.time_step:.3g} s long, at "
+            f"{times[substep]:.5f} s: its farthest point moves {farthest[substep]:.3g} m, allowed: {most:.3g} m, half "
+            "a grid spacing; make its path smooth or slower there; the frames before it are good"
         )
 
     def impulse(self) -> np.ndarray:

@@ -15,12 +15,12 @@ from .discretisation import half, initial_stress, lay_grid, require_symmetry
 from .effects import Effects
 from .kernels.contact import ContactLaw, body_struct
 from .kernels.fluidity import soil_parameters
-from .kernels.ghost_nodes import Images, images
-from .kernels.grid import grid_step
-from .kernels.nonlocal_fluidity import NonlocalFluidity, wall_sink
+from .kernels.ghost_nodes import GhostNodes, ghost_kernels
+from .kernels.grid import grid_step, particle_struct
+from .kernels.nonlocal_fluidity import nonlocal_launches, wall_sink
 from .kernels.transfer import transfer
-from .launch import Launch, Program, SceneKernel, Work, Worker, find_device
-from .limits import Guard, require_memory, steps_to_remap, substeps_per_frame, top_body_speed
+from .launch import Executor, Job, Launch, Program, SceneKernel, find_device
+from .limits import PhysicalLimits, require_memory, steps_to_remap, substeps_per_frame, top_body_speed
 from .poses import rotate
 from .rigid_body import RigidBody
 from .scene import Scene
@@ -88,7 +88,7 @@ class Solver:
         self.substeps_per_frame = substeps_per_frame(scene)
         self.time_step = 1.0 / scene.frame_rate / self.substeps_per_frame
         """Substep [s]."""
-        self._guard = Guard(scene, self.time_step)
+        self._limits = PhysicalLimits(scene, self.time_step)
         self._start = copy.deepcopy(start)  # every beginning needs it as it is now
         self._beginnings = 0
         self._make_ready()
@@ -101,7 +101,7 @@ class Solver:
     @property
     def computed_count(self) -> int:
         """Particles that are computed: about half of them with mirror symmetry."""
-        return len(self._x)
+        return len(self.particles.position)
 
     def frames(self) -> Iterator[Frame]:
         """All frames in order, the initial state first, or those after the one that the solver starts from.
@@ -112,14 +112,14 @@ class Solver:
             SceneError: the frames were asked for again meanwhile.
             SolverStopped: in the first frame in which a particle or the body went wrong, with the state before it.
         """
-        worker = Worker(self.device)
+        executor = Executor(self.device)
         for stage in self.stages():
-            if isinstance(stage, Work):
-                worker.do([stage])
+            if isinstance(stage, Job):
+                executor.run([stage])
             else:
                 yield stage
 
-    def stages(self) -> Generator[Frame | Work, None, None]:
+    def stages(self) -> Generator[Frame | Job, None, None]:
         """As `frames`, with all work that the device has to do before the solver can go on: the caller has it done,
         that of other scenes with it (batch.py)."""
         if self._beginnings:
@@ -134,10 +134,10 @@ class Solver:
                     "or make a Solver for each"
                 )
 
-    def _computed(self) -> Iterator[Frame | Work]:
+    def _computed(self) -> Iterator[Frame | Job]:
         """What `stages` gives, from the solver's memory as it is."""
-        for program in (self._remap, self._until_remap):
-            yield Work(program, 0)
+        for program in (self._remap, self._steps):
+            yield Job(program, 0)
         first = 0 if self._start is None else self._start.frame + 1
         if self._start is not None:
             self._memory.keep(self._start.frame)
@@ -165,214 +165,155 @@ class Solver:
             self._memory.load(self._start)
 
     def _allocate(self) -> None:
-        scene, real, device = self.scene, self._real, self.device
-        vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+        scene, effects, real, device = self.scene, self.effects, self._real, self.device
+        vec4 = wp.types.vector(4, real)
+
+        def zeros(dtype: Any, count: int) -> wp.array:
+            return wp.zeros(count, dtype=dtype, device=device)
+
         positions, volume = scene.filled
         velocities, (ln_j, strain) = scene.initial_velocities(), initial_stress(scene)
         if self._half is not None:
             kept = self._half.kept
             positions, velocities, ln_j, strain = positions[kept], velocities[kept], ln_j[kept], strain[kept]
-        n = len(positions)
-        self._grid, ghosts = lay_grid(scene, real, self.time_step, volume, self._half is not None)
-        self._soil = soil_parameters(real, scene.material, max(scene.bed.size), self.effects.fluidity)
-        if self.effects.fluidity:
-            self._soil.g = wp.zeros(n, dtype=real, device=device)
-
-        self._x = wp.array(positions, dtype=vec3, device=device)
-        self._home = wp.zeros(n, dtype=vec3, device=device)
-        self._v = wp.array(velocities, dtype=vec3, device=device)
-        self._felt = wp.array(np.pad(velocities, ((0, 0), (0, 1))), dtype=vec4, device=device)
-        self._c = wp.zeros(n, dtype=wp.types.matrix((3, 3), real), device=device)
-        self._e = wp.array(strain, dtype=wp.types.vector(6, real), device=device)
-        self._ln_j = wp.array(ln_j, dtype=real, device=device)
+        self._grid, layers = lay_grid(scene, real, self.time_step, volume, self._half is not None)
+        self._grid.on_plane = self._half.on_plane if self._half is not None else 0
+        self._soil = soil_parameters(real, scene.material, max(scene.bed.size))
         shear, bulk = 2.0 * scene.material.shear_modulus, scene.material.bulk_modulus
-        stress = shear * strain + bulk * ln_j[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
-        self._swelling = wp.zeros(n, dtype=real, device=device)
-        self._stress = wp.array(stress, dtype=wp.types.vector(6, real), device=device)
-        nodes = self._grid.nx * self._grid.ny * self._grid.nz
-        self._momentum, self._velocity, self._before, self._impulse = (
-            wp.zeros(nodes + 1, dtype=vec4, device=device)
-            for _ in range(4)  # + 1: see kernels/node_rows.py
+        n, node_count = len(positions), self._grid.nx * self._grid.ny * self._grid.nz
+        padded = node_count + 1  # see kernels/node_rows.py
+        self.particles = _with_arrays(
+            particle_struct(real),
+            device,
+            position=positions,
+            home=n,
+            velocity=velocities,
+            felt_velocity=np.pad(velocities, ((0, 0), (0, 1))),
+            velocity_gradient=n,
+            elastic_strain=strain,
+            log_volume=ln_j,
+            stress=shear * strain + bulk * ln_j[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
+            swelling=n,
+            fluidity=n if effects.fluidity else 0,
+            excess=n if effects.nonlocality else 0,
         )
-        cooperative = self.effects.nonlocality
-        self._cooperation = wp.zeros(nodes + 1 if cooperative else 0, dtype=vec4, device=device)
-        self._excess = wp.zeros(n if cooperative else 0, dtype=real, device=device)
-        self._inverse_mass = wp.zeros(nodes, dtype=real, device=device)
-        self._substep = wp.zeros(1, dtype=int, device=device)
-        self._top_speed = wp.zeros(1, dtype=real, device=device)
-        self._keep = wp.zeros(1, dtype=real, device=device)
-        self._stray = wp.zeros(4, dtype=int, device=device)
-
-        self._body: RigidBody | None = None
+        self._momentum, self._velocity, self._before, self._impulse = (zeros(vec4, padded) for _ in range(4))
+        self._inverse_mass = zeros(real, node_count)
+        self._cooperative_field, self._cooperation = (
+            zeros(vec4, padded if effects.nonlocality else 0) for _ in range(2)
+        )
+        self._top_speed, self._keep = zeros(real, 1), zeros(real, 1)
+        self._substep, self._fault = zeros(int, 1), zeros(int, 4)
+        periodic = (axis for axis, kind in enumerate(scene.bed.walls.conditions) if kind == "periodic")
+        self._turns = {axis: zeros(int, n) for axis in periodic}
+        self._body = None
         if scene.body is not None:
-            share = 1.0 if self._half is None else 0.5
-            self._body = RigidBody(
-                scene,
-                real,
-                device,
-                self.substeps_per_frame,
-                self.time_step,
-                n,
-                volume,
-                share,
-                self.effects.torque,
-            )
-        self._record_launches(n, nodes, ghosts)
+            self._body = RigidBody(scene, effects, real, device, self.substeps_per_frame, self.time_step, n)
+        self._remap, self._steps = self._programs(n, node_count, layers)
         self._memory = Memory(self._lasting())
 
     def _lasting(self) -> dict[str, wp.array]:
         """What a frame leaves to the next one; the grid is filled anew at every remap."""
-        arrays = {
-            "position": self._x,
-            "velocity": self._v,
-            "felt_velocity": self._felt,
-            "velocity_gradient": self._c,
-            "elastic_strain": self._e,
-            "log_volume": self._ln_j,
-            "stress": self._stress,
-            "swelling": self._swelling,
-        }
+        names = ["position", "velocity", "felt_velocity", "velocity_gradient", "elastic_strain", "log_volume"]
+        names += ["stress", "swelling", *(["fluidity"] if self.effects.fluidity else [])]
+        arrays = {name: getattr(self.particles, name) for name in names}
         arrays |= {f"turns_{'xyz'[axis]}": turns for axis, turns in self._turns.items()}
-        if self.effects.fluidity:
-            arrays["fluidity"] = self._soil.g
-        if self._nonlocal is not None:
-            arrays["cooperative_fluidity"] = self._nonlocal.field
-        if self._body is not None:
-            arrays |= self._body.lasting()
-        return arrays
+        if self.effects.nonlocality:
+            arrays["cooperative_fluidity"] = self._cooperative_field
+        return arrays | (self._body.lasting() if self._body is not None else {})
 
-    def _record(self, kernel: SceneKernel, count: int, *arguments: Any) -> Launch:
-        return Launch(kernel, count, arguments, self.device)
+    def _programs(self, n: int, node_count: int, layers: dict[int, np.ndarray]) -> tuple[Program, Program]:
+        """A remap, and the steps from there to the next one."""
+        real, scene, device, body = self._real, self.scene, self.device, self._body
+        particles, grid = self.particles, self._grid
+        kernels = transfer(real, self.effects, body.law if body else None, atomic=device.is_cuda)
+        node_kernels = grid_step(real, scene.bed.walls.conditions)
+        ghost_nodes = GhostNodes(real, device, grid, layers, mirrored=self._half is not None)
+        body_data = body.data if body else body_struct(real, ContactLaw())()
 
-    def _record_launches(self, n: int, nodes: int, ghosts: dict[int, np.ndarray]) -> None:
-        """What runs at a remap and in every step, in order."""
-        real, grid, soil, body = self._real, self._grid, self._soil, self._body
-        kernels = transfer(real, self.effects, body.law if body else None, atomic=self.device.is_cuda)
-        node = grid_step(real, self.scene.bed.walls.conditions)
-        ghost = Images(real, self.device, grid, ghosts, mirrored=self._half is not None)
-        x, home, v, felt, c, e, ln_j = (
-            self._x, self._home, self._v, self._felt, self._c, self._e, self._ln_j
-        )  # fmt: skip
-        watch = (self._substep, self._stray)
+        def launch(kernel: SceneKernel, count: int, *arguments: Any) -> Launch:
+            return Launch(kernel, count, arguments, device)
 
-        self._to_grid = self._record_wraps(n)
-        scatter = []
-        for part, its_grid, its_body in self._parts(n):
-            particles = [a[part] for a in (x, v, c, home)]
-            self._to_grid.append(
-                self._record(
-                    kernels.to_grid,
-                    len(particles[0]),
-                    *particles,
-                    its_grid,
-                    self._momentum,
-                    self._top_speed,
-                    *watch,
-                )
-            )
-            particles = [a[part] for a in (x, home, felt, self._stress, self._swelling)]
-            rest = (its_grid, its_body, self._impulse, self._substep)
-            scatter.append(self._record(kernels.scatter, len(particles[0]), *particles, *rest))
-        fields = (self._momentum, self._velocity, self._before, self._inverse_mass, self._impulse)
-        self._begin = [
-            *ghost.fold(self._momentum),
-            self._record(node.begin, nodes, grid, *fields),
-            *ghost.unfold(self._before),
-        ]
-        self._step = [
-            *scatter,
-            *(body.launches if body else ()),
-            *ghost.fold(self._impulse),
-            self._record(
-                node.step, nodes, grid, self._velocity, self._inverse_mass, self._impulse, self._substep
+        wrap = ghost_kernels(real).wrap
+        remap = [
+            *(launch(wrap, n, particles.position, t, a, scene.bed.size[a]) for a, t in self._turns.items()),
+            launch(
+                kernels.to_grid,
+                n,
+                particles,
+                grid,
+                self._momentum,
+                self._top_speed,
+                self._substep,
+                self._fault,
             ),
-            *self._record_nonlocal(ghosts),
-            *ghost.unfold(self._velocity),
-            self._record(
+        ]
+        begin = [
+            *ghost_nodes.fold(self._momentum),
+            launch(
+                node_kernels.begin,
+                node_count,
+                grid,
+                self._momentum,
+                self._velocity,
+                self._before,
+                self._inverse_mass,
+                self._impulse,
+            ),
+            *ghost_nodes.unfold(self._before),
+        ]
+        step = [
+            launch(kernels.scatter, n, particles, grid, body_data, self._impulse, self._substep),
+            *(body.launches if body else ()),
+            *ghost_nodes.fold(self._impulse),
+            launch(
+                node_kernels.step,
+                node_count,
+                grid,
+                self._velocity,
+                self._inverse_mass,
+                self._impulse,
+                self._substep,
+            ),
+            *(self._nonlocal_launches(layers) if self.effects.nonlocality else ()),
+            *ghost_nodes.unfold(self._velocity),
+            launch(
                 kernels.gather,
                 n,
-                x,
-                home,
-                felt,
-                c,
+                particles,
                 grid,
                 self._velocity,
                 self._cooperation,
-                self._excess,
-                *watch,
+                self._substep,
+                self._fault,
             ),
-            self._record(
-                kernels.material, n, felt, c, e, ln_j, self._stress, self._swelling, self._excess, grid, soil
-            ),
+            launch(kernels.material, n, particles, grid, self._soil),
         ]
-        self._from_grid = self._record(
-            kernels.from_grid, n, x, home, felt, v, grid, self._before, self._keep, ln_j
-        )
-        self._remap = Program(self._to_grid)
-        self._until_remap = Program(self._begin, self._step, [self._from_grid])
+        end = [launch(kernels.from_grid, n, particles, grid, self._before, self._keep)]
+        return Program(remap), Program(begin, step, end)
 
-    def _parts(self, n: int) -> Iterator[tuple[slice, Any, Any]]:
-        """Particles with the grid and the body that they see. Those on the plane of symmetry count half."""
+    def _nonlocal_launches(self, layers: dict[int, np.ndarray]) -> list[Launch]:
         grid = self._grid
-        body = self._body.data if self._body else body_struct(self._real, ContactLaw())()
-        on_plane = self._half.on_plane if self._half is not None else 0
-        if not on_plane:
-            yield slice(0, n), grid, body
-            return
-        for part, share in ((slice(0, on_plane), 0.5), (slice(on_plane, n), 1.0)):
-            if part.start == part.stop:  # all lie on it
-                continue
-            its_grid, its_body = type(grid)(), type(body)()
-            its_grid.assign(grid)
-            its_body.assign(body)
-            its_grid.particle_mass, its_grid.particle_volume = (
-                share * grid.particle_mass,
-                share * grid.particle_volume,
-            )
-            if self._body is not None:
-                its_body.stiffness, its_body.damping = share * body.stiffness, share * body.damping
-                its_body.stick = body.stick[part]
-            yield part, its_grid, its_body
-
-    def _record_nonlocal(self, ghosts: dict[int, np.ndarray]) -> list[Launch]:
-        self._nonlocal: NonlocalFluidity | None = None
-        if not self.effects.nonlocality:
-            return []
-        real, grid = self._real, self._grid
-        sink = np.zeros(grid.nx * grid.ny * grid.nz)
+        sink = np.zeros(len(self._inverse_mass))
         if self.scene.material.fluidity_at_walls == "zero":
             sink = wall_sink((grid.nx, grid.ny, grid.nz), grid.low, grid.high)
-        particles = [self._home, self._e, self._ln_j]
-        ghost = Images(real, self.device, grid, ghosts, mirrored=False)  # fluidity has no direction
-        on_plane = self._half.on_plane if self._half is not None else 0
-        self._nonlocal = NonlocalFluidity(
-            real,
+        ghost_nodes = GhostNodes(self._real, self.device, grid, layers, mirrored=False)
+        launches = nonlocal_launches(
+            self._real,
             self.effects,
-            self.device,
             sink,
-            particles,
+            self.particles,
             grid,
             self._soil,
-            ghost,
+            self._cooperative_field,
             self._cooperation,
-            on_plane,
+            ghost_nodes,
         )
-        return [*self._nonlocal.launches, *ghost.unfold(self._cooperation)]
-
-    def _record_wraps(self, n: int) -> list[Launch]:
-        """Bring particles that left a periodic bin back in."""
-        self._turns: dict[int, wp.array] = {}
-        launches = []
-        for axis, kind in enumerate(self.scene.bed.walls.conditions):
-            if kind == "periodic":
-                self._turns[axis] = turns = wp.zeros(n, dtype=int, device=self.device)
-                wrap = images(self._real).wrap
-                launches.append(self._record(wrap, n, self._x, turns, axis, self.scene.bed.size[axis]))
-        return launches
+        return [*launches, *ghost_nodes.unfold(self._cooperation)]
 
     # --- stepping -----------------------------------------------------------------------------------------
 
-    def _advance(self, index: int) -> Iterator[Work]:
+    def _advance(self, index: int) -> Iterator[Job]:
         """From frame index - 1 to frame `index`."""
         self._substep.zero_()
         if self._body is not None:
@@ -380,33 +321,34 @@ class Solver:
         left = self.substeps_per_frame
         while left:
             self._top_speed.zero_()
-            yield Work(self._remap, 1)
+            yield Job(self._remap, 1)
             top = float(self._top_speed.numpy()[0])
-            if not top <= self._guard.speed_bound:
-                fastest = int(np.argmax(np.linalg.norm(self._v.numpy(), axis=1)))
-                raise self._stopped(index, self.substeps_per_frame - left, fastest, self._guard.too_fast(top))
-            speed = max(self._top_body_speed, top)
-            steps = min(left, steps_to_remap(self.scene, self.time_step, speed))
+            if not top <= self._limits.top_speed:
+                fastest = int(np.argmax(np.linalg.norm(self.particles.velocity.numpy(), axis=1)))
+                substep = self.substeps_per_frame - left
+                raise self._stopped(index, substep, fastest, self._limits.too_fast(top))
+            steps = min(left, steps_to_remap(self.scene, self.time_step, max(self._top_body_speed, top)))
             left -= steps
             self._keep.fill_(math.exp(-steps * self.time_step / self.scene.velocity_memory))
-            yield Work(self._until_remap, steps)
+            yield Job(self._steps, steps)
         self._check(index)
 
     def _check(self, index: int) -> None:
         """At the end of frame `index`."""
-        count, particle, substep, near = (int(i) for i in self._stray.numpy())
+        particles, limits = self.particles, self._limits
+        count, particle, substep, near = (int(i) for i in self._fault.numpy())
         if count:
-            raise self._stopped(index, substep, particle, self._guard.strayed(bool(near)))
-        found = self._guard.too_strained(self._ln_j.numpy(), self._e.numpy())
-        found = found or self._guard.lost_fluidity(self._excess.numpy())
+            raise self._stopped(index, substep, particle, limits.strayed(bool(near)))
+        found = limits.too_strained(particles.log_volume.numpy(), particles.elastic_strain.numpy())
+        found = found or limits.lost_fluidity(particles.excess.numpy())
         if found is not None:
             raise self._stopped(index, self.substeps_per_frame, *found)
         if self._body is not None:
-            self._body.check(index / self.scene.frame_rate, self._guard.speed_bound)
+            self._body.check(index / self.scene.frame_rate, limits.top_speed)
 
     def _stopped(self, index: int, substep: int, particle: int, cause: str) -> SolverStopped:
         time = (index - 1) / self.scene.frame_rate + substep * self.time_step
-        at = ", ".join(f"{c:.4f}" for c in self._x.numpy()[particle])
+        at = ", ".join(f"{c:.4f}" for c in self.particles.position.numpy()[particle])
         if self._half is not None:
             particle = int(self._half.kept[particle])
         return SolverStopped(
@@ -421,7 +363,7 @@ class Solver:
         impulse = np.zeros((2, 3))
         if self._body is not None:
             pose, impulse = self._body.pose(time), self._body.impulse() * (scene.frame_rate if index else 0.0)
-        position, velocity = self._x.numpy(), self._felt.numpy()[:, :3]
+        position, velocity = self.particles.position.numpy(), self.particles.felt_velocity.numpy()[:, :3]
         for axis, turns in self._turns.items():
             position = position.copy()  # on the CPU it is the solver's own memory
             position[:, axis] += turns.numpy() * scene.bed.size[axis]
@@ -439,3 +381,12 @@ class Solver:
             force=impulse[0],
             torque=impulse[1],
         )
+
+
+def _with_arrays(struct: Any, device: wp.Device, **given: int | np.ndarray) -> Any:
+    """A struct whose arrays hold what is given, or so many zeros."""
+    filled = struct()
+    for name, values in given.items():
+        make = wp.zeros if isinstance(values, int) else wp.array
+        setattr(filled, name, make(values, dtype=struct.vars[name].type.dtype, device=device))
+    return filled

@@ -21,7 +21,7 @@ import warp as wp
 from scenes import FARTHEST, FORCE, Case, cases, outcome, write_rows
 from stand_in import Checked, Report, Threads, compiler, on_stand_in, with_graphs
 
-from mpm_warp.launch import Launch, Program, Work, Worker, find_device, scene_kernel
+from mpm_warp.launch import Executor, Job, Launch, Program, find_device, scene_kernel
 
 HERE = Path(__file__).resolve().parent
 FRAMES = 2  # checked; every launch of every step in them
@@ -94,7 +94,7 @@ def planted(given: Sequence[Case]) -> dict[str, list[Report]]:
     ):
         with on_stand_in(Checked()) as checked:
             launches = [Launch(kernel, len(array), [array], device) for array in arrays]
-            Worker(device).do([Work(Program([launch]), 1) for launch in launches])
+            Executor(device).run([Job(Program([launch]), 1) for launch in launches])
         found[words] = [report for report in checked.reports() if report.conflicts or report.outside]
     return found
 

@@ -45,9 +45,9 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
     vec3 = wp.types.vector(3, real)
     vec6 = wp.types.vector(6, real)
     mat33 = wp.types.matrix((3, 3), real)
-    Soil = soil_struct(real, effects.fluidity)
+    Soil = soil_struct(real)
     State = wp.types.vector(8 if effects.fluidity else 7, real)
-    fluid = fluidity(real, effects)
+    fluid = fluidity(real)
     coefficients, fluidity_step = fluid.coefficients, fluid.fluidity_step
     friction_with_excess = fluid.friction_with_excess
     second_order_limit = wp.constant(SECOND_ORDER_LIMIT**2)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 
 import warp as wp
 
@@ -65,20 +64,17 @@ def body_struct(real: type, law: ContactLaw) -> type:
         rotation: wp.array(dtype=quat)
         velocity: wp.array(dtype=vec3)  # pose difference over the substep [m/s]
         spin: wp.array(dtype=vec3)  # angular velocity, world frame [rad/s]
-        axle: wp.array(
-            dtype=wp.float64
-        )  # of a free body: height [m] and its rate [m/s] in place of the above
+        axle: wp.array(dtype=wp.float64)  # of a free body: height [m], its rate [m/s] in place of the above
         stick: wp.array(dtype=vec3)  # stretch of each particle's tangential spring, world frame [m]
-        impulse: wp.array(
-            dtype=vec3
-        )  # [0] by the soil on the body [N s], [1] its moment about the centre of mass, if that is asked for
+        impulse: wp.array(dtype=vec3)  # by the soil on the body [N s]; with `torque` also its moment [N m s]
 
     return Body
 
 
 @cache
-def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
-    """Warp function `push(p, x, v, mass, dt, s, body)` in precision `real`: impulse on particle p in substep s [N s].
+def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
+    """Warp function `push(p, x, v, mass, part, dt, s, body)` in precision `real`: impulse on particle p, of which
+    `part` is computed, in substep s [N s].
 
     The opposite impulse is added to the body; `atomic` is needed where many threads do so at once (a GPU).
     """
@@ -99,7 +95,7 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
                 body.impulse[1] = body.impulse[1] - wp.cross(arm, impulse)
 
     @wp.func
-    def push(p: int, x: vec3, v: vec3, mass: real, dt: real, s: int, body: Body):
+    def push(p: int, x: vec3, v: vec3, mass: real, part: real, dt: real, s: int, body: Body):
         centre = body.position[s]
         if wp.static(free):
             centre = vec3(centre[0], centre[1], real(body.axle[0]))
@@ -117,35 +113,33 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
                     velocity = vec3(velocity[0], velocity[1], real(body.axle[1]))
                 relative = v - velocity - wp.cross(body.spin[s], arm)
                 leaving = wp.dot(relative, normal)
-                hold = wp.min(dt * body.damping, mass)  # dampers may stop the particle, not turn it back
+                stiffness = part * body.stiffness
+                damping = part * body.damping
+                hold = wp.min(dt * damping, mass)  # dampers may stop the particle, not turn it back
                 pressed = real(0.0)
                 if wp.static(bilateral):
-                    pressed = dt * body.stiffness * wp.max(overlap, real(0.0)) - hold * leaving
+                    pressed = dt * stiffness * wp.max(overlap, real(0.0)) - hold * leaving
                 elif leaving < body.separation_speed:
-                    pressed = wp.max(dt * (body.stiffness * overlap - body.damping * leaving), real(0.0))
+                    pressed = wp.max(dt * (stiffness * overlap - damping * leaving), real(0.0))
                 if pressed != real(0.0):
                     sliding = relative - leaving * normal
                     stretch = body.stick[p]
                     stretch += dt * sliding - wp.dot(stretch, normal) * normal
-                    grip = dt * body.stiffness * stretch + hold * sliding
+                    grip = dt * stiffness * stretch + hold * sliding
                     size = wp.length(grip)
                     most = body.friction * wp.abs(pressed)
                     if size > most:
                         grip = grip * (most / size)
-                        stretch = grip / (dt * body.stiffness)
+                        stretch = grip / (dt * stiffness)
                     impulse = pressed * normal - grip
                     add(body, impulse, arm)
             body.stick[p] = stretch
         return impulse
 
-    return SimpleNamespace(push=push)
+    return push
 
 
-# --- A body whose height is free: it carries a load and rests on the soil -------------------------------
-# One thread on the device moves it once per substep with the impulse the soil gave it, so nothing waits for the
-# host and the step can be part of a captured graph. Height and speed are kept in double precision whatever the
-# solver's: in single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that sinks slower
-# than one such step per substep would hang in the air.
+# --- A body whose height is free: it carries a load and rests on the soil (see rigid_body.py) ------------
 
 
 @cache
@@ -156,9 +150,7 @@ def axle_step(real: type) -> SceneKernel:
     @scene_kernel()
     def step(
         _: int,
-        axle: wp.array(
-            dtype=wp.float64
-        ),  # height [m], its rate [m/s], vertical impulse of this frame so far [N s]
+        axle: wp.array(dtype=wp.float64),  # height [m], its rate [m/s], vertical impulse of this frame [N s]
         impulse: wp.array(dtype=vec3),
         dt: wp.float64,
         mass: wp.float64,

@@ -7,16 +7,14 @@ from typing import Any
 
 import warp as wp
 
-from ..effects import Effects
 from ..material import Material
 
 # --- The soil's constants as a Warp struct --------------------------------------------------------------
 
 
 @cache
-def soil_struct(real: type, with_fluidity: bool) -> type:
-    """Struct of the soil constants in precision `real` (pressures in Pa, lengths in m), and with the effect
-    `fluidity` the particles' fluidity."""
+def soil_struct(real: type) -> type:
+    """Struct of the soil constants in precision `real` (pressures in Pa, lengths in m)."""
 
     @wp.struct
     class Soil:
@@ -30,18 +28,16 @@ def soil_struct(real: type, with_fluidity: bool) -> type:
         fluidity_time: real  # t_0 [s]
         cooperative_length: real  # A d [m]
         least_slowing: real  # (A d / xi)^2 at the largest xi, the size of the bed
-        if with_fluidity:
-            g: wp.array(dtype=real)  # fluidity of each particle [1/s]
 
     return Soil
 
 
-def soil_parameters(real: type, material: Material, bed_size: float, with_fluidity: bool) -> Any:
-    """The struct filled with the constants of `material`, without its arrays.
+def soil_parameters(real: type, material: Material, bed_size: float) -> Any:
+    """The struct filled with the constants of `material`.
 
     `bed_size` [m] bounds the cooperativity length, which has no bound at mu = mu_s.
     """
-    soil = soil_struct(real, with_fluidity)()
+    soil = soil_struct(real)()
     soil.shear_modulus, soil.bulk_modulus = material.shear_modulus, material.bulk_modulus
     soil.static_friction, soil.limit_friction = material.static_friction, material.limit_friction
     soil.reference_rate = material.reference_inertial_number / (
@@ -86,7 +82,7 @@ MAX_ITERATIONS = 60
 
 
 @cache
-def fluidity(real: type, effects: Effects) -> SimpleNamespace:
+def fluidity(real: type) -> SimpleNamespace:
     """Warp functions in precision `real`:
 
     - `coefficients(p, dt, soil)` -> a and c,
@@ -98,7 +94,7 @@ def fluidity(real: type, effects: Effects) -> SimpleNamespace:
       flow: that of the shortest wave along an axis of the grid.
     """
     vec2 = wp.types.vector(2, real)
-    Soil = soil_struct(real, effects.fluidity)
+    Soil = soil_struct(real)
     seed = wp.constant(SEED_INERTIAL_NUMBER)
     least_fluidity = wp.constant(LEAST_FLUIDITY)
     least_pressure = wp.constant(LEAST_PRESSURE)

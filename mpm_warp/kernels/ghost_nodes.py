@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..launch import Launch, SceneKernel, scene_kernel
+from ..launch import Launch, scene_kernel
 
 _REACH = 2  # layers of ghost nodes: one more than the splines of a particle on the plane reach
 
@@ -32,7 +32,7 @@ def seam_pairs(low: int, cells: int) -> np.ndarray:
 
 
 @cache
-def images(real: type) -> SimpleNamespace:
+def ghost_kernels(real: type) -> SimpleNamespace:
     """Kernels `fold`, `unfold` (one thread per row of nodes across the plane) and `wrap` in precision `real`."""
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
 
@@ -89,36 +89,33 @@ def images(real: type) -> SimpleNamespace:
     return SimpleNamespace(fold=fold, unfold=unfold, wrap=wrap)
 
 
-class Images:
+class GhostNodes:
     """Launches that keep ghost nodes and their images in agreement.
 
     Args:
         real: precision.
         device: Warp device.
         grid: the solver's struct.
-        ghosts: axis → ghost layers and their images, shape (m, 2).
+        layers: axis → ghost layers and their images, shape (m, 2).
         mirrored: whether the layers along y are mirror images; all others are one period apart.
     """
 
     def __init__(
-        self, real: type, device: wp.Device, grid: Any, ghosts: dict[int, np.ndarray], mirrored: bool
+        self, real: type, device: wp.Device, grid: Any, layers: dict[int, np.ndarray], mirrored: bool
     ) -> None:
         vec4 = wp.types.vector(4, real)
-        self._kernels, self._device, self._axes = images(real), device, []
-        for axis, pairs in ghosts.items():
+        self._kernels, self._device, self._axes = ghost_kernels(real), device, []
+        for axis, pairs in layers.items():
             extent, stride = ((grid.nx, grid.ny * grid.nz), (grid.ny, grid.nz))[axis]
             sign = vec4(1.0, -1.0 if mirrored and axis == 1 else 1.0, 1.0, 1.0)
-            layers = wp.array(pairs, dtype=wp.vec2i, device=device)
             rows = grid.nx * grid.ny * grid.nz // extent
-            self._axes.append((rows, [layers, sign, stride, extent]))
+            self._axes.append((rows, wp.array(pairs, dtype=wp.vec2i, device=device), sign, stride, extent))
 
     def fold(self, nodes: wp.array) -> list[Launch]:
         """Add ghost layers to their images."""
-        return [self._record(self._kernels.fold, nodes, *axis) for axis in self._axes]
+        return [Launch(self._kernels.fold, rows, [nodes, *axis], self._device) for rows, *axis in self._axes]
 
     def unfold(self, nodes: wp.array) -> list[Launch]:
         """Give ghost layers the values of their images."""
-        return [self._record(self._kernels.unfold, nodes, *axis) for axis in reversed(self._axes)]
-
-    def _record(self, kernel: SceneKernel, nodes: wp.array, rows: int, rest: list) -> Launch:
-        return Launch(kernel, rows, [nodes, *rest], self._device)
+        axes = reversed(self._axes)
+        return [Launch(self._kernels.unfold, rows, [nodes, *axis], self._device) for rows, *axis in axes]

@@ -11,7 +11,11 @@ import warp as wp
 def momenta(solver):
     """Linear and angular momentum of the particles, the affine part (C dx^2 / 4) included."""
     mass = solver._grid.particle_mass
-    x, v, c = solver._x.numpy(), solver._v.numpy(), solver._c.numpy()
+    x, v, c = (
+        solver.particles.position.numpy(),
+        solver.particles.velocity.numpy(),
+        solver.particles.velocity_gradient.numpy(),
+    )
     spin = np.stack([c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], axis=-1)
     angular = mass * (np.cross(x, v) + spin * solver.scene.bed.spacing**2 / 4)
     return mass * v.sum(axis=0), angular.sum(axis=0)
@@ -19,7 +23,8 @@ def momenta(solver):
 
 def launches(solver):
     """At a remap, in a step and at its end."""
-    return [*solver._to_grid, *solver._begin, *solver._step, solver._from_grid]
+    steps = solver._steps
+    return [*solver._remap.begin, *steps.begin, *steps.step, *steps.end]
 
 
 def compiled_source(launch):

@@ -25,7 +25,7 @@ from mpm_warp import (
 )
 from mpm_warp import launch as work_module
 from mpm_warp.batch import all_together
-from mpm_warp.launch import Launch, Program, Together, Work
+from mpm_warp.launch import BatchedLaunch, Job, Launch, Program
 from sgns_testing.scenes import UNDAMPED, block, cut
 
 needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
@@ -121,7 +121,7 @@ def test_scenes_of_the_same_kernels_share_every_launch(monkeypatch):
         return launches
 
     monkeypatch.setattr(Launch, "launch", counted("alone", Launch.launch))
-    monkeypatch.setattr(Together, "launch", counted("together", Together.launch))
+    monkeypatch.setattr(BatchedLaunch, "launch", counted("together", BatchedLaunch.launch))
     scenes = [cut(duration=0.05, speed=speed, depth=0.03) for speed in (0.1, 0.15, 0.2)]
     for _ in Solver(scenes[-1]).frames():
         pass
@@ -188,7 +188,7 @@ def test_tasks_go_side_by_side_and_the_next_begins_when_one_ends():
     def task(name, turns):
         log.append(f"{name} begins")
         for turn in range(turns):
-            yield Work(Program([]), 0)
+            yield Job(Program([]), 0)
             yield name, turn
         log.append(f"{name} ends")
 
@@ -205,12 +205,12 @@ def test_when_one_breaks_the_others_are_closed():
     def waits(name):
         try:
             while True:
-                yield Work(Program([]), 0)
+                yield Job(Program([]), 0)
         finally:
             closed.append(name)
 
     def breaks():
-        yield Work(Program([]), 0)
+        yield Job(Program([]), 0)
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):

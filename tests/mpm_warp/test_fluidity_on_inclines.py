@@ -67,7 +67,7 @@ def flow(material, effects, angle, height, start, duration, spacing):
     }
     solver = Solver(Incline(bed=bed, material=material, **values), effects)
     z = (solver.scene.initial_positions()[:, 2] + height).round(7)
-    solver._v.assign(np.column_stack([start(z), 0.0 * z, 0.0 * z]))
+    solver.particles.velocity.assign(np.column_stack([start(z), 0.0 * z, 0.0 * z]))
     *_, last = solver.frames()
     rows = np.unique(z)
     return rows, np.array([last.velocity[z == row, 0].mean() for row in rows])

@@ -13,7 +13,7 @@ from mpm_warp import launch as kernel_cache_module
 from mpm_warp.kernels.contact import ContactLaw
 from mpm_warp.kernels.grid import grid_step
 from mpm_warp.kernels.transfer import transfer
-from mpm_warp.launch import Launch, Program, Work, Worker, find_device, load_kernel, scene_kernel
+from mpm_warp.launch import Executor, Job, Launch, Program, find_device, load_kernel, scene_kernel
 
 # --- Kernels that are damaged in Warp's cache -----------------------------------------------------------
 
@@ -155,8 +155,8 @@ def test_programs_together_are_the_programs_alone():
     cases = [(1.0, [1.0, 2.0, 3.0], 2), (-0.5, [4.0], 5), (3.0, [1.0, 0.1], 1)]
     alone, together = ([scene(*both, *case[:2]) for case in cases] for _ in range(2))
     for (_, program), (*_, steps) in zip(alone, cases, strict=True):
-        Worker(device).do([Work(program, steps)])
-    Worker(device).do([Work(p, steps) for (_, p), (*_, steps) in zip(together, cases, strict=True)])
+        Executor(device).run([Job(program, steps)])
+    Executor(device).run([Job(p, steps) for (_, p), (*_, steps) in zip(together, cases, strict=True)])
     for (one, _), (two, _), (factor, numbers, steps) in zip(alone, together, cases, strict=True):
         np.testing.assert_array_equal(one.numpy(), two.numpy())
         np.testing.assert_allclose(two.numpy(), 2.0 * (2 + steps) * factor * np.array(numbers), rtol=1e-6)
@@ -166,26 +166,26 @@ def test_programs_together_are_the_programs_alone():
 def test_work_without_steps_does_nothing(count):
     both = kernels()
     found = [scene(*both, 1.0, [1.0, 2.0]) for _ in range(count)]
-    Worker(find_device("cpu")).do([Work(program, 0) for _, program in found])
+    Executor(find_device("cpu")).run([Job(program, 0) for _, program in found])
     assert all(not to.numpy().any() for to, _ in found)
 
 
 def test_those_who_have_no_steps_to_do_wait():
-    both, worker = kernels(), Worker(find_device("cpu"))
+    both, executor = kernels(), Executor(find_device("cpu"))
     (one, first), (two, second) = (scene(*both, 1.0, [1.0]) for _ in range(2))
-    worker.do([Work(first, 1), Work(second, 0)])
+    executor.run([Job(first, 1), Job(second, 0)])
     assert (one.numpy()[0], two.numpy()[0]) == (6.0, 0.0)
-    worker.do([Work(first, 0), Work(second, 2)])
+    executor.run([Job(first, 0), Job(second, 2)])
     assert (one.numpy()[0], two.numpy()[0]) == (6.0, 8.0)
 
 
 def test_programs_of_other_kernels_are_done_apart():
     add, double = kernels()
     to, first = scene(add, double, 1.0, [1.0])
-    works = [Work(first, 1), Work(Program([Launch(double, 1, [to], find_device("cpu"))]), 1)]
-    Worker(find_device("cpu")).do(works)
+    jobs = [Job(first, 1), Job(Program([Launch(double, 1, [to], find_device("cpu"))]), 1)]
+    Executor(find_device("cpu")).run(jobs)
     assert to.numpy()[0] == 12.0
-    assert [work.shared_by for work in works] == [2, 2]
+    assert [job.shared_by for job in jobs] == [2, 2]
 
 
 def test_kernels_compile_for_a_gpu(tmp_path):

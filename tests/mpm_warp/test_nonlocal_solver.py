@@ -36,15 +36,15 @@ def test_a_periodic_seam_is_nowhere(effects, at_walls):
         solver = Solver(scene, effects, precision="float64")
         e, flow = np.zeros((len(order), 6)), np.roll(mu, moved, axis=(0, 1)).ravel()
         e[order, 4] = flow * PRESSURE / (2.0 * material.shear_modulus)
-        solver._e.assign(e)
-        solver._ln_j.fill_(-PRESSURE / material.bulk_modulus)
+        solver.particles.elastic_strain.assign(e)
+        solver.particles.log_volume.fill_(-PRESSURE / material.bulk_modulus)
         if effects.fluidity:
             g = np.zeros(len(order))
             g[order] = 10.0 * flow
-            solver._soil.g.assign(g)
-        for launch in (*solver._to_grid, *solver._begin, *solver._step):
+            solver.particles.fluidity.assign(g)
+        for launch in (*solver._remap.begin, *solver._steps.begin, *solver._steps.step):
             launch.launch()
-        found = solver._excess.numpy()[order].reshape(cells)
+        found = solver.particles.excess.numpy()[order].reshape(cells)
         return np.roll(found, [-m for m in moved], axis=(0, 1))
 
     still = excess((0, 0))
@@ -58,10 +58,10 @@ def test_what_is_off_costs_nothing():
     assert [launch.kernel.name for launch in launches(plain)] == [
         "to_grid", "begin", "scatter", "step", "gather", "material", "from_grid"
     ]  # fmt: skip
-    assert len(fluid._step) > len(plain._step)
-    assert not hasattr(plain._soil, "g")
-    assert fluid._soil.g.shape == (fluid.particle_count,)
-    assert "fluidity_step" in compiled_source(fluid._step[-1])
+    assert len(fluid._steps.step) > len(plain._steps.step)
+    assert len(plain.particles.fluidity) == 0
+    assert fluid.particles.fluidity.shape == (fluid.particle_count,)
+    assert "fluidity_step" in compiled_source(fluid._steps.step[-1])
     for launch in launches(plain):
         found = compiled_source(launch)
         assert (
@@ -85,9 +85,9 @@ def test_stops_where_the_fluidity_is_no_number():
     solver = Solver(cut(duration=0.1, material=Material(grain_diameter=5e-3)), STEADY)
     frames = solver.frames()
     next(frames), next(frames)
-    field = solver._nonlocal.field.numpy().copy()
+    field = solver._cooperative_field.numpy().copy()
     field[:, 3] = np.nan  # which the sweeps of the steady form go on from
-    solver._nonlocal.field.assign(field)
+    solver._cooperative_field.assign(field)
     with pytest.raises(SolverStopped, match="its fluidity is not finite"):
         list(frames)
 

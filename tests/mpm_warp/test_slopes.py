@@ -69,7 +69,7 @@ def test_the_flow_finds_its_speed():
     solver = Solver(scene)
     frames = solver.frames()
     steady = next(frames).velocity[:, 0].mean()
-    solver._v.assign(0.9 * solver._v.numpy())
+    solver.particles.velocity.assign(0.9 * solver.particles.velocity.numpy())
     speed = [f.velocity[:, 0].mean() / steady for f in frames]
     assert speed[0] < 0.93
     assert speed[-1] > 0.95
@@ -81,7 +81,7 @@ def test_no_flow_below_the_static_friction():
     solver = Solver(scene, Effects(rate_dependence=False))
     frames = solver.frames()
     next(frames)
-    solver._v.assign(np.tile([0.2, 0.0, 0.0], (solver.particle_count, 1)))
+    solver.particles.velocity.assign(np.tile([0.2, 0.0, 0.0], (solver.particle_count, 1)))
     speed = [f.velocity[:, 0].mean() for f in frames]
     assert speed[0] > 0.05
     assert np.abs(speed[-1]) < 2e-3

@@ -20,13 +20,13 @@ def test_free_fall_is_exact():
     """Symplectic Euler: after n steps v = -g n dt and the drop is g dt^2 n (n + 1) / 2."""
     scene = block(gravity=9.81)
     solver = Solver(scene, precision="float64")
-    start = solver._x.numpy().copy()
+    start = solver.particles.position.numpy().copy()
     for _ in solver.frames():
         pass
     n = (scene.frame_count - 1) * solver.substeps_per_frame
     dt = solver.time_step
-    np.testing.assert_allclose(solver._v.numpy()[:, 2], -9.81 * n * dt, rtol=1e-12)
-    drop = solver._x.numpy() - start
+    np.testing.assert_allclose(solver.particles.velocity.numpy()[:, 2], -9.81 * n * dt, rtol=1e-12)
+    drop = solver.particles.position.numpy() - start
     np.testing.assert_allclose(drop[:, 2], -9.81 * dt**2 * n * (n + 1) / 2, rtol=1e-12)
     np.testing.assert_allclose(drop[:, :2], 0.0, atol=1e-15)
 
@@ -36,14 +36,14 @@ def test_momentum_is_conserved(effects):
     """A free block thrown about: linear and (APIC) angular momentum to round-off."""
     solver = Solver(block(remap_time=0.0, velocity_memory=1e-9), effects, precision="float64")
     rng = np.random.default_rng(0)
-    x = solver._x.numpy()
+    x = solver.particles.position.numpy()
     turning = np.cross([3.0, -2.0, 5.0], x - x.mean(axis=0)) + np.array([0.3, 0.1, -0.2])
-    solver._v.assign(turning + 0.2 * rng.normal(size=turning.shape))
+    solver.particles.velocity.assign(turning + 0.2 * rng.normal(size=turning.shape))
     before = momenta(solver)
     for _ in solver.frames():
         pass
     after = momenta(solver)
-    size = solver._grid.particle_mass * np.abs(solver._v.numpy()).sum()
+    size = solver._grid.particle_mass * np.abs(solver.particles.velocity.numpy()).sum()
     np.testing.assert_allclose(after[0], before[0], atol=1e-12 * size)
     np.testing.assert_allclose(after[1], before[1], atol=1e-12 * size)
     assert np.linalg.norm(before[1]) > 1e-3 * size * 0.1  # there was something to conserve
@@ -61,10 +61,10 @@ def shaken_column():
     layers = np.unique(heights.round(6))
     sink, stress = [], []
     for _ in solver.frames():
-        now = solver._x.numpy()[middle, 2] + 0.1 - heights
+        now = solver.particles.position.numpy()[middle, 2] + 0.1 - heights
         sink.append([now[np.isclose(heights, h, atol=1e-5)].mean() for h in layers])
         g, k = scene.material.shear_modulus, scene.material.bulk_modulus
-        e, ln_j = solver._e.numpy()[middle], solver._ln_j.numpy()[middle]
+        e, ln_j = solver.particles.elastic_strain.numpy()[middle], solver.particles.log_volume.numpy()[middle]
         stress.append([np.mean(2 * g * e[:, 0] + k * ln_j), np.mean(2 * g * e[:, 2] + k * ln_j)])
     return scene, layers, np.array(sink), np.array(stress)
 
@@ -213,12 +213,12 @@ def test_stops_at_a_value_that_is_not_finite():
     solver = Solver(cut(duration=0.1))
     frames = solver.frames()
     next(frames)
-    v = solver._v.numpy()
+    v = solver.particles.velocity.numpy()
     v[17, 1] = np.nan
-    solver._v.assign(v)
+    solver.particles.velocity.assign(v)
     with pytest.raises(SolverStopped, match=r"particle \d+ at .* frame 1: its speed is not finite"):
         next(frames)
-    assert np.isfinite(solver._x.numpy()).all()
+    assert np.isfinite(solver.particles.position.numpy()).all()
 
 
 def test_stops_when_soil_leaves_the_grid():
@@ -226,7 +226,7 @@ def test_stops_when_soil_leaves_the_grid():
     solver = Solver(scene)
     frames = solver.frames()
     next(frames)
-    solver._v.assign(np.tile([0.0, 0.0, 4.0], (solver.particle_count, 1)))
+    solver.particles.velocity.assign(np.tile([0.0, 0.0, 4.0], (solver.particle_count, 1)))
     with pytest.raises(SolverStopped, match="headroom"):
         list(frames)
 

@@ -10,7 +10,7 @@ import pytest
 
 from mpm_warp import Bed, Effects, Incline, Material, SceneError, Solver, SolverStopped, State, Walls, Wheel
 from mpm_warp.batch import all_together
-from mpm_warp.limits import Guard
+from mpm_warp.limits import PhysicalLimits
 from sgns_testing.scenes import UNDAMPED, block, cut
 
 
@@ -58,9 +58,9 @@ def stopped(scene, frame: int = 3) -> tuple[list, SolverStopped]:
         for found in solver.frames():
             frames.append(found)
             if found.index == frame - 1:
-                v = solver._v.numpy()
+                v = solver.particles.velocity.numpy()
                 v[17] = np.nan
-                solver._v.assign(v)
+                solver.particles.velocity.assign(v)
     return frames, caught.value
 
 
@@ -83,8 +83,12 @@ def test_what_soil_cannot_do_stops_the_solver(stopping):
     frames = solver.frames()
     next(frames)
     array, value, words = {
-        "speed": (solver._v, 20.0, r"it moves at 34.6 m/s, which nothing here can cause \(\d"),
-        "nan": (solver._e, np.nan, "speed is not finite"),
+        "speed": (
+            solver.particles.velocity,
+            20.0,
+            r"it moves at 34.6 m/s, which nothing here can cause \(\d",
+        ),
+        "nan": (solver.particles.elastic_strain, np.nan, "speed is not finite"),
     }[stopping]
     values = array.numpy()
     values[17] = value
@@ -110,10 +114,10 @@ def test_what_soil_cannot_do_stops_the_solver(stopping):
 )
 def test_strains_that_soil_cannot_have(volume, shear, courant, words):
     scene = cut(courant=courant)
-    guard = Guard(scene, Solver(scene).time_step)
+    limits = PhysicalLimits(scene, Solver(scene).time_step)
     ln_j, strain = np.full(5, -0.01), np.zeros((5, 6))
     ln_j[3], strain[3, 4] = volume, shear
-    found = guard.too_strained(ln_j, strain)
+    found = limits.too_strained(ln_j, strain)
     if words is None:
         assert found is None
     else:
@@ -171,10 +175,10 @@ def test_every_call_begins_anew(scene, effects):
     assert same(list(solver.frames()), first)
     some = [frame for frame, _ in zip(solver.frames(), range(2), strict=False)]
     assert same(some, first[:2])
-    solver._v.fill_(np.nan)
+    solver.particles.velocity.fill_(np.nan)
     frames = solver.frames()
     next(frames)
-    solver._v.fill_(np.nan)
+    solver.particles.velocity.fill_(np.nan)
     with pytest.raises(SolverStopped):
         next(frames)
     assert same(list(solver.frames()), first)

@@ -43,7 +43,7 @@ def updated(effects: Effects, material: Material, pressure, ratio, a=None, g=1.0
         g: fluidity before, or the excess of cooperative flow [1/s].
     """
     start_warp()
-    law, Soil = constitutive(real, effects), soil_struct(real, effects.fluidity)
+    law, Soil = constitutive(real, effects), soil_struct(real)
     vec6, mat33, update, with_g = law.vec6, law.mat33, law.update, effects.fluidity
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -68,7 +68,7 @@ def updated(effects: Effects, material: Material, pressure, ratio, a=None, g=1.0
     e = wp.array(strain, dtype=vec6, device="cpu")
     j = wp.array(-pressure / material.bulk_modulus, dtype=real, device="cpu")
     fluid = wp.array(np.full(len(pressure), g), dtype=real, device="cpu")
-    soil = soil_parameters(real, material, 1.0, effects.fluidity)
+    soil = soil_parameters(real, material, 1.0)
     motion = mat33(*(np.zeros(9) if a is None else np.ravel(a)))
     wp.launch(step, len(pressure), [e, j, fluid, motion, DT, soil], device="cpu")
     found, p = e.numpy().astype(float), -material.bulk_modulus * j.numpy().astype(float)
@@ -102,11 +102,11 @@ def no_pressure(law: str) -> tuple[float, str]:
     scene = block(duration=0.05, frame_rate=20.0, material=material)
     solver = Solver(scene, effects)
     turning = np.cross([3.0, -2.0, 5.0], scene.initial_positions() - 0.15)
-    solver._v.assign(turning + 0.2 * np.random.default_rng(0).normal(size=turning.shape))
-    start = solver._v.numpy().astype(float)
+    solver.particles.velocity.assign(turning + 0.2 * np.random.default_rng(0).normal(size=turning.shape))
+    start = solver.particles.velocity.numpy().astype(float)
     for _ in solver.frames():
         pass
-    lost = np.linalg.norm(np.sum(solver._v.numpy() - start, axis=0)) / np.abs(start).sum()
+    lost = np.linalg.norm(np.sum(solver.particles.velocity.numpy() - start, axis=0)) / np.abs(start).sum()
     return max(
         worst, float(lost) / 1e-4
     ), f"shear stress {worst:.3g} of its bound; momentum lost {lost:.2g} (1e-4)"

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
 from mpm_warp.batch import all_together
-from mpm_warp.launch import Work
+from mpm_warp.launch import Job
 from sgns.clock import elapsed
 from sgns.config import UserError, flattened
 from sgns.data.files import file_lock, remove_abandoned
@@ -322,7 +322,7 @@ def _make(
     seed: int,
     device: str,
     precision: str,
-) -> Generator[tuple[str, str] | Work, None, None]:
+) -> Generator[tuple[str, str] | Job, None, None]:
     """Make one run unless another process does, passing on the work for the device; gives made, elsewhere or failed,
     and what went wrong in words."""
 
@@ -344,7 +344,7 @@ def _make(
                 outcome = "elsewhere", ""
             else:
                 for stage in scene_stages(scene, output, progress=count_frame, **settings):
-                    if isinstance(stage, Work):
+                    if isinstance(stage, Job):
                         yield stage
     except (UserError, SceneError, SolverStopped) as error:
         outcome = "failed", str(error)

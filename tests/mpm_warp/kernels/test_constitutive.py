@@ -21,7 +21,7 @@ class Point:
     """Runs the Warp functions on many single points."""
 
     def __init__(self, real=wp.float64, effects=ALL, material=SAND):
-        law, Soil = constitutive(real, effects), soil_struct(real, effects.fluidity)
+        law, Soil = constitutive(real, effects), soil_struct(real)
         vec6, mat33 = law.vec6, law.mat33
         update, trial, volume = law.update, law.strain_trial, law.volume_step
 
@@ -47,7 +47,7 @@ class Point:
             j[p] = volume(a[p])
 
         self._steps, self._trials, self.types = steps, trials, (vec6, real, mat33)
-        self.soil = soil_parameters(real, material, 1.0, effects.fluidity)
+        self.soil = soil_parameters(real, material, 1.0)
 
     def _arrays(self, strain, ln_j, a):
         six = np.array([[s[i, k] for i, k in PAIRS] for s in strain])

@@ -24,7 +24,7 @@ class Laws:
     """Runs the Warp functions of fluidity.py on arrays of mu_trial, p and g (or the excess)."""
 
     def __init__(self, real=wp.float64):
-        law, Soil = fluidity(real, DYNAMIC), soil_struct(real, True)
+        law, Soil = fluidity(real), soil_struct(real)
         coefficients, local, step = law.coefficients, law.local_fluidity, law.fluidity_step
         excess_law = law.friction_with_excess
         vec2 = wp.types.vector(2, real)
@@ -52,7 +52,7 @@ class Laws:
         real = self._real
         dynamic, steady = (wp.zeros(mu.size, dtype=self._vec2, device="cpu") for _ in range(2))
         inputs = [wp.array(v.ravel(), dtype=real, device="cpu") for v in (mu, p, g)]
-        soil = soil_parameters(real, material, 1.0, True)
+        soil = soil_parameters(real, material, 1.0)
         wp.launch(self._run, mu.size, [*inputs, dt, soil, dynamic, steady], device="cpu")
         return dynamic.numpy().astype(float), steady.numpy().astype(float)
 
@@ -82,7 +82,7 @@ def shear(material, rate, pressure, time, dt, g=0.0, real=wp.float64):
     a = np.zeros((3, 3))
     a[0, 2] = rate * dt
     found = wp.zeros((round(time / dt), 2), dtype=real, device="cpu")
-    soil = soil_parameters(real, material, 1.0, True)
+    soil = soil_parameters(real, material, 1.0)
     inputs = [wp.types.matrix((3, 3), real)(a), -pressure / material.bulk_modulus, g, dt, soil, found]
     wp.launch(shear_kernel(real), 1, inputs, device="cpu")
     strain, g = found.numpy().T
@@ -91,7 +91,7 @@ def shear(material, rate, pressure, time, dt, g=0.0, real=wp.float64):
 
 @cache
 def shear_kernel(real):
-    law, Soil = constitutive(real, DYNAMIC), soil_struct(real, True)
+    law, Soil = constitutive(real, DYNAMIC), soil_struct(real)
     vec6, mat33, update = law.vec6, law.mat33, law.update
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -272,7 +272,7 @@ def test_friction_with_excess_solves_its_equation(material):
 def test_without_excess_it_is_the_local_return(material):
     """friction_with_excess(q = 0) and the return of the local law are the same formula."""
     real = wp.float64
-    law, Soil = constitutive(real, Effects()), soil_struct(real, False)
+    law, Soil = constitutive(real, Effects()), soil_struct(real)
     yield_stress = law.yield_stress
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -282,7 +282,7 @@ def test_without_excess_it_is_the_local_return(material):
 
     mu = np.linspace(0.5, 3.0, 60)
     found = wp.array(mu, dtype=real, device="cpu")
-    wp.launch(run, 60, [found, 1000.0, 1e-4, soil_parameters(real, material, 1.0, False)], device="cpu")
+    wp.launch(run, 60, [found, 1000.0, 1e-4, soil_parameters(real, material, 1.0)], device="cpu")
     _, steady = Laws()(material, mu, 1000.0, 0.0, 1e-4)
     np.testing.assert_allclose(steady[:, 0], found.numpy(), rtol=1e-12)
 
@@ -296,7 +296,7 @@ def test_soil_at_rest_is_not_seeded():
 
 def test_soil_that_comes_together_flows_as_it_did_apart():
     real = wp.float64
-    law, Soil = constitutive(real, DYNAMIC), soil_struct(real, True)
+    law, Soil = constitutive(real, DYNAMIC), soil_struct(real)
     vec6, mat33, update = law.vec6, law.mat33, law.update
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -308,7 +308,7 @@ def test_soil_that_comes_together_flows_as_it_did_apart():
     a = np.zeros((3, 3))
     a[0, 2] = 1e-4 * 5.0
     found = wp.zeros(8, dtype=real, device="cpu")
-    wp.launch(run, 1, [mat33(a), soil_parameters(real, SAND, 1.0, True), found], device="cpu")
+    wp.launch(run, 1, [mat33(a), soil_parameters(real, SAND, 1.0), found], device="cpu")
     assert not found.numpy()[:6].any()
     assert found.numpy()[7] * SAND.static_friction == pytest.approx(5.0)
 

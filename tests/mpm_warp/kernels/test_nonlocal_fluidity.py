@@ -9,8 +9,8 @@ import warp as wp
 from scipy.optimize import brentq
 
 from mpm_warp import Bed, Effects, Material, Scene, Solver
-from mpm_warp.kernels.ghost_nodes import Images
-from mpm_warp.kernels.nonlocal_fluidity import NonlocalFluidity, wall_sink
+from mpm_warp.kernels.ghost_nodes import GhostNodes
+from mpm_warp.kernels.nonlocal_fluidity import nonlocal_launches, wall_sink
 
 STEADY = Effects(nonlocality=True)
 DYNAMIC = Effects(fluidity=True, nonlocality=True)
@@ -28,19 +28,20 @@ class Column:
         )
         grid = solver._grid
         floor = wall_sink((grid.nx, grid.ny, grid.nz), (-1, -1, grid.low[2]), (2**30,) * 3)
-        self.term = NonlocalFluidity(
+        self.field = solver._cooperative_field
+        self.launches = nonlocal_launches(
             solver._real,
             effects,
-            solver.device,
             floor * (material.fluidity_at_walls == "zero"),
-            [solver._home, solver._e, solver._ln_j],
+            solver.particles,
             grid,
             solver._soil,
-            Images(solver._real, solver.device, grid, {}, mirrored=False),
+            self.field,
             solver._cooperation,
+            GhostNodes(solver._real, solver.device, grid, {}, mirrored=False),
         )
-        wp.copy(solver._home, solver._x)  # as a remap does
-        self.height = solver._x.numpy()[:, 2] + height  # of the particles [m]
+        wp.copy(solver.particles.home, solver.particles.position)  # as a remap does
+        self.height = solver.particles.position.numpy()[:, 2] + height  # of the particles [m]
         self.bottom = grid.low[2]
         self.nodal_height = spacing * (np.arange(grid.nz) - self.bottom)
         self.shape = (grid.nx, grid.ny, grid.nz)
@@ -50,18 +51,18 @@ class Column:
         solver, material, n = self.solver, self.solver.scene.material, self.solver.particle_count
         e = np.zeros((n, 6))
         e[:, 4] = np.broadcast_to(mu, n) * pressure / (2.0 * material.shear_modulus)
-        solver._e.assign(e)
-        solver._ln_j.assign(np.full(n, -pressure / material.bulk_modulus))
+        solver.particles.elastic_strain.assign(e)
+        solver.particles.log_volume.assign(np.full(n, -pressure / material.bulk_modulus))
 
     def solve(self, times):
         for _ in range(times):
-            for launch in self.term.launches:
+            for launch in self.launches:
                 launch.launch()
 
     def nodes(self, name):
         """filled, source, slowing or g in the middle of the column, from the floor to the surface."""
         at = ("filled", "source", "slowing", "g").index(name)
-        field = self.term.field.numpy()[:-1, at].reshape(self.shape)
+        field = self.field.numpy()[:-1, at].reshape(self.shape)
         inside = (self.nodal_height > -1e-9) & (self.nodal_height < self.height.max() + 1e-9)
         return field[self.shape[0] // 2, self.shape[1] // 2][inside]
 
@@ -72,16 +73,20 @@ class Column:
 
     def move(self):
         """The particles' part of the step with the velocities that are on the grid."""
-        for launch in self.solver._step[-2:]:
+        for launch in self.solver._steps.step[-2:]:
             launch.launch()
 
     @property
     def mu(self):
         strain = np.sqrt(2.0) * np.linalg.norm(
-            self.solver._e.numpy() * [1, 1, 1, 2**0.5, 2**0.5, 2**0.5], axis=1
+            self.solver.particles.elastic_strain.numpy() * [1, 1, 1, 2**0.5, 2**0.5, 2**0.5], axis=1
         )
         material = self.solver.scene.material
-        return material.shear_modulus * strain / (-material.bulk_modulus * self.solver._ln_j.numpy())
+        return (
+            material.shear_modulus
+            * strain
+            / (-material.bulk_modulus * self.solver.particles.log_volume.numpy())
+        )
 
 
 def soil(xi, mu=0.8, **kw):
@@ -114,12 +119,12 @@ def test_nodes_that_hardly_hold_soil_do_no_harm(effects):
     def answer(beyond):
         column = Column(effects, soil(0.04), real="float32", height=0.05)
         solver = column.solver
-        solver._home.assign(solver._x.numpy() + beyond * solver.scene.bed.spacing)
+        solver.particles.home.assign(solver.particles.position.numpy() + beyond * solver.scene.bed.spacing)
         column.impose(0.8)
         if effects.fluidity:
-            solver._soil.g.assign(10.0 * column.height)
+            solver.particles.fluidity.assign(10.0 * column.height)
         column.solve(30 if effects is STEADY else 3)
-        assert np.isfinite(column.term.field.numpy()).all()
+        assert np.isfinite(column.field.numpy()).all()
         return column.nodes("g")
 
     middle = answer(0.0)
@@ -156,7 +161,7 @@ def test_laplacian_is_of_second_order():
         column = Column(DYNAMIC, material, spacing=spacing)
         k = math.pi / 0.2
         column.impose(0.5)
-        column.solver._soil.g.assign(1.0 + np.cos(k * column.height))
+        column.solver.particles.fluidity.assign(1.0 + np.cos(k * column.height))
         column.solve(1)
         cooperative = material.nonlocal_amplitude * material.grain_diameter
         kappa = (cooperative * k) ** 2 * column.solver.time_step / material.fluidity_time
@@ -181,9 +186,9 @@ def test_constants_stay_constant(effects, bed):
     column = Column(effects, Material(grain_diameter=0.005, fluidity_at_walls="free"), **bed)
     column.impose(0.8)
     if effects.fluidity:
-        column.solver._soil.g.fill_(3.0)
+        column.solver.particles.fluidity.fill_(3.0)
     column.solve(3)
-    field = column.term.field.numpy()
+    field = column.field.numpy()
     soil_nodes = field[:, 0] > 0.0
     assert np.ptp(field[soil_nodes, 0]) > 0.5  # nodes at the surface are partly filled
     expected = 3.0 if effects.fluidity else column.nodes("source")[5]
@@ -206,7 +211,7 @@ def lost_share(column):
 def test_particles_of_a_cell_keep_together():
     """Rows that differ by turns, which the grid cannot see: the difference fades, a smooth profile does not."""
     column = Column(DYNAMIC, Material(grain_diameter=0.01, nonlocal_amplitude=0.5, fluidity_at_walls="free"))
-    g, k = column.solver._soil.g, math.pi / 0.2
+    g, k = column.solver.particles.fluidity, math.pi / 0.2
     rows = np.round(column.height / 0.01 - 0.5).astype(int)
     material, dt = column.solver.scene.material, column.solver.time_step
     turns, smooth = [], []
@@ -233,9 +238,9 @@ def test_fluidity_is_kept_by_the_step():
         arrangement="jittered",
     )
     column.impose(0.5)
-    column.solver._soil.g.assign(np.exp(-(((column.height - 0.05) / 0.03) ** 2)))
+    column.solver.particles.fluidity.assign(np.exp(-(((column.height - 0.05) / 0.03) ** 2)))
     column.solve(1)
-    filled, source, _, g = column.term.field.numpy().T
+    filled, source, _, g = column.field.numpy().T
     assert np.abs(g - source).max() > 0.02
     # What the Jacobi sweeps leave undone is not conserved: a per cent of the change.
     assert abs(np.sum(filled * (g - source))) < 0.01 * np.sum(filled * np.abs(g - source))
@@ -260,7 +265,7 @@ def rate(material, mu=0.8):
 def growth(material, start, mode, mu=0.8, steps=20):
     """Growth rate of the part of g along `mode` over some steps of the particles' own g [1/s]."""
     column = Column(DYNAMIC, material)
-    g = column.solver._soil.g
+    g = column.solver.particles.fluidity
     g.assign(0.01 * start(column.height))
     size = []
     for _ in range(steps + 1):
@@ -293,7 +298,7 @@ def sheared(effects, material, profile, speed=1.0, total=0.03, spacing=0.01):
     """
     column = Column(effects, material, spacing=spacing, wide=2)
     solver = column.solver
-    x = solver._x.numpy().copy()
+    x = solver.particles.position.numpy().copy()
     fine = np.linspace(-0.05, 0.3, 3501)
     slope = speed * profile(fine)
     integral = np.concatenate([[0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * np.diff(fine))])
@@ -304,7 +309,7 @@ def sheared(effects, material, profile, speed=1.0, total=0.03, spacing=0.01):
     for _ in range(round(total / speed / solver.time_step)):
         column.solve(1)
         column.move()
-        solver._x.assign(x)
+        solver.particles.position.assign(x)
     middle = np.abs(column.height - 0.1) < 0.09
     return column.height[middle], column.mu[middle]
 
@@ -374,14 +379,14 @@ def test_fluidity_never_falls_below_zero(effects):
     flowing = rng.random(column.solver.particle_count) < 0.1
     column.impose(np.where(flowing, 0.95, 0.3))
     if effects.fluidity:
-        column.solver._soil.g.assign(np.where(flowing, 100.0, 0.0))
+        column.solver.particles.fluidity.assign(np.where(flowing, 100.0, 0.0))
     for _ in range(5):
         column.solve(1)
-        _, source, _, g = column.term.field.numpy().T
+        _, source, _, g = column.field.numpy().T
         assert 0.0 <= g.min() <= g.max() <= source.max() * (1 + 1e-12)
         column.move()
     if effects.fluidity:
-        assert column.solver._soil.g.numpy().min() >= 0.0
+        assert column.solver.particles.fluidity.numpy().min() >= 0.0
 
 
 @pytest.mark.parametrize("effects", [STEADY, DYNAMIC])
@@ -393,8 +398,8 @@ def test_limits_are_finite(effects, change, mu):
         column.impose(mu, pressure)
         column.solve(2)
         column.move()
-        assert np.isfinite(column.term.field.numpy()).all()
-        assert np.isfinite(column.solver._e.numpy()).all()
+        assert np.isfinite(column.field.numpy()).all()
+        assert np.isfinite(column.solver.particles.elastic_strain.numpy()).all()
 
 
 def test_precisions_agree():
@@ -411,9 +416,9 @@ def test_separated_soil_has_no_part_in_it():
     column = Column(STEADY, soil(0.04))
     column.impose(0.8)
     apart = column.height > 0.1
-    ln_j = column.solver._ln_j.numpy().copy()
+    ln_j = column.solver.particles.log_volume.numpy().copy()
     ln_j[apart] = 0.01
-    column.solver._ln_j.assign(ln_j)
+    column.solver.particles.log_volume.assign(ln_j)
     column.solve(1)
     filled = column.nodes("filled")
     assert filled[5] > 0.9
