@@ -1,11 +1,12 @@
-"""The explicit material point method, frame by frame."""
+"""The explicit material point method, frame by frame; one scene or many at once."""
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice, repeat
 from typing import Any
 
 import numpy as np
@@ -120,8 +121,8 @@ class Solver:
                 yield stage
 
     def stages(self) -> Generator[Frame | Job, None, None]:
-        """As `frames`, with all work that the device has to do before the solver can go on: the caller has it done,
-        that of other scenes with it (batch.py)."""
+        """As `frames`, with the jobs that the device has to do before the solver can go on: the caller has them run, with
+        those of other scenes (`run_concurrently`)."""
         if self._beginnings:
             self._make_ready()
         self._beginnings += 1
@@ -160,11 +161,6 @@ class Solver:
 
     def _make_ready(self) -> None:
         """Arrays as they are before the first frame, or at the state to start from."""
-        self._allocate()
-        if self._start is not None:
-            self._memory.load(self._start)
-
-    def _allocate(self) -> None:
         scene, effects, real, device = self.scene, self.effects, self._real, self.device
         vec4 = wp.types.vector(4, real)
 
@@ -206,11 +202,13 @@ class Solver:
         self._substep, self._fault = zeros(int, 1), zeros(int, 4)
         periodic = (axis for axis, kind in enumerate(scene.bed.walls.conditions) if kind == "periodic")
         self._turns = {axis: zeros(int, n) for axis in periodic}
-        self._body = None
+        self._body: RigidBody | None = None
         if scene.body is not None:
             self._body = RigidBody(scene, effects, real, device, self.substeps_per_frame, self.time_step, n)
-        self._remap, self._steps = self._programs(n, node_count, layers)
+        self._remap, self._steps = self._programs(layers)
         self._memory = Memory(self._lasting())
+        if self._start is not None:
+            self._memory.load(self._start)
 
     def _lasting(self) -> dict[str, wp.array]:
         """What a frame leaves to the next one; the grid is filled anew at every remap."""
@@ -222,94 +220,52 @@ class Solver:
             arrays["cooperative_fluidity"] = self._cooperative_field
         return arrays | (self._body.lasting() if self._body is not None else {})
 
-    def _programs(self, n: int, node_count: int, layers: dict[int, np.ndarray]) -> tuple[Program, Program]:
+    def _programs(self, layers: dict[int, np.ndarray]) -> tuple[Program, Program]:
         """A remap, and the steps from there to the next one."""
-        real, scene, device, body = self._real, self.scene, self.device, self._body
-        particles, grid = self.particles, self._grid
+        real, scene, device, body, particles = self._real, self.scene, self.device, self._body, self.particles
+        momentum, velocity, before, impulse = self._momentum, self._velocity, self._before, self._impulse
         kernels = transfer(real, self.effects, body.law if body else None, atomic=device.is_cuda)
-        node_kernels = grid_step(real, scene.bed.walls.conditions)
-        ghost_nodes = GhostNodes(real, device, grid, layers, mirrored=self._half is not None)
+        node_kernels, wrap = grid_step(real, scene.bed.walls.conditions), ghost_kernels(real).wrap
+        ghost_nodes = GhostNodes(real, device, self._grid, layers, mirrored=self._half is not None)
         body_data = body.data if body else body_struct(real, ContactLaw())()
 
-        def launch(kernel: SceneKernel, count: int, *arguments: Any) -> Launch:
-            return Launch(kernel, count, arguments, device)
+        def over_particles(kernel: SceneKernel, *arguments: Any) -> Launch:
+            return Launch(kernel, self.computed_count, [particles, self._grid, *arguments], device)
 
-        wrap = ghost_kernels(real).wrap
+        def over_nodes(kernel: SceneKernel, *arguments: Any) -> Launch:
+            return Launch(kernel, len(self._inverse_mass), [self._grid, *arguments], device)
+
         remap = [
-            *(launch(wrap, n, particles.position, t, a, scene.bed.size[a]) for a, t in self._turns.items()),
-            launch(
-                kernels.to_grid,
-                n,
-                particles,
-                grid,
-                self._momentum,
-                self._top_speed,
-                self._substep,
-                self._fault,
-            ),
+            Launch(wrap, len(turns), [particles.position, turns, axis, scene.bed.size[axis]], device)
+            for axis, turns in self._turns.items()
         ]
+        remap.append(over_particles(kernels.to_grid, momentum, self._top_speed, self._substep, self._fault))
         begin = [
-            *ghost_nodes.fold(self._momentum),
-            launch(
-                node_kernels.begin,
-                node_count,
-                grid,
-                self._momentum,
-                self._velocity,
-                self._before,
-                self._inverse_mass,
-                self._impulse,
-            ),
-            *ghost_nodes.unfold(self._before),
+            *ghost_nodes.fold(momentum),
+            over_nodes(node_kernels.begin, momentum, velocity, before, self._inverse_mass, impulse),
+            *ghost_nodes.unfold(before),
         ]
         step = [
-            launch(kernels.scatter, n, particles, grid, body_data, self._impulse, self._substep),
+            over_particles(kernels.scatter, body_data, impulse, self._substep),
             *(body.launches if body else ()),
-            *ghost_nodes.fold(self._impulse),
-            launch(
-                node_kernels.step,
-                node_count,
-                grid,
-                self._velocity,
-                self._inverse_mass,
-                self._impulse,
-                self._substep,
-            ),
+            *ghost_nodes.fold(impulse),
+            over_nodes(node_kernels.step, velocity, self._inverse_mass, impulse, self._substep),
             *(self._nonlocal_launches(layers) if self.effects.nonlocality else ()),
-            *ghost_nodes.unfold(self._velocity),
-            launch(
-                kernels.gather,
-                n,
-                particles,
-                grid,
-                self._velocity,
-                self._cooperation,
-                self._substep,
-                self._fault,
-            ),
-            launch(kernels.material, n, particles, grid, self._soil),
+            *ghost_nodes.unfold(velocity),
+            over_particles(kernels.gather, velocity, self._cooperation, self._substep, self._fault),
+            over_particles(kernels.material, self._soil),
         ]
-        end = [launch(kernels.from_grid, n, particles, grid, self._before, self._keep)]
-        return Program(remap), Program(begin, step, end)
+        return Program(remap), Program(begin, step, [over_particles(kernels.from_grid, before, self._keep)])
 
     def _nonlocal_launches(self, layers: dict[int, np.ndarray]) -> list[Launch]:
-        grid = self._grid
+        grid, field, cooperation = self._grid, self._cooperative_field, self._cooperation
         sink = np.zeros(len(self._inverse_mass))
         if self.scene.material.fluidity_at_walls == "zero":
             sink = wall_sink((grid.nx, grid.ny, grid.nz), grid.low, grid.high)
         ghost_nodes = GhostNodes(self._real, self.device, grid, layers, mirrored=False)
-        launches = nonlocal_launches(
-            self._real,
-            self.effects,
-            sink,
-            self.particles,
-            grid,
-            self._soil,
-            self._cooperative_field,
-            self._cooperation,
-            ghost_nodes,
-        )
-        return [*launches, *ghost_nodes.unfold(self._cooperation)]
+        given = (self.particles, grid, self._soil, field, cooperation, ghost_nodes)
+        launches = nonlocal_launches(self._real, self.effects, sink, *given)
+        return [*launches, *ghost_nodes.unfold(cooperation)]
 
     # --- stepping -----------------------------------------------------------------------------------------
 
@@ -381,6 +337,83 @@ class Solver:
             force=impulse[0],
             torque=impulse[1],
         )
+
+
+# --- Many scenes at once ------------------------------------------------------------------------------------
+
+
+def frames_together(
+    scenes: Iterable[Scene],
+    effects: Effects | Iterable[Effects] | None = None,
+    device: str = "cpu",
+    precision: str = "float32",
+    at_once: int = 32,
+) -> Iterator[tuple[int, Frame | SceneError | SolverStopped]]:
+    """Computes scenes side by side, each as a `Solver` of its own would.
+
+        for number, frame in frames_together(scenes, device="cuda"):
+            if not isinstance(frame, Frame):
+                print(f"scene {number} ended: {frame}")
+
+    It pays on a GPU, which a scene of some ten thousand particles does not fill. Scenes may differ in anything; none
+    depends on which others are computed with it. Those of the same effects, walls, contact and precision
+    share every launch.
+
+    Args:
+        scenes: what to compute.
+        effects: which physics, for all of them or one for each.
+        device: `cpu` or `cuda`, `cuda:0`, ...
+        precision: `float32` or `float64`.
+        at_once: scenes that are under way at the same time; the next begins when one ends.
+
+    Yields:
+        The number of a scene and its next frame. Frames of one scene come in order, those of different scenes mixed.
+        In place of a frame that cannot be computed the error comes, as that scene's last; the others go on.
+    """
+
+    def frames(scene: Scene, effects: Effects | None) -> Iterator[Frame | SceneError | SolverStopped | Job]:
+        try:
+            yield from Solver(scene, effects, device, precision).stages()
+        except (SceneError, SolverStopped) as error:
+            yield error
+
+    each = repeat(effects) if effects is None or isinstance(effects, Effects) else effects
+    return run_concurrently(map(frames, scenes, each), at_once, device)
+
+
+def run_concurrently(
+    tasks: Iterable[Generator[Any, None, None]], at_once: int, device: str
+) -> Iterator[tuple[int, Any]]:
+    """Advances `at_once` generators side by side, the next one as soon as one has ended.
+
+    Args:
+        tasks: what to advance; each is taken when its turn comes.
+        at_once: how many are under way.
+        device: where they compute.
+
+    Yields:
+        A task's number and what it yielded, unless that was a job. Jobs are run when all tasks have asked for one.
+    """
+    executor = Executor(find_device(device))
+    waiting = enumerate(tasks)
+    running = list(islice(waiting, at_once))
+    try:
+        while running:
+            jobs: list[Job] = []
+            while len(jobs) < len(running):
+                place = len(jobs)
+                number, task = running[place]
+                item = next(task, None)
+                if isinstance(item, Job):
+                    jobs.append(item)
+                elif item is not None:
+                    yield number, item
+                else:
+                    running[place : place + 1] = islice(waiting, 1)
+            executor.run(jobs)
+    finally:
+        for _, task in running:
+            task.close()
 
 
 def _with_arrays(struct: Any, device: wp.Device, **given: int | np.ndarray) -> Any:

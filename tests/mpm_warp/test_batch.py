@@ -24,8 +24,8 @@ from mpm_warp import (
     frames_together,
 )
 from mpm_warp import launch as work_module
-from mpm_warp.batch import all_together
 from mpm_warp.launch import BatchedLaunch, Job, Launch, Program
+from mpm_warp.solver import run_concurrently
 from sgns_testing.scenes import UNDAMPED, block, cut
 
 needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
@@ -193,7 +193,7 @@ def test_tasks_go_side_by_side_and_the_next_begins_when_one_ends():
         log.append(f"{name} ends")
 
     given = list(
-        all_together((task(name, turns) for name, turns in [("a", 2), ("b", 1), ("c", 2)]), 2, "cpu")
+        run_concurrently((task(name, turns) for name, turns in [("a", 2), ("b", 1), ("c", 2)]), 2, "cpu")
     )
     assert given == [(0, ("a", 0)), (1, ("b", 0)), (0, ("a", 1)), (2, ("c", 0)), (2, ("c", 1))]
     assert log == ["a begins", "b begins", "b ends", "c begins", "a ends", "c ends"]
@@ -214,13 +214,13 @@ def test_when_one_breaks_the_others_are_closed():
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        list(all_together([waits("a"), breaks(), waits("b")], 3, "cpu"))
+        list(run_concurrently([waits("a"), breaks(), waits("b")], 3, "cpu"))
     assert sorted(closed) == ["a", "b"]
 
 
 def test_unknown_device():
     with pytest.raises(SceneError, match="device is 'tpu'; allowed here: cpu"):
-        list(all_together([], 2, "tpu"))
+        list(run_concurrently([], 2, "tpu"))
 
 
 @needs_cuda

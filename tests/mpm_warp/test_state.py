@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mpm_warp import Bed, Effects, Incline, Material, SceneError, Solver, SolverStopped, State, Walls, Wheel
-from mpm_warp.batch import all_together
 from mpm_warp.limits import PhysicalLimits
+from mpm_warp.solver import run_concurrently
 from sgns_testing.scenes import UNDAMPED, block, cut
 
 
@@ -195,7 +195,7 @@ def test_every_call_begins_at_the_state_that_was_given():
     state.arrays["position"] += 1.0  # no longer the solver's business
     assert same(list(later.frames()), whole[3:])
     assert same(list(later.frames()), whole[3:])
-    stages = [stage for _, stage in all_together([later.stages()], 1, "cpu")]
+    stages = [stage for _, stage in run_concurrently([later.stages()], 1, "cpu")]
     assert same(stages, whole[3:])
 
 
@@ -208,7 +208,7 @@ def test_an_earlier_call_ends_where_a_later_one_begins():
         next(earlier)
     assert same([first, *later], list(Solver(cut(duration=0.05)).frames()))
     with pytest.raises(SceneError, match="make a Solver for each"):
-        list(all_together([solver.stages(), solver.stages()], 2, "cpu"))
+        list(run_concurrently([solver.stages(), solver.stages()], 2, "cpu"))
 
 
 def test_what_was_given_stays_as_it_was():

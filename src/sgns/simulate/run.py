@@ -13,8 +13,8 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from mpm_warp import Effects, Scene, Solver, SolverStopped, State
-from mpm_warp.batch import all_together
 from mpm_warp.launch import Job
+from mpm_warp.solver import run_concurrently
 from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.data.run import Run, read_state
@@ -175,7 +175,9 @@ class Timing:
 
 def simulate_scene(scene: Scene, output: Path, **settings: Any) -> Timing:
     """Compute a scene and write its run file; arguments as in `scene_stages`."""
-    ((_, timing),) = all_together([scene_stages(scene, output, **settings)], 1, settings.get("device", "cpu"))
+    ((_, timing),) = run_concurrently(
+        [scene_stages(scene, output, **settings)], 1, settings.get("device", "cpu")
+    )
     return timing
 
 

@@ -20,8 +20,8 @@ import numpy as np
 from tqdm import tqdm
 
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
-from mpm_warp.batch import all_together
 from mpm_warp.launch import Job
+from mpm_warp.solver import run_concurrently
 from sgns.clock import elapsed
 from sgns.config import UserError, flattened
 from sgns.data.files import file_lock, remove_abandoned
@@ -306,7 +306,7 @@ def _make_share(
     `_make` says of each."""
     tasks = (_make(*job, seed, device, precision) for _, *job in jobs)
     outcomes = {}
-    for number, outcome in all_together(tasks, batch, device):
+    for number, outcome in run_concurrently(tasks, batch, device):
         name, index, *_ = jobs[number]
         outcomes[name] = outcome
         _ended[index] = True
