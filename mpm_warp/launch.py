@@ -1,4 +1,4 @@
-"""Warp: its start, kernels for one scene or many, and the work that scenes ask of the device."""
+"""Warp: its start, kernels for one scene or many, and the jobs that scenes ask of the device."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def load_kernel(kernel: wp.Kernel, device: wp.Device) -> None:
     """
     module = kernel.module
     block_dim = 1 if device.is_cpu else module.options["block_dim"]
-    folder = Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim)
+    folder = Path(str(wp.config.kernel_cache_dir)) / module.get_module_identifier(block_dim)
     there = os.path.lexists(folder)
     try:
         with silent_stderr() if there else nullcontext():  # the line that follows says it, or it is repaired
@@ -236,21 +236,16 @@ class BatchedLaunch:
     def __init__(self, launches: Sequence[Launch], steps: wp.array) -> None:
         self._launches = launches  # they hold the arrays that the table points to
         kernel, device, rows = launches[0].kernel, launches[0].device, []
-        row = kernel.row
         for launch in launches:
-            rows.append(row())
-            for name, value in zip(row.vars, launch.arguments, strict=True):
+            rows.append(kernel.row())
+            for name, value in zip(kernel.row.vars, launch.arguments, strict=True):
                 setattr(rows[-1], name, value)
         counts = [launch.count for launch in launches]
-        table = wp.array(rows, dtype=row, device=device), wp.array(counts, dtype=int, device=device)
+        inputs: list[Any] = [wp.array(rows, dtype=kernel.row, device=device)]
+        inputs += [wp.array(counts, dtype=int, device=device), steps, 0]
         load_kernel(kernel.together, device)
-        self._recorded = wp.launch(
-            kernel.together,
-            (len(launches), max(counts)),
-            [*table, steps, 0],
-            device=device,
-            record_cmd=True,
-        )
+        size = len(launches), max(counts)
+        self._recorded = wp.launch(kernel.together, size, inputs, device=device, record_cmd=True)
 
     def launch(self, step: int = 0) -> None:
         """Run it for the scenes that have more than `step` steps to do."""
@@ -277,12 +272,13 @@ class Program:
 
 @dataclass
 class Job:
-    """A program and the number of its steps; with none of them its kernels are loaded and nothing runs."""
+    """What a scene asks of the device: a program and the number of its steps. With none of them its kernels are loaded
+    and nothing runs."""
 
     program: Program
     steps: int
     shared_by: int = 1
-    """How many scenes had work done at the same time; known afterwards."""
+    """How many scenes had a job at the same time; known afterwards."""
 
 
 def captures(device: wp.Device) -> bool:
@@ -340,11 +336,7 @@ class _Batch:
 
 
 class Executor:
-    """Has a device do what scenes ask for.
-
-    Args:
-        device: on which their arrays lie.
-    """
+    """Runs jobs on the device on which their arrays lie."""
 
     def __init__(self, device: wp.Device) -> None:
         self._device = device

@@ -28,21 +28,13 @@ if TYPE_CHECKING:
 def stable_step(mass: float, contacts: float, stiffness: float, damping: float) -> float:
     """Longest substep [s] in which a free body on springs is stable, with a margin of two.
 
-    On N springs k with dampers c at rest in the soil, a step dt changes the body's velocity by the share
-    q = N (k dt^2 + c dt) / M of what it would take to stop it; symplectic Euler with a lagged damper is stable
-    for q below 2. The step returned has q = 1.
-
-    Args:
-        mass: M of the body [kg].
-        contacts: N, the most particles that can touch it at once.
-        stiffness: k [N/m].
-        damping: c [N s/m].
+    A body of mass M [kg] touches at most N particles, each on a spring k [N/m] with a damper c [N s/m]. A step dt
+    changes its velocity by the share q = N (k dt^2 + c dt) / M of what it would take to stop it; symplectic Euler with
+    a lagged damper is stable for q below 2. The step returned has q = 1.
     """
     a, b = contacts * stiffness / mass, contacts * damping / mass
     return 2.0 / (b + math.sqrt(b * b + 4.0 * a))
 
-
-# --- The scene's body on the device: its shape, its motion through a frame, and what the soil gave it ---
 
 LONGEST_WAY = 0.5
 """Of any point of a body in one substep [grid spacings]."""
@@ -153,6 +145,12 @@ class RigidBody:
             pose[2] = self._axle.numpy()[0]
         return pose
 
+    def impulse(self) -> np.ndarray:
+        """By the soil on the body since the frame began [N s], and its moment [N m s], shape (2, 3); a moment that is
+        not added up is 0."""
+        impulse = self.data.impulse.numpy().astype(float)
+        return np.pad(impulse, ((0, 2 - len(impulse)), (0, 0)))
+
     def lasting(self) -> dict[str, wp.array]:
         """What a frame leaves to the next one, by name."""
         arrays = {"contact_stretch": self.data.stick}
@@ -160,25 +158,21 @@ class RigidBody:
             arrays["axle"] = self._axle
         return arrays
 
-    def check(self, time: float, speed_bound: float) -> None:
-        """Stop where the soil's push or a free body's motion means nothing any more.
-
-        Args:
-            time: [s], for the message.
-            speed_bound: of a free body [m/s].
+    def check(self, time: float, top_speed: float) -> None:
+        """Stop at `time` [s] where the soil's push or a free body's motion means nothing any more.
 
         Raises:
-            SolverStopped: the force is not finite; the body reached the floor, or its motion cannot be.
+            SolverStopped: the force is not finite; the body reached the floor, or is faster than `top_speed` [m/s].
         """
         if not np.isfinite(self.data.impulse.numpy()).all():
             raise SolverStopped(f"the force on the body is not finite by {time:.3f} s: lower scene.courant")
         if self._axle is None:
             return
         height, rate, _ = self._axle.numpy()
-        if not abs(rate) <= speed_bound:
+        if not abs(rate) <= top_speed:
             raise SolverStopped(
                 f"the body moves up or down at {rate:.3g} m/s by {time:.3f} s, which nothing here can cause "
-                f"({speed_bound:.3g} m/s at most): lower scene.courant or raise scene.damping"
+                f"({top_speed:.3g} m/s at most): lower scene.courant or raise scene.damping"
             )
         if not height - self._shape.half_size[2] > -self.scene.bed.size[2]:
             raise SolverStopped(
@@ -200,11 +194,3 @@ class RigidBody:
             f"{times[substep]:.5f} s: its farthest point moves {farthest[substep]:.3g} m, allowed: {most:.3g} m, half "
             "a grid spacing; make its path smooth or slower there; the frames before it are good"
         )
-
-    def impulse(self) -> np.ndarray:
-        """By the soil on the body since the frame began [N s], and its moment [N m s], shape (2, 3); a moment that is
-        not added up is 0."""
-        found = np.zeros((2, 3))
-        impulse = self.data.impulse.numpy()
-        found[: len(impulse)] = impulse
-        return found

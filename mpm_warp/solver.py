@@ -121,7 +121,7 @@ class Solver:
                 yield stage
 
     def stages(self) -> Generator[Frame | Job, None, None]:
-        """As `frames`, with the jobs that the device has to do before the solver can go on: the caller has them run, with
+        """As `frames`, with the jobs that the device has to do before the solver can go on: the caller runs them, with
         those of other scenes (`run_concurrently`)."""
         if self._beginnings:
             self._make_ready()
