@@ -9,7 +9,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -32,8 +32,13 @@ def start_warp() -> None:
     """
     # Warp announces every kernel it loads; here only its warnings are of use.
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    quiet: AbstractContextManager = nullcontext()
     try:
-        with nullcontext() if _has_cuda_driver() else silent_stderr():
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        quiet = silent_stderr()
+    try:
+        with quiet:
             wp.init()
     except OSError as error:
         raise SceneError(
@@ -55,14 +60,6 @@ def find_device(name: str) -> wp.Device:
     if name not in devices:
         raise SceneError(f"device is {name!r}; allowed here: {', '.join(devices)}")
     return devices[name]
-
-
-def _has_cuda_driver() -> bool:
-    try:
-        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-    except OSError:
-        return False
-    return True
 
 
 @contextmanager
@@ -101,37 +98,32 @@ def load_kernel(kernel: wp.Kernel, device: wp.Device) -> None:
     folder = Path(str(wp.config.kernel_cache_dir)) / module.get_module_identifier(block_dim)
     there = os.path.lexists(folder)
     try:
-        with silent_stderr() if there else nullcontext():  # the line that follows says it, or it is repaired
-            wp.load_module(module, device, max_workers=0)
-        return
-    except OSError as error:
-        if not there:
-            raise SceneError(_unwritable(error)) from error
-    except Exception:  # Warp's own have no class of theirs
-        if not there:
-            raise
-    aside = folder.with_name(f"{folder.name}.damaged-{os.getpid()}")
-    try:
+        try:
+            with silent_stderr() if there else nullcontext():  # the error below says it, or it is repaired
+                wp.load_module(module, device, max_workers=0)
+            return
+        except Exception:  # Warp's own have no class of theirs
+            if not there:
+                raise
         # A folder that cannot be read can still be renamed. Another process may have done so.
+        aside = folder.with_name(f"{folder.name}.damaged-{os.getpid()}")
         with suppress(FileNotFoundError):
             folder.rename(aside)
         shutil.rmtree(aside, ignore_errors=True)
         module.unload()  # a failure is remembered otherwise
         wp.load_module(module, device, max_workers=0)
     except OSError as error:
-        raise SceneError(_unwritable(error)) from error
+        raise SceneError(
+            f"Warp's folder of compiled kernels, {wp.config.kernel_cache_dir}, cannot be used ({error}); repair or "
+            "remove it, or name another one in the environment variable WARP_CACHE_PATH"
+        ) from error
     except Exception as error:
+        if not there:
+            raise
         raise SceneError(
             f"the kernel {kernel.key} in {folder} was damaged and does not load when compiled anew either "
             f"({str(error).splitlines()[0]}); remove {wp.config.kernel_cache_dir} and try again"
         ) from error
-
-
-def _unwritable(error: OSError) -> str:
-    return (
-        f"Warp's folder of compiled kernels, {wp.config.kernel_cache_dir}, cannot be used ({error}); repair or remove "
-        "it, or name another one in the environment variable WARP_CACHE_PATH"
-    )
 
 
 # --- Kernels that work for one scene or, in one launch, for many ----------------------------------------
@@ -211,18 +203,15 @@ class Launch:
     """Of the kernel's function, without its first. Arrays keep their place and numbers their value."""
     device: wp.Device
 
-    def load(self) -> None:
-        """Load the kernel, which compiles it the first time."""
-        _ = self._recorded
+    @cached_property
+    def recorded(self) -> wp.Launch:
+        """The launch, with the kernel loaded, which compiles it the first time."""
+        load_kernel(self.kernel.alone, self.device)
+        return wp.launch(self.kernel.alone, self.count, self.arguments, device=self.device, record_cmd=True)
 
     def launch(self, step: int = 0) -> None:
         """Run it, whatever the number of the step."""
-        self._recorded.launch()
-
-    @cached_property
-    def _recorded(self) -> wp.Launch:
-        load_kernel(self.kernel.alone, self.device)
-        return wp.launch(self.kernel.alone, self.count, self.arguments, device=self.device, record_cmd=True)
+        self.recorded.launch()
 
 
 class BatchedLaunch:
@@ -301,13 +290,11 @@ class _Batch:
         """What runs in place of the programs' launches, in order."""
         if len(parts) == 1:
             for launch in parts[0]:
-                launch.load()
+                _ = launch.recorded
             return list(parts[0])
-        made: dict[tuple[Launch, ...], BatchedLaunch] = {}
-        for launches in zip(*parts, strict=True):
-            if launches not in made:
-                made[launches] = BatchedLaunch(launches, self._steps)
-        return [made[launches] for launches in zip(*parts, strict=True)]
+        groups = list(zip(*parts, strict=True))
+        batched = {group: BatchedLaunch(group, self._steps) for group in dict.fromkeys(groups)}
+        return [batched[group] for group in groups]
 
     def run(self, steps: Sequence[int]) -> None:
         """Do so many steps of each program."""

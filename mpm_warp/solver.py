@@ -371,7 +371,7 @@ def frames_together(
         In place of a frame that cannot be computed the error comes, as that scene's last; the others go on.
     """
 
-    def frames(scene: Scene, effects: Effects | None) -> Iterator[Frame | SceneError | SolverStopped | Job]:
+    def frames(scene: Scene, effects: Effects | None) -> Generator[Frame | Exception | Job, None, None]:
         try:
             yield from Solver(scene, effects, device, precision).stages()
         except (SceneError, SolverStopped) as error:
@@ -420,6 +420,6 @@ def _with_arrays(struct: Any, device: wp.Device, **given: int | np.ndarray) -> A
     """A struct whose arrays hold what is given, or so many zeros."""
     filled = struct()
     for name, values in given.items():
-        make = wp.zeros if isinstance(values, int) else wp.array
+        make: Any = wp.zeros if isinstance(values, int) else wp.array
         setattr(filled, name, make(values, dtype=struct.vars[name].type.dtype, device=device))
     return filled

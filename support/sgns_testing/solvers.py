@@ -29,7 +29,7 @@ def launches(solver):
 
 def compiled_source(launch):
     """What Warp compiled for a kernel with a module of its own, from its cache."""
-    launch.load()
+    assert launch.recorded
     (newest, *_) = sorted(
         Path(wp.config.kernel_cache_dir).glob(f"wp_{launch.kernel.alone.module.name}_*/*.cpp"),
         key=lambda file: file.stat().st_mtime,

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from leakage import leakage
 
 from mpm_warp import Bed, Box, Column, Effects, Excavation, Incline, Material, Push, Scene, Solver, Walls
-from mpm_warp.diagnostics import leakage
 from sgns_testing.scenes import BlockBed, block, cut
 
 from .case import Case
