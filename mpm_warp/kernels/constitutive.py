@@ -37,16 +37,16 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
     - `strain_trial(e, A)` -> deviatoric trial strain (6),
     - `volume_step(A)` -> ln det(I + A),
     - `yield_stress(tau_trial, p, dt, soil)` -> equivalent shear stress after the plastic return,
-    - `update(e, ln_j, A, dt, soil, g)` -> new e (6) and new ln J as a 7-vector. `g` is a number of the effects that
-      have one, otherwise unused: with `nonlocality` alone the excess of the fluidity over its local value; with
-      `fluidity` the particle's fluidity [1/s], whose new value is then the eighth number of the answer,
+    - `update(e, ln_j, A, dt, soil, g)` -> new e (6), ln J and g as an 8-vector. `g` means something with two effects:
+      with `nonlocality` alone the excess of the fluidity over its local value, which stays; with `fluidity` the
+      particle's fluidity [1/s],
     - `kirchhoff(e, ln_j, soil)` -> Kirchhoff stress (3 x 3) [Pa].
     """
     vec3 = wp.types.vector(3, real)
     vec6 = wp.types.vector(6, real)
     mat33 = wp.types.matrix((3, 3), real)
     Soil = soil_struct(real)
-    State = wp.types.vector(8 if effects.fluidity else 7, real)
+    State = wp.types.vector(8, real)
     fluid = fluidity(real)
     coefficients, fluidity_step = fluid.coefficients, fluid.fluidity_step
     friction_with_excess = fluid.friction_with_excess
@@ -200,10 +200,7 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
 
     @wp.func
     def state_of(e: vec6, ln_j: real, g: real):
-        if wp.static(effects.fluidity):
-            return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j, g)
-        else:
-            return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j)
+        return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j, g)
 
     @wp.func
     def separated_fluidity(a: mat33, dt: real, soil: Soil):
@@ -217,14 +214,13 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
     @wp.func
     def update(e: vec6, ln_j: real, a: mat33, dt: real, soil: Soil, g: real):
         new_ln_j = ln_j + volume_step(a)
+        new_g = g
         if wp.static(effects.separation):
             if new_ln_j >= real(0.0):
                 if wp.static(effects.fluidity):
-                    return state_of(vec6(), new_ln_j, separated_fluidity(a, dt, soil))
-                else:
-                    return state_of(vec6(), new_ln_j, g)
+                    new_g = separated_fluidity(a, dt, soil)
+                return state_of(vec6(), new_ln_j, new_g)
         t = strain_trial(e, a)
-        new_g = g
         if wp.static(effects.yielding):
             p = -soil.bulk_modulus * new_ln_j
             if p <= real(0.0):

@@ -17,13 +17,13 @@ from ..launch import Launch, scene_kernel
 _REACH = 2  # layers of ghost nodes: one more than the splines of a particle on the plane reach
 
 
-def mirror_pairs(sum_of_indices: int) -> np.ndarray:
+def mirror_layers(sum_of_indices: int) -> np.ndarray:
     """Ghost layers and their images, shape (m, 2), where layers j and `sum_of_indices` - j mirror each other."""
     first = (sum_of_indices + 1) // 2 - _REACH
     return np.array([(j, sum_of_indices - j) for j in range(first, sum_of_indices // 2 + 1)])
 
 
-def seam_pairs(low: int, cells: int) -> np.ndarray:
+def periodic_layers(low: int, cells: int) -> np.ndarray:
     """Ghost layers and their images, shape (m, 2), where layers j and j + `cells` are the same and layer `low` is
     the first of the period."""
     before = [(low - j, low - j + cells) for j in range(1, _REACH + 1)]

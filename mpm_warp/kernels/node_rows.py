@@ -53,7 +53,7 @@ def splines(real: type) -> SimpleNamespace:
 
 
 @cache
-def rows(real: type, gpu: bool) -> SimpleNamespace:
+def row_operations(real: type, gpu: bool) -> SimpleNamespace:
     """Type `row` of four nodes (16 numbers, the last node is padding) in precision `real`, and Warp functions
 
     - `plus(a, w, b)` -> a + w b,

@@ -151,6 +151,15 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         else:
             field[n] = vec4()
 
+    @wp.func
+    def stride(axis: int, grid: Grid):
+        # Entries from a node to the next one along an axis.
+        if axis == 0:
+            return grid.ny * grid.nz
+        if axis == 1:
+            return grid.nz
+        return 1
+
     @scene_kernel()
     def sweep(
         n: int,
@@ -161,18 +170,13 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         swept: vec4s,
     ):
         here = field[n]
-        plane = grid.ny * grid.nz
+        plane = stride(0, grid)
         # No soil lies in the outermost layers of the grid, so only the ends of the array need care.
         if here[0] > real(0.0) and n >= plane and n < field.shape[0] - plane:
             total = real(0.0)
             flux = real(0.0)
             for side in range(6):
-                stride = plane
-                if side // 2 == 1:
-                    stride = grid.nz
-                if side // 2 == 2:
-                    stride = 1
-                other = field[n + (2 * (side % 2) - 1) * stride]
+                other = field[n + (2 * (side % 2) - 1) * stride(side // 2, grid)]
                 if other[0] > real(0.0):
                     joint = wp.max(here[0], other[0])
                     total += joint
@@ -187,13 +191,8 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         # on which both neighbours hold soil. Ghost nodes have their G from the sweeps.
         sharp = here[1]
         for axis in range(3):
-            stride = grid.ny * grid.nz
-            if axis == 1:
-                stride = grid.nz
-            if axis == 2:
-                stride = 1
-            before = field[n - stride]
-            after = field[n + stride]
+            before = field[n - stride(axis, grid)]
+            after = field[n + stride(axis, grid)]
             if wp.min(before[0], after[0]) > real(0.25) * here[0]:
                 sharp -= real(0.25) * (before[1] - real(2.0) * here[1] + after[1])
         return sharp
@@ -205,7 +204,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         if found[0] > real(0.0):
             amount = found[3] - found[1]
             if wp.static(effects.fluidity):
-                plane = grid.ny * grid.nz
+                plane = stride(0, grid)
                 if n >= plane and n < field.shape[0] - plane:
                     lost = real(1.0) - fading(grid.inverse_spacing, grid.dt, soil)
                     amount += lost * sharpened(n, found, grid, field)

@@ -22,7 +22,7 @@ from .contact import ContactLaw, body_struct, contact
 from .fluidity import fluidity, soil_struct
 from .grid import grid_struct, particle_struct
 from .loose_soil import loose_soil
-from .node_rows import rows, splines
+from .node_rows import row_operations, splines
 
 
 @cache
@@ -48,7 +48,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
     apart, loose_volume = loose_soil(real).apart, loose_soil(real).volume
     spline = splines(real)
     base_and_offset, weights, moments = spline.base_and_offset, spline.weights, spline.moments
-    lanes = rows(real, gpu=atomic)
+    lanes = row_operations(real, gpu=atomic)
     row, plus, gather_row, scatter_row, spread, fold = (
         lanes.row, lanes.plus, lanes.gather, lanes.scatter, lanes.spread, lanes.fold
     )  # fmt: skip
