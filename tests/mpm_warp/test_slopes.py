@@ -6,27 +6,18 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 
+import bagnold
 import numpy as np
 import pytest
 
-from mpm_warp import Bed, Column, Effects, Incline, Material, Scene, SceneError, Solver, Walls
+from mpm_warp import Bed, Column, Effects, Incline, Scene, SceneError, Solver
 
-BEADS = Material(
-    youngs_modulus=1.0e5,
-    grain_density=2450.0,
-    packing=0.6,
-    grain_diameter=0.003,
-    static_friction=0.3819,
-    limit_friction=0.6435,
-)
+BEADS = replace(bagnold.BEADS, youngs_modulus=1.0e5)
 
 
 def incline(**kw) -> Incline:
     """A layer of glass beads, 3 cm thick, on a slope of 26 degrees: ten cells high, one particle per cell."""
-    bed = Bed(size=(0.012, 0.012, 0.03), spacing=0.003, headroom=0.006, walls=Walls("periodic", "periodic"))
-    return Incline(
-        **({"bed": bed, "material": BEADS, "tilt": 26.0, "duration": 0.5, "frame_rate": 20.0} | kw)
-    )
+    return bagnold.layer(0.003, 1, **({"material": BEADS, "duration": 0.5} | kw))
 
 
 def column(**kw) -> Column:
