@@ -1,9 +1,9 @@
-"""A body whose height is free: it carries a load and rests on the soil.
+"""A body in the soil: its motion through a frame, and the impulse that the soil gives it.
 
-One thread on the device moves it once per substep with the impulse the soil gave it, so nothing waits for the host and
-the step can be part of a captured graph. Height and speed are kept in double precision whatever the solver's: in
-single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that sinks slower than one such step per
-substep would hang in the air.
+Where its height is free it carries a load and rests on the soil. One thread on the device then moves it once per
+substep, so nothing waits for the host and the step can be part of a captured graph. Height and speed are kept in double
+precision whatever the solver's: in single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that
+sinks slower than one such step per substep would hang in the air.
 """
 
 from __future__ import annotations
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from .scene import Scene
 
 
+LONGEST_WAY = 0.5
+"""Of any point of a body in one substep [grid spacings]."""
+
+
 def stable_step(mass: float, contacts: float, stiffness: float, damping: float) -> float:
     """Longest substep [s] in which a free body on springs is stable, with a margin of two.
 
@@ -34,10 +38,6 @@ def stable_step(mass: float, contacts: float, stiffness: float, damping: float) 
     """
     a, b = contacts * stiffness / mass, contacts * damping / mass
     return 2.0 / (b + math.sqrt(b * b + 4.0 * a))
-
-
-LONGEST_WAY = 0.5
-"""Of any point of a body in one substep [grid spacings]."""
 
 
 def contact_spring(scene: Scene, volume: float) -> tuple[float, float]:
@@ -128,15 +128,10 @@ class RigidBody:
         times = (frame * self.substeps + np.arange(self.substeps + 1)) * self.time_step
         poses = self.scene.poses_at(times)
         self._require_steady(frame, times, poses[:, :3])
-        velocity = np.diff(poses[:, :3], axis=0) / self.time_step
-        spin = rotation_vectors(poses[:-1, 3:], poses[1:, 3:]) / self.time_step
-        for array, values in (
-            (self.data.position, poses[:-1, :3]),
-            (self.data.rotation, poses[:-1, 3:]),
-            (self.data.velocity, velocity),
-            (self.data.spin, spin),
-        ):
-            array.assign(values)
+        self.data.position.assign(poses[:-1, :3])
+        self.data.rotation.assign(poses[:-1, 3:])
+        self.data.velocity.assign(np.diff(poses[:, :3], axis=0) / self.time_step)
+        self.data.spin.assign(rotation_vectors(poses[:-1, 3:], poses[1:, 3:]) / self.time_step)
 
     def pose(self, time: float) -> np.ndarray:
         """Centre of mass [m] and quaternion now, at `time` [s], shape (7,)."""

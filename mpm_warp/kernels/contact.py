@@ -1,4 +1,19 @@
-"""Contact between soil and a rigid body, and the motion of a body whose height is free."""
+"""Contact between soil and a rigid body, and the motion of a body whose height is free.
+
+A particle within the body is pushed out by a stiff damped spring along the body's normal. A second spring holds it back
+along the surface; it is stretched by the sliding since contact began, no further than Coulomb friction allows (Cundall
+& Strack 1979). Friction without such a memory could take no more from a particle than the momentum of its own sliding,
+far too little where soil slides at millimetres per second under a load. The body receives the opposite of both.
+Particles move with the soil, so the force changes smoothly as the body advances, while contact enforced at grid nodes
+comes and goes with every cell the body crosses.
+
+The grid spreads a push over the width of its B-splines, whose support reaches one and a half grid spacings, so a body
+acts further out than it is. Contact therefore begins at a margin of -1/4 grid spacings: when the soil's edge, half a
+particle spacing from a particle's centre, is that far inside. Wheels, which press on soil and hardly cut it, have none.
+
+Bilateral contact holds the soil as well: within a layer half a grid spacing thick outside the place where the spring
+begins, the damper takes away the particle's normal velocity relative to the body, towards it or away from it.
+"""
 
 from dataclasses import dataclass
 from functools import cache
@@ -8,26 +23,8 @@ import warp as wp
 from ..launch import SceneKernel, scene_kernel
 from .signed_distance import shape_struct, signed_distance
 
-# --- Contact between soil particles and a rigid body ----------------------------------------------------
-# A particle within the body is pushed out by a stiff damped spring along the body's normal. A second spring
-# holds it back along the surface; it is stretched by the sliding since contact began, no further than Coulomb
-# friction allows (Cundall & Strack 1979). Friction without such a memory could take no more from a particle
-# than the momentum of its own sliding, far too little where soil slides at millimetres per second under a load.
-# The body receives the opposite of both. Particles move with the soil, so the force changes smoothly as the
-# body advances, while contact enforced at grid nodes comes and goes with every cell the body crosses.
-#
-# The grid spreads a push over the width of its B-splines, whose support reaches one and a half grid spacings,
-# so a body acts further out than it is. Contact therefore begins at a margin of -1/4 grid spacings: when the
-# soil's edge, half a particle spacing from a particle's centre, is that far inside. Wheels, which press on soil
-# and hardly cut it, have none.
-#
-# Bilateral contact holds the soil as well: within a layer half a grid spacing thick outside the place where the
-# spring begins, the damper takes away the particle's normal velocity relative to the body, towards it or away
-# from it.
-
 HOLDING_LAYER = 0.5
-"""Thickness of the layer of soil that bilateral contact holds, outside the place where the spring begins [grid
-spacings]."""
+"""Thickness of the layer of soil that bilateral contact holds [grid spacings]."""
 
 
 @dataclass(frozen=True)

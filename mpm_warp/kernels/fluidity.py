@@ -95,22 +95,18 @@ def fluidity(real: type) -> SimpleNamespace:
     """
     vec2 = wp.types.vector(2, real)
     Soil = soil_struct(real)
-    seed = wp.constant(SEED_INERTIAL_NUMBER)
-    least_fluidity = wp.constant(LEAST_FLUIDITY)
-    least_pressure = wp.constant(LEAST_PRESSURE)
-    least_gap = wp.constant(LEAST_GAP)
     negligible = wp.constant(1e-8 if real is wp.float32 else 1e-16)
     tolerance = wp.constant(1e-6 if real is wp.float32 else 1e-13)
 
     @wp.func
     def coefficients(p: real, dt: real, soil: Soil):
-        pressure = wp.max(p, real(least_pressure) * soil.shear_modulus)
+        pressure = wp.max(p, real(LEAST_PRESSURE) * soil.shear_modulus)
         return vec2(soil.shear_modulus * dt / pressure, soil.reference_rate * wp.sqrt(pressure))
 
     @wp.func
     def steepening(mu: real, soil: Soil):
         # m in the saturating law.
-        gap = wp.max(soil.limit_friction - mu, real(least_gap) * soil.limit_friction)
+        gap = wp.max(soil.limit_friction - mu, real(LEAST_GAP) * soil.limit_friction)
         return (soil.limit_friction - soil.static_friction) / gap
 
     @wp.func
@@ -161,12 +157,12 @@ def fluidity(real: type) -> SimpleNamespace:
             fading = mu_trial - mu_s
             if soil.linear_rate_law == 0:
                 fading = steepening(mu_trial, soil) * fading
-            return vec2(mu_trial, wp.max(g * wp.exp(steps * fading), real(least_fluidity)))
-        start = wp.max(g, real(least_fluidity))
+            return vec2(mu_trial, wp.max(g * wp.exp(steps * fading), real(LEAST_FLUIDITY)))
+        start = wp.max(g, real(LEAST_FLUIDITY))
         low = real(-1.0e4)
         high = low
         if mu_trial > mu_s:
-            start = wp.max(start, real(seed) * c / soil.reference_inertial_number)
+            start = wp.max(start, real(SEED_INERTIAL_NUMBER) * c / soil.reference_inertial_number)
             high = wp.log((mu_trial / mu_s - real(1.0)) / a)  # there mu = mu_s
             if soil.linear_rate_law == 0 and mu_trial > mu_2:
                 low = wp.log((mu_trial / mu_2 - real(1.0)) / a)  # there mu = mu_2
@@ -203,7 +199,7 @@ def fluidity(real: type) -> SimpleNamespace:
             y = new
             if moved <= real(tolerance) * (real(1.0) + wp.abs(y)):
                 break
-        g_new = wp.exp(wp.max(y, wp.log(real(least_fluidity))))
+        g_new = wp.exp(wp.max(y, wp.log(real(LEAST_FLUIDITY))))
         return vec2(mu_trial / (real(1.0) + a * g_new), g_new)
 
     @wp.func

@@ -35,20 +35,14 @@ def periodic_layers(low: int, cells: int) -> np.ndarray:
 def ghost_kernels(real: type) -> SimpleNamespace:
     """Kernels `fold`, `unfold` (one thread per row of nodes across the plane) and `wrap` in precision `real`."""
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    vec4s, layers = wp.array(dtype=vec4), wp.array(dtype=wp.vec2i)
 
     @wp.func
     def node_of(row: int, layer: int, stride: int, extent: int):
         return (row // stride) * stride * extent + row % stride + layer * stride
 
     @scene_kernel()
-    def fold(
-        row: int,
-        nodes: wp.array(dtype=vec4),
-        pairs: wp.array(dtype=wp.vec2i),
-        sign: vec4,
-        stride: int,
-        extent: int,
-    ):
+    def fold(row: int, nodes: vec4s, pairs: layers, sign: vec4, stride: int, extent: int):
         """Add ghost layers to their images; `sign` mirrors a node's momentum, `stride` and `extent` are the axis'."""
         for q in range(pairs.shape[0]):
             ghost = node_of(row, pairs[q][0], stride, extent)
@@ -59,14 +53,7 @@ def ghost_kernels(real: type) -> SimpleNamespace:
                 nodes[ghost] = vec4()
 
     @scene_kernel()
-    def unfold(
-        row: int,
-        velocity: wp.array(dtype=vec4),
-        pairs: wp.array(dtype=wp.vec2i),
-        sign: vec4,
-        stride: int,
-        extent: int,
-    ):
+    def unfold(row: int, velocity: vec4s, pairs: layers, sign: vec4, stride: int, extent: int):
         """Give ghost layers the velocity of their images."""
         for q in range(pairs.shape[0]):
             ghost = node_of(row, pairs[q][0], stride, extent)

@@ -34,9 +34,7 @@ def grid_struct(real: type) -> type:
         particle_volume: real  # at the critical density [m^3]
         on_plane: int  # so many particles, the first ones, lie on a plane of symmetry and count half
         density_per_mass: real  # of a node: soil's density there over that of an undisturbed bed [1/kg]
-        beyond_walls: (
-            vec3  # the whole around a node on an x wall, a y wall, the floor over its part in the bin
-        )
+        beyond_walls: vec3  # whole around a node on an x wall, a y wall, the floor over its part in the bin
         speed_limit: real  # one cell per step [m/s]
 
     return Grid
@@ -77,7 +75,7 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
     (`Walls.conditions`); the kernels hold no code of other kinds.
     """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    Grid, vec4s, numbers = grid_struct(real), wp.array(dtype=vec4), wp.array(dtype=real)
+    Grid, vec4s, reals = grid_struct(real), wp.array(dtype=vec4), wp.array(dtype=real)
 
     @wp.func
     def no_slip(v: vec3, inward: vec3, friction: real):
@@ -125,7 +123,7 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
         momentum: vec4s,
         velocity: vec4s,
         before: vec4s,
-        inverse_mass: numbers,
+        inverse_mass: reals,
         impulse: vec4s,
     ):
         node = momentum[n]
@@ -145,12 +143,7 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
 
     @scene_kernel()
     def step(
-        n: int,
-        grid: Grid,
-        velocity: vec4s,
-        inverse_mass: numbers,
-        impulse: vec4s,
-        substep: wp.array(dtype=int),
+        n: int, grid: Grid, velocity: vec4s, inverse_mass: reals, impulse: vec4s, substep: wp.array(dtype=int)
     ):
         # `static` around the walls' functions: Warp knows a kernel by its text and its functions, but not under which
         # names it calls these. Without, walls x slip, y no_slip would get the kernel of x no_slip, y slip.

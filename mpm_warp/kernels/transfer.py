@@ -40,7 +40,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
     law = constitutive(real, effects)
     vec6, mat33 = law.vec6, law.mat33
     Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real, touch or ContactLaw())
-    Particles, vec4s, numbers, counts = particle_struct(real), *(wp.array(dtype=t) for t in (vec4, real, int))
+    Particles, vec4s, reals, ints = particle_struct(real), *(wp.array(dtype=t) for t in (vec4, real, int))
     with_body = touch is not None
     push = contact(real, touch or ContactLaw(), atomic)
     update, kirchhoff = law.update, law.kirchhoff
@@ -58,7 +58,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         return ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
 
     @wp.func
-    def fail(fault: counts, p: int, substep: int, near_home: int):
+    def fail(fault: ints, p: int, substep: int, near_home: int):
         # The first faulty particle is remembered; the solver stops at the end of the frame.
         if wp.atomic_add(fault, 0, 1) == 0:
             fault[1] = p
@@ -97,9 +97,9 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         particles: Particles,
         grid: Grid,
         momentum: vec4s,
-        top_speed: numbers,
-        substep: counts,
-        fault: counts,
+        top_speed: reals,
+        substep: ints,
+        fault: ints,
     ):
         x = particles.position[p]
         v = particles.velocity[p]
@@ -116,7 +116,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         deposit(base, f, vec4(start[0], start[1], start[2], mass), q, grid, momentum)
 
     @scene_kernel(fused)
-    def scatter(p: int, particles: Particles, grid: Grid, body: Body, impulse: vec4s, substep: counts):
+    def scatter(p: int, particles: Particles, grid: Grid, body: Body, impulse: vec4s, substep: ints):
         base, f = base_and_offset(particles.home[p], grid)
         mass = part(p, grid) * grid.particle_mass
         # Of the stress: -dt V D^-1 tau (x_i - x_p), D = dx^2 / 4; q is per cell.
@@ -139,8 +139,8 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         grid: Grid,
         velocity: vec4s,
         cooperation: vec4s,
-        substep: counts,
-        fault: counts,
+        substep: ints,
+        fault: ints,
     ):
         base, f = base_and_offset(particles.home[p], grid)
         wx = weights(f[0])
@@ -248,7 +248,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         return x
 
     @scene_kernel(fused)
-    def from_grid(p: int, particles: Particles, grid: Grid, before: vec4s, keep: numbers):
+    def from_grid(p: int, particles: Particles, grid: Grid, before: vec4s, keep: reals):
         # The particle's own velocity changes by what changed on the grid; of the part that the grid does not resolve
         # the share `keep` is left.
         base, f = base_and_offset(particles.home[p], grid)
