@@ -81,15 +81,11 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
     bilateral, free, torque = law.bilateral, law.free, law.torque
 
     @wp.func
-    def add(body: Body, impulse: vec3, arm: vec3):
+    def take(total: wp.array(dtype=vec3), i: int, amount: vec3):
         if wp.static(atomic):
-            wp.atomic_sub(body.impulse, 0, impulse)
-            if wp.static(torque):
-                wp.atomic_sub(body.impulse, 1, wp.cross(arm, impulse))
+            wp.atomic_sub(total, i, amount)
         else:
-            body.impulse[0] = body.impulse[0] - impulse
-            if wp.static(torque):
-                body.impulse[1] = body.impulse[1] - wp.cross(arm, impulse)
+            total[i] = total[i] - amount
 
     @wp.func
     def push(p: int, x: vec3, v: vec3, mass: real, part: real, dt: real, s: int, body: Body):
@@ -129,19 +125,19 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
                         grip = grip * (most / size)
                         stretch = grip / (dt * stiffness)
                     impulse = pressed * normal - grip
-                    add(body, impulse, arm)
+                    take(body.impulse, 0, impulse)
+                    if wp.static(torque):
+                        take(body.impulse, 1, wp.cross(arm, impulse))
             body.stick[p] = stretch
         return impulse
 
     return push
 
 
-# --- A body whose height is free: it carries a load and rests on the soil (see rigid_body.py) ------------
-
-
 @cache
 def axle_step(real: type) -> SceneKernel:
-    """Kernel of one thread: symplectic Euler with the damping taken implicitly."""
+    """Kernel of one thread, which moves a body of free height (rigid_body.py): symplectic Euler with the damping taken
+    implicitly."""
     vec3 = wp.types.vector(3, real)
 
     @scene_kernel()

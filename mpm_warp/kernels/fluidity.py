@@ -9,8 +9,6 @@ import warp as wp
 
 from ..material import Material
 
-# --- The soil's constants as a Warp struct --------------------------------------------------------------
-
 
 @cache
 def soil_struct(real: type) -> type:

@@ -7,8 +7,6 @@ import warp as wp
 
 from .grid import grid_struct
 
-# --- Quadratic B-splines: which 27 nodes a particle touches, and with what weights ----------------------
-
 
 @cache
 def splines(real: type) -> SimpleNamespace:

@@ -87,9 +87,7 @@ def test_stops_where_the_fluidity_is_no_number():
     solver = Solver(cut(duration=0.1, material=Material(grain_diameter=5e-3)), STEADY)
     frames = solver.frames()
     next(frames), next(frames)
-    change(
-        solver._cooperative_field, np.nan, at=(slice(None), 3)
-    )  # which the steady form's sweeps go on from
+    change(solver._cooperative_field, np.nan, at=(..., 3))  # which the steady form's sweeps go on from
     with pytest.raises(SolverStopped, match="its fluidity is not finite"):
         list(frames)
 

@@ -87,6 +87,18 @@ def test_what_soil_cannot_do_stops_the_solver(name, value, words):
     assert np.abs(last.position - undisturbed.position).max() < 1e-3
 
 
+def test_with_symmetry_the_message_names_the_right_particle():
+    """15 rows across: particles on the plane of symmetry come first and count half."""
+    scene = cut(duration=0.1, bed=Bed(size=(0.5, 0.375, 0.16), spacing=0.025, headroom=0.12))
+    solver = Solver(scene, Effects(symmetry=True))
+    assert solver._half.on_plane < 500
+    frames = solver.frames()
+    next(frames)
+    change(solver.particles.velocity, np.nan, at=500)
+    with pytest.raises(SolverStopped, match=f"^particle {solver._half.kept[500]} at "):
+        next(frames)
+
+
 @pytest.mark.parametrize(
     ("volume", "shear", "courant", "words"),
     [
