@@ -1,6 +1,7 @@
 """The stress update at a single point, against exact answers (float64) and in float32."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -136,18 +137,21 @@ def test_float32_keeps_slow_straining():
     assert np.abs(single - double).max() < 1e-3 * np.abs(double).max()
 
 
+@pytest.mark.parametrize("law", ["saturating", "linear"])
 @pytest.mark.parametrize("rate", [0.1, 10.0, 1000.0])
-def test_simple_shear_reaches_mu_of_i(rate):
+def test_simple_shear_reaches_mu_of_i(rate, law):
     """Steady simple shear at constant volume: tau / p = mu(I) exactly, at any rate."""
-    pressure, dt = 1000.0, 1e-5
+    pressure, dt, material = 1000.0, 1e-5, replace(SAND, rate_law=law)
     ln_j = np.array([-pressure / SAND.bulk_modulus])
     # Enough strain to pass the elastic range (p / G is about 2e-4), whatever the rate.
-    strain, after = Point().update(NOTHING, ln_j, sheared(rate * dt), dt, int(2e-2 / (rate * dt)) + 2000)
+    steps = int(2e-2 / (rate * dt)) + 2000
+    strain, after = Point(material=material).update(NOTHING, ln_j, sheared(rate * dt), dt, steps)
     assert after == pytest.approx(ln_j, rel=1e-9)
-    inertial = rate * SAND.grain_diameter * math.sqrt(SAND.grain_density / pressure)
-    mu = SAND.static_friction + (SAND.limit_friction - SAND.static_friction) / (
-        1 + SAND.reference_inertial_number / inertial
+    number = (
+        rate * SAND.grain_diameter * math.sqrt(SAND.grain_density / pressure) / SAND.reference_inertial_number
     )
+    share = number if law == "linear" else number / (1.0 + number)
+    mu = SAND.static_friction + (SAND.limit_friction - SAND.static_friction) * share
     # The plastic rate equals the shear rate up to the elastic strain's small rotation.
     assert shear_stress(strain)[0] / pressure == pytest.approx(mu, rel=2e-4)
 
