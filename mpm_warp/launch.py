@@ -253,15 +253,10 @@ class Program:
     step: Sequence[Launch] = ()
     end: Sequence[Launch] = ()
 
-    @property
-    def parts(self) -> tuple[Sequence[Launch], ...]:
-        """In order."""
-        return self.begin, self.step, self.end
-
     @cached_property
     def kernels(self) -> tuple[tuple[SceneKernel, ...], ...]:
         """Programs that have the same can run as one."""
-        return tuple(tuple(launch.kernel for launch in part) for part in self.parts)
+        return tuple(tuple(launch.kernel for launch in part) for part in (self.begin, self.step, self.end))
 
 
 @dataclass
@@ -287,9 +282,9 @@ class _Batch:
         self.programs, self._device = programs, device
         self._steps = wp.zeros(len(programs), dtype=int, device=device)
         self._graphs: dict[int, wp.Graph] = {}
-        self._begin, self._step, self._end = map(
-            self._serving, zip(*(p.parts for p in programs), strict=True)
-        )
+        self._begin = self._serving([p.begin for p in programs])
+        self._step = self._serving([p.step for p in programs])
+        self._end = self._serving([p.end for p in programs])
 
     def _serving(self, parts: Sequence[Sequence[Launch]]) -> list[Launch | BatchedLaunch]:
         """What runs in place of the programs' launches, in order."""

@@ -199,7 +199,7 @@ class Solver:
             zeros(vec4, padded if effects.nonlocality else 0) for _ in range(2)
         )
         self._top_speed, self._keep = zeros(real, 1), zeros(real, 1)
-        self._substep, self._fault = zeros(int, 1), zeros(int, 4)
+        self._grid.substep, self._fault = zeros(int, 1), zeros(int, 4)
         periodic = (axis for axis, kind in enumerate(scene.bed.walls.conditions) if kind == "periodic")
         self._turns = {axis: zeros(int, n) for axis in periodic}
         self._body: RigidBody | None = None
@@ -239,20 +239,20 @@ class Solver:
             Launch(wrap, len(turns), [particles.position, turns, axis, scene.bed.size[axis]], device)
             for axis, turns in self._turns.items()
         ]
-        remap.append(over_particles(kernels.to_grid, momentum, self._top_speed, self._substep, self._fault))
+        remap.append(over_particles(kernels.to_grid, momentum, self._top_speed, self._fault))
         begin = [
             *ghost_nodes.fold(momentum),
             over_nodes(node_kernels.begin, momentum, velocity, before, self._inverse_mass, impulse),
             *ghost_nodes.unfold(before),
         ]
         step = [
-            over_particles(kernels.scatter, body_data, impulse, self._substep),
+            over_particles(kernels.scatter, body_data, impulse),
             *(body.launches if body else ()),
             *ghost_nodes.fold(impulse),
-            over_nodes(node_kernels.step, velocity, self._inverse_mass, impulse, self._substep),
+            over_nodes(node_kernels.step, velocity, self._inverse_mass, impulse),
             *(self._nonlocal_launches(layers) if self.effects.nonlocality else ()),
             *ghost_nodes.unfold(velocity),
-            over_particles(kernels.gather, velocity, self._cooperation, self._substep, self._fault),
+            over_particles(kernels.gather, velocity, self._cooperation, self._fault),
             over_particles(kernels.material, self._soil),
         ]
         return Program(remap), Program(begin, step, [over_particles(kernels.from_grid, before, self._keep)])
@@ -271,7 +271,7 @@ class Solver:
 
     def _advance(self, index: int) -> Iterator[Job]:
         """From frame index - 1 to frame `index`."""
-        self._substep.zero_()
+        self._grid.substep.zero_()
         if self._body is not None:
             self._body.start_frame(index - 1)
         left = self.substeps_per_frame

@@ -22,6 +22,7 @@ def grid_struct(real: type) -> type:
         ny: int
         nz: int
         dt: real  # [s]
+        substep: wp.array(dtype=int)  # how many steps of the frame are done, (1,)
         volume_averaging: real  # share of a particle's own volume change that the mean replaces
         forgetting: real  # share of recent volume changes that a step forgets
         damping: real  # viscous time of the elastic strain / dt
@@ -142,13 +143,11 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
         inverse_mass[n] = inverse
 
     @scene_kernel()
-    def step(
-        n: int, grid: Grid, velocity: vec4s, inverse_mass: reals, impulse: vec4s, substep: wp.array(dtype=int)
-    ):
+    def step(n: int, grid: Grid, velocity: vec4s, inverse_mass: reals, impulse: vec4s):
         # `static` around the walls' functions: Warp knows a kernel by its text and its functions, but not under which
         # names it calls these. Without, walls x slip, y no_slip would get the kernel of x no_slip, y slip.
         if n == 0:
-            substep[0] = substep[0] + 1
+            grid.substep[0] = grid.substep[0] + 1
         inverse = inverse_mass[n]
         if inverse > real(0.0):
             change = impulse[n]

@@ -92,20 +92,12 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
             plane = plus(plane, real(1.0), row_x)
 
     @scene_kernel(fused)
-    def to_grid(
-        p: int,
-        particles: Particles,
-        grid: Grid,
-        momentum: vec4s,
-        top_speed: reals,
-        substep: ints,
-        fault: ints,
-    ):
+    def to_grid(p: int, particles: Particles, grid: Grid, momentum: vec4s, top_speed: reals, fault: ints):
         x = particles.position[p]
         v = particles.velocity[p]
         speed = wp.length(v)
         if not (speed < grid.speed_limit):  # true for a NaN, too
-            fail(fault, p, substep[0], 0)
+            fail(fault, p, grid.substep[0], 0)
             return
         wp.atomic_max(top_speed, 0, speed)
         particles.home[p] = x
@@ -116,7 +108,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         deposit(base, f, vec4(start[0], start[1], start[2], mass), q, grid, momentum)
 
     @scene_kernel(fused)
-    def scatter(p: int, particles: Particles, grid: Grid, body: Body, impulse: vec4s, substep: ints):
+    def scatter(p: int, particles: Particles, grid: Grid, body: Body, impulse: vec4s):
         base, f = base_and_offset(particles.home[p], grid)
         mass = part(p, grid) * grid.particle_mass
         # Of the stress: -dt V D^-1 tau (x_i - x_p), D = dx^2 / 4; q is per cell.
@@ -128,20 +120,12 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         if wp.static(with_body):
             felt = particles.felt_velocity[p]
             u = vec3(felt[0], felt[1], felt[2])
-            start += push(p, particles.position[p], u, mass, part(p, grid), grid.dt, substep[0], body)
+            start += push(p, particles.position[p], u, mass, part(p, grid), grid.dt, grid.substep[0], body)
         swelling = mass * particles.swelling[p]
         deposit(base, f, vec4(start[0], start[1], start[2], swelling), q, grid, impulse)
 
     @scene_kernel(fused)
-    def gather(
-        p: int,
-        particles: Particles,
-        grid: Grid,
-        velocity: vec4s,
-        cooperation: vec4s,
-        substep: ints,
-        fault: ints,
-    ):
+    def gather(p: int, particles: Particles, grid: Grid, velocity: vec4s, cooperation: vec4s, fault: ints):
         base, f = base_and_offset(particles.home[p], grid)
         wx = weights(f[0])
         wy = weights(f[1])
@@ -194,7 +178,7 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
             )  # fmt: skip
         else:
             particles.velocity_gradient[p] = mat33()  # the particle keeps its last good state
-            fail(fault, p, substep[0], wp.where(near, 1, 0))
+            fail(fault, p, grid.substep[0], wp.where(near, 1, 0))
 
     # A kernel of its own: in one with the transfer the C++ compiler makes both slower.
     @scene_kernel(fused)
