@@ -26,12 +26,12 @@ from .node_rows import row_operations, splines
 
 
 @cache
-def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: bool) -> SimpleNamespace:
+def transfer(real: type, effects: Effects, contact_law: ContactLaw | None, atomic: bool) -> SimpleNamespace:
     """Kernels in precision `real` with only the physics in `effects`: `to_grid` and `from_grid` at a remap;
     `scatter`, `gather` and `material` in every step.
 
-    `touch` is the contact with a body, None without one; `atomic` is needed where many threads write to the grid at
-    once (a GPU).
+    `contact_law` is that with a body, None without one; `atomic` is needed where many threads write to the grid at once
+    (a GPU).
     """
     # Warp writes a product and the sum it goes into as two statements: without the flag they stay two instructions.
     fused = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast"}
@@ -39,10 +39,10 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
     vec4 = wp.types.vector(4, real)
     law = constitutive(real, effects)
     vec6, mat33 = law.vec6, law.mat33
-    Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real, touch or ContactLaw())
+    Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real, contact_law or ContactLaw())
     Particles, vec4s, reals, ints = particle_struct(real), *(wp.array(dtype=t) for t in (vec4, real, int))
-    with_body = touch is not None
-    push = contact(real, touch or ContactLaw(), atomic)
+    with_body = contact_law is not None
+    push = contact(real, contact_law or ContactLaw(), atomic)
     update, kirchhoff = law.update, law.kirchhoff
     fading = fluidity(real).fading
     apart, loose_volume = loose_soil(real).apart, loose_soil(real).volume
