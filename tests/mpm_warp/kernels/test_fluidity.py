@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -10,8 +9,8 @@ import warp as wp
 from scipy.integrate import solve_ivp
 
 from mpm_warp import Effects, Material
-from mpm_warp.kernels.constitutive import constitutive
 from mpm_warp.kernels.fluidity import SEED_INERTIAL_NUMBER, fluidity, soil_parameters, soil_struct
+from sgns_testing.points import sheared, updated
 
 SAND = Material()
 LINEAR = replace(SAND, rate_law="linear")
@@ -77,44 +76,21 @@ def local_fluidity(material, mu, p):
     return c * over / (span * mu) * steepening(material, mu)
 
 
-def shear(material, rate, pressure, time, dt, g=0.0):
-    """mu and g of every step of simple shear at constant volume from rest."""
-    a = np.zeros((3, 3))
-    a[0, 2] = rate * dt
-    found = wp.zeros((round(time / dt), 2), dtype=wp.float64, device="cpu")
-    soil = soil_parameters(wp.float64, material, 1.0)
-    wp.launch(
-        shear_kernel(), 1, [wp.mat33d(a), -pressure / material.bulk_modulus, g, dt, soil, found], device="cpu"
-    )
-    strain, g = found.numpy().T
-    return 2.0 * material.shear_modulus * strain / pressure, g
-
-
-@cache
-def shear_kernel():
-    real = wp.float64
-    law, Soil = constitutive(real, DYNAMIC), soil_struct(real)
-    vec6, mat33, update = law.vec6, law.mat33, law.update
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def run(a: mat33, ln_j: real, g: real, dt: real, soil: Soil, found: wp.array2d(dtype=real)):
-        e = vec6()
-        fluid = g + real(0.0)
-        for n in range(found.shape[0]):
-            s = update(e, ln_j, a, dt, soil, fluid)
-            e = vec6(s[0], s[1], s[2], s[3], s[4], s[5])
-            fluid = s[7]
-            found[n, 0] = e[4]
-            found[n, 1] = fluid
-
-    return run
+def shear(material, rate, pressure, time, dt, g=0.0, every=1):
+    """mu and g of simple shear at constant volume from rest, at every n-th step."""
+    strain, found = np.zeros((1, 3, 3)), []
+    for _ in range(round(time / dt) // every):
+        ln_j, a = -pressure / material.bulk_modulus, sheared(rate * dt)
+        strain, _, g = updated(material, strain, ln_j, a, dt, every, g, DYNAMIC)
+        found.append((2.0 * material.shear_modulus * strain[0, 0, 2] / pressure, g[0]))
+    return np.array(found).T
 
 
 @BOTH_LAWS
 @pytest.mark.parametrize("rate", [0.1, 7.5, 300.0])
 def test_steady_shear_reaches_mu_of_i(material, rate):
     """After the transient the dynamics rest at the rate law, at any rate."""
-    mu, g = shear(material, rate, 1000.0, 0.05 + 0.15 / rate, 2e-5)
+    mu, g = shear(material, rate, 1000.0, 0.05 + 0.15 / rate, 2e-5, every=25)
     inertial = rate * material.grain_diameter * math.sqrt(material.grain_density / 1000.0)
     span, i0 = material.limit_friction - material.static_friction, material.reference_inertial_number
     share = inertial / i0 if material.rate_law == "linear" else 1.0 / (1.0 + i0 / inertial)
@@ -139,8 +115,8 @@ def test_start_of_shear_against_a_reference_integrator(material, rate):
     exact = solve_ivp(slope, (0.0, t_end), (0.0, math.log(g0)), "LSODA", rtol=1e-9, atol=1e-12, max_step=1e-5)
     errors = []
     for dt in (1e-5, 5e-6, 2.5e-6):
-        mu, _ = shear(material, rate, p, t_end, dt, g0)
-        at = np.interp(dt * np.arange(1, len(mu) + 1), exact.t, exact.y[0])
+        mu, _ = shear(material, rate, p, t_end, dt, g0, every=10)
+        at = np.interp(10 * dt * np.arange(1, len(mu) + 1), exact.t, exact.y[0])
         errors.append(np.abs(mu - at).mean())
     assert errors[2] < 0.01
     assert errors[1] < 0.6 * errors[0]
@@ -159,7 +135,7 @@ def test_start_of_shear_against_a_reference_integrator(material, rate):
 def test_overshoot_of_the_dynamic_form(material, g, low, high):
     """Sheared suddenly (1 kPa, 7.5 1/s) friction overshoots many times before it settles, but for the saturating law,
     which bounds it."""
-    mu, _ = shear(material, 7.5, 1000.0, 0.1, 2e-5, g)
+    mu, _ = shear(material, 7.5, 1000.0, 0.1, 2e-5, g, every=2)
     assert low < mu.max() < high
     if material.rate_law == "linear":
         assert mu[-1] == pytest.approx(0.7626, abs=1e-3)
