@@ -193,6 +193,7 @@ class Solver:
             fluidity=n if effects.fluidity else 0,
             excess=n if effects.nonlocality else 0,
         )
+        """The arrays of the particles that are computed, see kernels/grid.py."""
         self._momentum, self._velocity, self._before, self._impulse = (zeros(vec4, padded) for _ in range(4))
         self._inverse_mass = zeros(real, node_count)
         self._cooperative_field, self._cooperation = (
