@@ -1,7 +1,6 @@
 """A 3D material point method for granular soil, in NVIDIA Warp. Usable alone; needs warp, numpy and pydantic only."""
 
 from .auto_effects import Decision, Tolerances, effects_for
-from .batch import frames_together
 from .bed import Bed, Walls, arrange
 from .bodies import Box, Cylinder, MeshBody, Plate
 from .discretisation import asymmetry
@@ -10,7 +9,7 @@ from .limits import substeps_per_frame
 from .material import Material
 from .scene import Scene
 from .scenes import Body, Column, Excavation, Incline, Wheel
-from .solver import Frame, Solver
+from .solver import Frame, Solver, frames_together
 from .state import SceneError, SolverStopped, State
 
 Push = Body  # its former name

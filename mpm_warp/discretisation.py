@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from .bed import PADDING
-from .kernels.ghost_nodes import mirror_pairs, seam_pairs
+from .kernels.ghost_nodes import mirror_layers, periodic_layers
 from .kernels.grid import grid_struct
 from .scene import Scene
 from .state import SceneError
@@ -38,10 +38,10 @@ def lay_grid(
     ghosts = {}
     for axis in (0, 1):
         if bed.walls.conditions[axis] == "periodic":
-            ghosts[axis] = seam_pairs(PADDING, cells[axis])
+            ghosts[axis] = periodic_layers(PADDING, cells[axis])
             low[axis], high[axis] = -1, 2**30  # no walls
     if symmetric:
-        ghosts[1] = mirror_pairs(2 * PADDING + cells[1])
+        ghosts[1] = mirror_layers(2 * PADDING + cells[1])
         left_out = ghosts[1].min()
         ghosts[1] -= left_out
         origin[1] += left_out * h

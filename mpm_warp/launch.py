@@ -1,4 +1,4 @@
-"""Warp: its start, kernels for one scene or many, and the work that scenes ask of the device."""
+"""Warp: its start, kernels for one scene or many, and the jobs that scenes ask of the device."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -32,8 +32,13 @@ def start_warp() -> None:
     """
     # Warp announces every kernel it loads; here only its warnings are of use.
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    quiet: AbstractContextManager = nullcontext()
     try:
-        with nullcontext() if _has_cuda_driver() else silent_stderr():
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        quiet = silent_stderr()
+    try:
+        with quiet:
             wp.init()
     except OSError as error:
         raise SceneError(
@@ -55,14 +60,6 @@ def find_device(name: str) -> wp.Device:
     if name not in devices:
         raise SceneError(f"device is {name!r}; allowed here: {', '.join(devices)}")
     return devices[name]
-
-
-def _has_cuda_driver() -> bool:
-    try:
-        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-    except OSError:
-        return False
-    return True
 
 
 @contextmanager
@@ -98,40 +95,35 @@ def load_kernel(kernel: wp.Kernel, device: wp.Device) -> None:
     """
     module = kernel.module
     block_dim = 1 if device.is_cpu else module.options["block_dim"]
-    folder = Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim)
+    folder = Path(str(wp.config.kernel_cache_dir)) / module.get_module_identifier(block_dim)
     there = os.path.lexists(folder)
     try:
-        with silent_stderr() if there else nullcontext():  # the line that follows says it, or it is repaired
-            wp.load_module(module, device, max_workers=0)
-        return
-    except OSError as error:
-        if not there:
-            raise SceneError(_unwritable(error)) from error
-    except Exception:  # Warp's own have no class of theirs
-        if not there:
-            raise
-    aside = folder.with_name(f"{folder.name}.damaged-{os.getpid()}")
-    try:
+        try:
+            with silent_stderr() if there else nullcontext():  # the error below says it, or it is repaired
+                wp.load_module(module, device, max_workers=0)
+            return
+        except Exception:  # Warp's own have no class of theirs
+            if not there:
+                raise
         # A folder that cannot be read can still be renamed. Another process may have done so.
+        aside = folder.with_name(f"{folder.name}.damaged-{os.getpid()}")
         with suppress(FileNotFoundError):
             folder.rename(aside)
         shutil.rmtree(aside, ignore_errors=True)
         module.unload()  # a failure is remembered otherwise
         wp.load_module(module, device, max_workers=0)
     except OSError as error:
-        raise SceneError(_unwritable(error)) from error
+        raise SceneError(
+            f"Warp's folder of compiled kernels, {wp.config.kernel_cache_dir}, cannot be used ({error}); repair or "
+            "remove it, or name another one in the environment variable WARP_CACHE_PATH"
+        ) from error
     except Exception as error:
+        if not there:
+            raise
         raise SceneError(
             f"the kernel {kernel.key} in {folder} was damaged and does not load when compiled anew either "
             f"({str(error).splitlines()[0]}); remove {wp.config.kernel_cache_dir} and try again"
         ) from error
-
-
-def _unwritable(error: OSError) -> str:
-    return (
-        f"Warp's folder of compiled kernels, {wp.config.kernel_cache_dir}, cannot be used ({error}); repair or remove "
-        "it, or name another one in the environment variable WARP_CACHE_PATH"
-    )
 
 
 # --- Kernels that work for one scene or, in one launch, for many ----------------------------------------
@@ -211,21 +203,18 @@ class Launch:
     """Of the kernel's function, without its first. Arrays keep their place and numbers their value."""
     device: wp.Device
 
-    def load(self) -> None:
-        """Load the kernel, which compiles it the first time."""
-        _ = self._recorded
-
-    def launch(self, step: int = 0) -> None:
-        """Run it, whatever the number of the step."""
-        self._recorded.launch()
-
     @cached_property
-    def _recorded(self) -> wp.Launch:
+    def recorded(self) -> wp.Launch:
+        """The launch, with the kernel loaded, which compiles it the first time."""
         load_kernel(self.kernel.alone, self.device)
         return wp.launch(self.kernel.alone, self.count, self.arguments, device=self.device, record_cmd=True)
 
+    def launch(self, step: int = 0) -> None:
+        """Run it, whatever the number of the step."""
+        self.recorded.launch()
 
-class Together:
+
+class BatchedLaunch:
     """The same kernel over the items of several scenes.
 
     Args:
@@ -236,21 +225,16 @@ class Together:
     def __init__(self, launches: Sequence[Launch], steps: wp.array) -> None:
         self._launches = launches  # they hold the arrays that the table points to
         kernel, device, rows = launches[0].kernel, launches[0].device, []
-        row = kernel.row
         for launch in launches:
-            rows.append(row())
-            for name, value in zip(row.vars, launch.arguments, strict=True):
+            rows.append(kernel.row())
+            for name, value in zip(kernel.row.vars, launch.arguments, strict=True):
                 setattr(rows[-1], name, value)
         counts = [launch.count for launch in launches]
-        table = wp.array(rows, dtype=row, device=device), wp.array(counts, dtype=int, device=device)
+        inputs: list[Any] = [wp.array(rows, dtype=kernel.row, device=device)]
+        inputs += [wp.array(counts, dtype=int, device=device), steps, 0]
         load_kernel(kernel.together, device)
-        self._recorded = wp.launch(
-            kernel.together,
-            (len(launches), max(counts)),
-            [*table, steps, 0],
-            device=device,
-            record_cmd=True,
-        )
+        size = len(launches), max(counts)
+        self._recorded = wp.launch(kernel.together, size, inputs, device=device, record_cmd=True)
 
     def launch(self, step: int = 0) -> None:
         """Run it for the scenes that have more than `step` steps to do."""
@@ -276,13 +260,14 @@ class Program:
 
 
 @dataclass
-class Work:
-    """A program and the number of its steps; with none of them its kernels are loaded and nothing runs."""
+class Job:
+    """What a scene asks of the device: a program and the number of its steps. With none of them its kernels are loaded
+    and nothing runs."""
 
     program: Program
     steps: int
     shared_by: int = 1
-    """How many scenes had work done at the same time; known afterwards."""
+    """How many scenes had a job at the same time; known afterwards."""
 
 
 def captures(device: wp.Device) -> bool:
@@ -290,7 +275,7 @@ def captures(device: wp.Device) -> bool:
     return device.is_cuda
 
 
-class _Stack:
+class _Batch:
     """Programs of the same kernels as one; on a GPU the whole of it is one CUDA graph."""
 
     def __init__(self, programs: Sequence[Program], device: wp.Device) -> None:
@@ -301,17 +286,15 @@ class _Stack:
         self._step = self._serving([p.step for p in programs])
         self._end = self._serving([p.end for p in programs])
 
-    def _serving(self, parts: Sequence[Sequence[Launch]]) -> list[Launch | Together]:
+    def _serving(self, parts: Sequence[Sequence[Launch]]) -> list[Launch | BatchedLaunch]:
         """What runs in place of the programs' launches, in order."""
         if len(parts) == 1:
             for launch in parts[0]:
-                launch.load()
+                _ = launch.recorded
             return list(parts[0])
-        made: dict[tuple[Launch, ...], Together] = {}
-        for launches in zip(*parts, strict=True):
-            if launches not in made:
-                made[launches] = Together(launches, self._steps)
-        return [made[launches] for launches in zip(*parts, strict=True)]
+        groups = list(zip(*parts, strict=True))
+        batched = {group: BatchedLaunch(group, self._steps) for group in dict.fromkeys(groups)}
+        return [batched[group] for group in groups]
 
     def run(self, steps: Sequence[int]) -> None:
         """Do so many steps of each program."""
@@ -339,26 +322,22 @@ class _Stack:
             launch.launch()
 
 
-class Worker:
-    """Has a device do what scenes ask for.
-
-    Args:
-        device: on which their arrays lie.
-    """
+class Executor:
+    """Runs jobs on the device on which their arrays lie."""
 
     def __init__(self, device: wp.Device) -> None:
         self._device = device
-        self._stacks: dict[object, _Stack] = {}  # kernels → the programs that last asked for them
+        self._batches: dict[object, _Batch] = {}  # kernels → the programs that last asked for them
 
-    def do(self, works: Sequence[Work]) -> None:
-        """Do works that do not touch each other's arrays, those of the same kernels together."""
-        alike: dict[object, list[Work]] = {}
-        for work in works:
-            work.shared_by = len(works)
-            alike.setdefault(work.program.kernels, []).append(work)
+    def run(self, jobs: Sequence[Job]) -> None:
+        """Run jobs that do not touch each other's arrays, those of the same kernels together."""
+        alike: dict[object, list[Job]] = {}
+        for job in jobs:
+            job.shared_by = len(jobs)
+            alike.setdefault(job.program.kernels, []).append(job)
         for kernels, group in alike.items():
-            programs = [work.program for work in group]
-            stack = self._stacks.get(kernels)
-            if stack is None or stack.programs != programs:
-                stack = self._stacks[kernels] = _Stack(programs, self._device)
-            stack.run([work.steps for work in group])
+            programs = [job.program for job in group]
+            batch = self._batches.get(kernels)
+            if batch is None or batch.programs != programs:
+                batch = self._batches[kernels] = _Batch(programs, self._device)
+            batch.run([job.steps for job in group])

@@ -30,9 +30,7 @@ def substeps_per_frame(scene: Scene) -> int:
     Raises:
         SceneError: more than limits.py allows in a frame or in all.
     """
-    limit = scene.courant * scene.bed.spacing / (scene.material.wave_speed + top_body_speed(scene))
-    limit *= damped_share(scene)
-    limit = min(limit, longest_step(scene))
+    limit = min(_wave_step(scene), longest_step(scene))
     count = 1.0 / scene.frame_rate / limit - 1e-9 if limit > 0.0 else math.inf
     total = count * (scene.frame_count - 1)
     if not count <= MOST_SUBSTEPS:
@@ -48,20 +46,24 @@ def substeps_per_frame(scene: Scene) -> int:
     return max(1, math.ceil(count))
 
 
+def _wave_step(scene: Scene) -> float:
+    """Longest step [s] that elastic waves and the body's motion allow."""
+    step = scene.courant * scene.bed.spacing / (scene.material.wave_speed + top_body_speed(scene))
+    return step * damped_share(scene)
+
+
 def _way_out(scene: Scene) -> str:
     """What to change for fewer substeps: the key that asks for most of them beyond what the defaults would."""
-    mass, speed, waves = longest_step(scene), top_body_speed(scene), scene.material.wave_speed
-    if mass < damped_share(scene) * scene.courant * scene.bed.spacing / (waves + speed):
-        kilograms = scene.axle.mass
+    if scene.axle is not None and longest_step(scene) < _wave_step(scene):
         return (
-            f"the body's mass of {kilograms:.3g} kg is too small for contact this stiff: raise scene.load or lower "
-            "scene.gravity"
+            f"the body's mass of {scene.axle.mass:.3g} kg is too small for contact this stiff: raise scene.load or "
+            "lower scene.gravity"
         )
-    if speed > waves:
+    soil, usual, speed = scene.material, Material(), top_body_speed(scene)
+    if speed > soil.wave_speed:
         return (
             f"the body moves at up to {speed:.3g} m/s: make its path or scene.speed, scene.rim_speed slower"
         )
-    soil, usual = scene.material, Material()
     more = {  # key → by what it multiplies the number of steps
         "raise scene.bed.spacing": Bed.spacing / scene.bed.spacing,
         "raise scene.courant": Scene.courant / scene.courant,
@@ -87,11 +89,11 @@ def top_body_speed(scene: Scene, step: float | None = None) -> float:
         return 0.0
     times = scene.times()
     top = float(np.max(scene.largest_displacement(times), initial=0.0) * scene.frame_rate)
-    rows = scene.path_times()
-    if step is None or not len(rows):
+    corners = scene.path_times()
+    if step is None or not len(corners):
         return top
     # Where a path is fastest, such a time begins or ends at one of its rows.
-    begin = np.clip(np.concatenate([rows, rows - step]), 0.0, times[-1])
+    begin = np.clip(np.concatenate([corners, corners - step]), 0.0, times[-1])
     every = np.unique(np.concatenate([[0.0], begin, begin + step]))
     travelled = np.concatenate([[0.0], np.cumsum(scene.largest_displacement(every))])
     way = np.interp(begin + step, every, travelled) - np.interp(begin, every, travelled)
@@ -154,13 +156,7 @@ def scene_size(scene: Scene, precision: str = "float32") -> SceneSize:
 
 
 def require_memory(scene: Scene, precision: str, device: str, symmetry: bool) -> None:
-    """Refuse a scene that the device has no memory for.
-
-    Args:
-        scene: what will be computed.
-        precision: float32 or float64.
-        device: cpu, cuda, cuda:0, ...
-        symmetry: whether only half of it is computed.
+    """Refuse a scene that the device has no memory for; with `symmetry` only half of it is computed.
 
     Raises:
         SceneError: the scene is too large, or there is no such device.
@@ -194,41 +190,30 @@ STABLE_COURANT = 0.84
 leaves soil room to become stiffer."""
 
 
-def speed_bound(scene: Scene, time_step: float) -> float:
-    """Speed [m/s] that no soil of a scene can reach, computed in steps of `time_step` [s].
-
-    Four times the sum of what it has at the start, of the fastest point of the body and of a fall through the whole
-    grid (or, down an endless slope, of a fall for as long as the scene lasts), and half the speed of its waves for what
-    elastic strain can give back.
-    """
-    bed = scene.bed
-    start = float(np.linalg.norm(scene.initial_velocities(), axis=1).max(initial=0.0))
-    height = bed.size[2] + bed.headroom + abs(math.sin(math.radians(scene.tilt))) * bed.size[0]
-    fall = math.sqrt(2.0 * scene.gravity * height)
-    if bed.walls.conditions[0] == "periodic" and scene.tilt:
-        fall = max(fall, scene.gravity * scene.duration)
-    return 4.0 * (start + top_body_speed(scene, time_step) + fall) + 0.5 * scene.material.wave_speed
-
-
-class Guard:
-    """Knows what soil cannot do, and what is to blame when it does.
-
-    Args:
-        scene: what is computed.
-        time_step: substep [s].
-    """
+class PhysicalLimits:
+    """What soil of a scene cannot do, computed in steps of `time_step` [s], and what is to blame when it does."""
 
     def __init__(self, scene: Scene, time_step: float) -> None:
         self._time_step = time_step
-        self.speed_bound = speed_bound(scene, time_step)
         # Compressed soil is stiffer: its waves are faster by sqrt(1 - ln J).
         stable = damped_share(scene) * scene.bed.spacing / scene.material.wave_speed
         self._most_compression = min(LARGEST_STRAIN, (STABLE_COURANT * stable / time_step) ** 2 - 1.0)
+        bed = scene.bed
+        start = float(np.linalg.norm(scene.initial_velocities(), axis=1).max(initial=0.0))
+        height = bed.size[2] + bed.headroom + abs(math.sin(math.radians(scene.tilt))) * bed.size[0]
+        fall = math.sqrt(2.0 * scene.gravity * height)
+        if bed.walls.conditions[0] == "periodic" and scene.tilt:
+            fall = max(fall, scene.gravity * scene.duration)
+        cause = start + top_body_speed(scene, time_step) + fall
+        self.top_speed = 4.0 * cause + 0.5 * scene.material.wave_speed
+        """[m/s]. Four times the sum of what soil has at the start, of the fastest point of the body and of a fall
+        through the whole grid (or, down an endless slope, of a fall for as long as the scene lasts), and half the
+        speed of waves for what elastic strain can give back."""
 
     def too_fast(self, speed: float) -> str:
-        """The cause for soil faster than the bound."""
+        """The cause for soil of this speed [m/s], above the top one."""
         return (
-            f"it moves at {speed:.3g} m/s, which nothing here can cause ({self.speed_bound:.3g} m/s at most): lower "
+            f"it moves at {speed:.3g} m/s, which nothing here can cause ({self.top_speed:.3g} m/s at most): lower "
             "scene.courant"
         )
 
@@ -242,12 +227,8 @@ class Guard:
         )
 
     def too_strained(self, ln_j: np.ndarray, strain: np.ndarray) -> tuple[int, str] | None:
-        """The first particle whose elastic strain cannot be, and why; None if there is none.
-
-        Args:
-            ln_j: log of the volume (n,).
-            strain: deviatoric part (n, 6) [-].
-        """
+        """The first particle whose elastic strain cannot be, and why; None if there is none. `ln_j` (n,) is the log of
+        the volume, `strain` (n, 6) the deviatoric part."""
         lowest, largest = ln_j.min(), max(strain.max(), -strain.min())  # a NaN makes both comparisons false
         if lowest > -self._most_compression and largest < LARGEST_STRAIN:
             return None
@@ -268,15 +249,10 @@ class Guard:
         )
 
     def lost_fluidity(self, excess: np.ndarray) -> tuple[int, str] | None:
-        """The first particle to which cooperative flow gave a fluidity that is no number, and why; None if there is
-        none. Its stress does not show it: without a fluidity soil is elastic.
-
-        Args:
-            excess: what the grid gave the particles (n,) [1/s].
-        """
+        """The first particle to which cooperative flow gave an `excess` (n,) that is no number, and why; None if there
+        is none. Its stress does not show it: without a fluidity soil is elastic."""
         lost = ~np.isfinite(excess)
         if not lost.any():
             return None
-        return int(
-            np.argmax(lost)
-        ), "its fluidity is not finite: lower scene.courant or set effects.nonlocality=false"
+        cause = "its fluidity is not finite: lower scene.courant or set effects.nonlocality=false"
+        return int(np.argmax(lost)), cause

@@ -1,9 +1,9 @@
-"""A body whose height is free: it carries a load and rests on the soil.
+"""A body in the soil: its motion through a frame, and the impulse that the soil gives it.
 
-One thread on the device moves it once per substep with the impulse the soil gave it, so nothing waits for the host and
-the step can be part of a captured graph. Height and speed are kept in double precision whatever the solver's: in
-single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that sinks slower than one such step per
-substep would hang in the air.
+Where its height is free it carries a load and rests on the soil. One thread on the device then moves it once per
+substep, so nothing waits for the host and the step can be part of a captured graph. Height and speed are kept in double
+precision whatever the solver's: in single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that
+sinks slower than one such step per substep would hang in the air.
 """
 
 from __future__ import annotations
@@ -21,37 +21,23 @@ from .poses import rotation_vectors
 from .state import SolverStopped
 
 if TYPE_CHECKING:
+    from .effects import Effects
     from .scene import Scene
 
 
-# --- A body whose height is free: it carries a load and rests on the soil -------------------------------
-# One thread on the device moves it once per substep with the impulse the soil gave it, so nothing waits for the
-# host and the step can be part of a captured graph. Height and speed are kept in double precision whatever the
-# solver's: in single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that sinks slower
-# than one such step per substep would hang in the air.
+LONGEST_WAY = 0.5
+"""Of any point of a body in one substep [grid spacings]."""
 
 
 def stable_step(mass: float, contacts: float, stiffness: float, damping: float) -> float:
     """Longest substep [s] in which a free body on springs is stable, with a margin of two.
 
-    On N springs k with dampers c at rest in the soil, a step dt changes the body's velocity by the share
-    q = N (k dt^2 + c dt) / M of what it would take to stop it; symplectic Euler with a lagged damper is stable
-    for q below 2. The step returned has q = 1.
-
-    Args:
-        mass: M of the body [kg].
-        contacts: N, the most particles that can touch it at once.
-        stiffness: k [N/m].
-        damping: c [N s/m].
+    A body of mass M [kg] touches at most N particles, each on a spring k [N/m] with a damper c [N s/m]. A step dt
+    changes its velocity by the share q = N (k dt^2 + c dt) / M of what it would take to stop it; symplectic Euler with
+    a lagged damper is stable for q below 2. The step returned has q = 1.
     """
     a, b = contacts * stiffness / mass, contacts * damping / mass
     return 2.0 / (b + math.sqrt(b * b + 4.0 * a))
-
-
-# --- The scene's body on the device: its shape, its motion through a frame, and what the soil gave it ---
-
-LONGEST_WAY = 0.5
-"""Of any point of a body in one substep [grid spacings]."""
 
 
 def contact_spring(scene: Scene, volume: float) -> tuple[float, float]:
@@ -69,7 +55,7 @@ def longest_step(scene: Scene) -> float:
 
     Counted as if the whole lower half of the box around the body touched a particle per (particle spacing)^2.
     """
-    if scene.axle is None:
+    if scene.axle is None or scene.body is None:
         return math.inf
     volume = scene.bed.particle_volume
     hx, hy, hz = scene.body.half_size
@@ -82,59 +68,53 @@ class RigidBody:
 
     Args:
         scene: with a body.
+        effects: with `symmetry` half of the soil's impulse is computed; with `torque` its moment is added up.
         real: precision.
         device: where it lives.
         substeps: per frame.
-        dt: substep [s].
-        particles: how many there are.
-        volume: of a particle [m^3].
-        share: of the soil's impulse that is computed: 1/2 with mirror symmetry.
-        torque: whether the moment of that impulse is added up.
+        time_step: substep [s].
+        particles: how many are computed.
     """
 
     def __init__(
         self,
         scene: Scene,
+        effects: Effects,
         real: type,
         device: wp.Device,
         substeps: int,
-        dt: float,
+        time_step: float,
         particles: int,
-        volume: float,
-        share: float = 1.0,
-        torque: bool = True,
     ) -> None:
         vec3 = wp.types.vector(3, real)
-        self.scene, self.substeps, self.dt = scene, substeps, dt
-        shape, axle = scene.body, scene.axle
-        self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, torque)
-        data = body_struct(real, self.law)()
-        h = scene.bed.spacing
+        self.scene, self.substeps, self.time_step = scene, substeps, time_step
+        shape, axle, h = scene.body, scene.axle, scene.bed.spacing
+        assert shape is not None
+        self._shape = shape
+        self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, effects.torque)
+        self.data = data = body_struct(real, self.law)()
+        """The struct that kernels take."""
         data.margin = scene.contact_distance
         data.layer = HOLDING_LAYER * h if scene.bilateral else 0.0
         outermost = max(0.0, scene.contact_distance + float(data.layer))
         data.shape, self._mesh = shape_data(shape, real, outermost, device)
         data.reach = shape.reach + math.sqrt(3.0) * outermost + h
         data.friction = shape.friction
-        data.stiffness, data.damping = contact_spring(scene, volume)
+        data.stiffness, data.damping = contact_spring(scene, scene.filled[1])
         data.separation_speed = 0.01 * scene.material.wave_speed
-        data.position = wp.zeros(substeps, dtype=vec3, device=device)
-        data.rotation = wp.zeros(substeps, dtype=wp.types.quaternion(real), device=device)
-        data.velocity = wp.zeros(substeps, dtype=vec3, device=device)
-        data.spin = wp.zeros(substeps, dtype=vec3, device=device)
-        data.stick = wp.zeros(particles, dtype=vec3, device=device)
-        data.impulse = wp.zeros(1 + torque, dtype=vec3, device=device)
+        data.position, data.velocity, data.spin = (wp.zeros(substeps, vec3, device) for _ in range(3))
+        data.rotation = wp.zeros(substeps, wp.types.quaternion(real), device)
+        data.stick = wp.zeros(particles, vec3, device)
+        data.impulse = wp.zeros(1 + effects.torque, vec3, device)
         self.launches: list[Launch] = []
         """What has to run in every substep after the soil's push was added up."""
         self._axle: wp.array | None = None
         if axle is not None:
             height = scene.poses_at(np.zeros(1))[0, 2]
-            self._axle = wp.array([height, 0.0, 0.0], dtype=wp.float64, device=device)
-            data.axle = self._axle
-            values = [self._axle, data.impulse, dt, share * axle.mass, scene.gravity, axle.damping]
+            self._axle = data.axle = wp.array([height, 0.0, 0.0], dtype=wp.float64, device=device)
+            mass = axle.mass * (0.5 if effects.symmetry else 1.0)
+            values = [self._axle, data.impulse, time_step, mass, scene.gravity, axle.damping]
             self.launches.append(Launch(axle_step(real), 1, values, device))
-        self.data = data
-        """The struct that kernels take."""
 
     def start_frame(self, frame: int) -> None:
         """Load the prescribed motion of the frame that begins at `frame`, and forget the impulse.
@@ -145,18 +125,13 @@ class RigidBody:
         self.data.impulse.zero_()
         if self._axle is not None:
             self._axle[2:].zero_()
-        times = (frame * self.substeps + np.arange(self.substeps + 1)) * self.dt
+        times = (frame * self.substeps + np.arange(self.substeps + 1)) * self.time_step
         poses = self.scene.poses_at(times)
         self._require_steady(frame, times, poses[:, :3])
-        velocity = np.diff(poses[:, :3], axis=0) / self.dt
-        spin = rotation_vectors(poses[:-1, 3:], poses[1:, 3:]) / self.dt
-        for array, values in (
-            (self.data.position, poses[:-1, :3]),
-            (self.data.rotation, poses[:-1, 3:]),
-            (self.data.velocity, velocity),
-            (self.data.spin, spin),
-        ):
-            array.assign(values)
+        self.data.position.assign(poses[:-1, :3])
+        self.data.rotation.assign(poses[:-1, 3:])
+        self.data.velocity.assign(np.diff(poses[:, :3], axis=0) / self.time_step)
+        self.data.spin.assign(rotation_vectors(poses[:-1, 3:], poses[1:, 3:]) / self.time_step)
 
     def pose(self, time: float) -> np.ndarray:
         """Centre of mass [m] and quaternion now, at `time` [s], shape (7,)."""
@@ -165,6 +140,12 @@ class RigidBody:
             pose[2] = self._axle.numpy()[0]
         return pose
 
+    def impulse(self) -> np.ndarray:
+        """By the soil on the body since the frame began [N s], and its moment [N m s], shape (2, 3); a moment that is
+        not added up is 0."""
+        impulse = self.data.impulse.numpy().astype(float)
+        return np.pad(impulse, ((0, 2 - len(impulse)), (0, 0)))
+
     def lasting(self) -> dict[str, wp.array]:
         """What a frame leaves to the next one, by name."""
         arrays = {"contact_stretch": self.data.stick}
@@ -172,27 +153,23 @@ class RigidBody:
             arrays["axle"] = self._axle
         return arrays
 
-    def check(self, time: float, speed_bound: float) -> None:
-        """Stop where the soil's push or a free body's motion means nothing any more.
-
-        Args:
-            time: [s], for the message.
-            speed_bound: of a free body [m/s].
+    def check(self, time: float, top_speed: float) -> None:
+        """Stop at `time` [s] where the soil's push or a free body's motion means nothing any more.
 
         Raises:
-            SolverStopped: the force is not finite; the body reached the floor, or its motion cannot be.
+            SolverStopped: the force is not finite; the body reached the floor, or is faster than `top_speed` [m/s].
         """
         if not np.isfinite(self.data.impulse.numpy()).all():
             raise SolverStopped(f"the force on the body is not finite by {time:.3f} s: lower scene.courant")
         if self._axle is None:
             return
         height, rate, _ = self._axle.numpy()
-        if not abs(rate) <= speed_bound:
+        if not abs(rate) <= top_speed:
             raise SolverStopped(
                 f"the body moves up or down at {rate:.3g} m/s by {time:.3f} s, which nothing here can cause "
-                f"({speed_bound:.3g} m/s at most): lower scene.courant or raise scene.damping"
+                f"({top_speed:.3g} m/s at most): lower scene.courant or raise scene.damping"
             )
-        if not height - self.scene.body.half_size[2] > -self.scene.bed.size[2]:
+        if not height - self._shape.half_size[2] > -self.scene.bed.size[2]:
             raise SolverStopped(
                 f"the body reached the floor of the bin by {time:.3f} s: make scene.bed.size deeper or the load smaller"
             )
@@ -200,7 +177,7 @@ class RigidBody:
     def _require_steady(self, frame: int, times: np.ndarray, position: np.ndarray) -> None:
         """A body that is somewhere else in the next substep does not push soil: it appears in its midst."""
         way, angle = self.scene.displacement(times)
-        farthest, most = way + self.scene.body.reach * angle, LONGEST_WAY * self.scene.bed.spacing
+        farthest, most = way + self._shape.reach * angle, LONGEST_WAY * self.scene.bed.spacing
         far = ~(farthest <= most)
         if not far.any():
             return
@@ -208,15 +185,7 @@ class RigidBody:
         at = ", ".join(f"{c:.4f}" for c in position[substep])
         raise SolverStopped(
             f"the body jumps by {way[substep]:.3g} m from ({at}) m and turns by {math.degrees(angle[substep]):.3g} "
-            f"degrees within substep {substep} of frame {frame + 1}, {self.dt:.3g} s long, at {times[substep]:.5f} s: "
-            f"its farthest point moves {farthest[substep]:.3g} m, allowed: {most:.3g} m, half a grid spacing; make its "
-            "path smooth or slower there; the frames before it are good"
+            f"degrees within substep {substep} of frame {frame + 1}, {self.time_step:.3g} s long, at "
+            f"{times[substep]:.5f} s: its farthest point moves {farthest[substep]:.3g} m, allowed: {most:.3g} m, half "
+            "a grid spacing; make its path smooth or slower there; the frames before it are good"
         )
-
-    def impulse(self) -> np.ndarray:
-        """By the soil on the body since the frame began [N s], and its moment [N m s], shape (2, 3); a moment that is
-        not added up is 0."""
-        found = np.zeros((2, 3))
-        impulse = self.data.impulse.numpy()
-        found[: len(impulse)] = impulse
-        return found

@@ -1,11 +1,12 @@
-"""The explicit material point method, frame by frame."""
+"""The explicit material point method, frame by frame; one scene or many at once."""
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice, repeat
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,12 @@ from .discretisation import half, initial_stress, lay_grid, require_symmetry
 from .effects import Effects
 from .kernels.contact import ContactLaw, body_struct
 from .kernels.fluidity import soil_parameters
-from .kernels.ghost_nodes import Images, images
-from .kernels.grid import grid_step
-from .kernels.nonlocal_fluidity import NonlocalFluidity, wall_sink
+from .kernels.ghost_nodes import GhostNodes, ghost_kernels
+from .kernels.grid import grid_step, particle_struct
+from .kernels.nonlocal_fluidity import nonlocal_launches, wall_sink
 from .kernels.transfer import transfer
-from .launch import Launch, Program, SceneKernel, Work, Worker, find_device
-from .limits import Guard, require_memory, steps_to_remap, substeps_per_frame, top_body_speed
+from .launch import Executor, Job, Launch, Program, SceneKernel, find_device
+from .limits import PhysicalLimits, require_memory, steps_to_remap, substeps_per_frame, top_body_speed
 from .poses import rotate
 from .rigid_body import RigidBody
 from .scene import Scene
@@ -88,7 +89,7 @@ class Solver:
         self.substeps_per_frame = substeps_per_frame(scene)
         self.time_step = 1.0 / scene.frame_rate / self.substeps_per_frame
         """Substep [s]."""
-        self._guard = Guard(scene, self.time_step)
+        self._limits = PhysicalLimits(scene, self.time_step)
         self._start = copy.deepcopy(start)  # every beginning needs it as it is now
         self._beginnings = 0
         self._make_ready()
@@ -101,7 +102,7 @@ class Solver:
     @property
     def computed_count(self) -> int:
         """Particles that are computed: about half of them with mirror symmetry."""
-        return len(self._x)
+        return len(self.particles.position)
 
     def frames(self) -> Iterator[Frame]:
         """All frames in order, the initial state first, or those after the one that the solver starts from.
@@ -112,16 +113,16 @@ class Solver:
             SceneError: the frames were asked for again meanwhile.
             SolverStopped: in the first frame in which a particle or the body went wrong, with the state before it.
         """
-        worker = Worker(self.device)
+        executor = Executor(self.device)
         for stage in self.stages():
-            if isinstance(stage, Work):
-                worker.do([stage])
+            if isinstance(stage, Job):
+                executor.run([stage])
             else:
                 yield stage
 
-    def stages(self) -> Generator[Frame | Work, None, None]:
-        """As `frames`, with all work that the device has to do before the solver can go on: the caller has it done,
-        that of other scenes with it (batch.py)."""
+    def stages(self) -> Generator[Frame | Job, None, None]:
+        """As `frames`, with the jobs that the device has to do before the solver can go on: the caller runs them, with
+        those of other scenes (`run_concurrently`)."""
         if self._beginnings:
             self._make_ready()
         self._beginnings += 1
@@ -134,10 +135,10 @@ class Solver:
                     "or make a Solver for each"
                 )
 
-    def _computed(self) -> Iterator[Frame | Work]:
+    def _computed(self) -> Iterator[Frame | Job]:
         """What `stages` gives, from the solver's memory as it is."""
-        for program in (self._remap, self._until_remap):
-            yield Work(program, 0)
+        for program in (self._remap, self._steps):
+            yield Job(program, 0)
         first = 0 if self._start is None else self._start.frame + 1
         if self._start is not None:
             self._memory.keep(self._start.frame)
@@ -160,253 +161,151 @@ class Solver:
 
     def _make_ready(self) -> None:
         """Arrays as they are before the first frame, or at the state to start from."""
-        self._allocate()
-        if self._start is not None:
-            self._memory.load(self._start)
+        scene, effects, real, device = self.scene, self.effects, self._real, self.device
+        vec4 = wp.types.vector(4, real)
 
-    def _allocate(self) -> None:
-        scene, real, device = self.scene, self._real, self.device
-        vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+        def zeros(dtype: Any, count: int) -> wp.array:
+            return wp.zeros(count, dtype=dtype, device=device)
+
         positions, volume = scene.filled
         velocities, (ln_j, strain) = scene.initial_velocities(), initial_stress(scene)
         if self._half is not None:
             kept = self._half.kept
             positions, velocities, ln_j, strain = positions[kept], velocities[kept], ln_j[kept], strain[kept]
-        n = len(positions)
-        self._grid, ghosts = lay_grid(scene, real, self.time_step, volume, self._half is not None)
-        self._soil = soil_parameters(real, scene.material, max(scene.bed.size), self.effects.fluidity)
-        if self.effects.fluidity:
-            self._soil.g = wp.zeros(n, dtype=real, device=device)
-
-        self._x = wp.array(positions, dtype=vec3, device=device)
-        self._home = wp.zeros(n, dtype=vec3, device=device)
-        self._v = wp.array(velocities, dtype=vec3, device=device)
-        self._felt = wp.array(np.pad(velocities, ((0, 0), (0, 1))), dtype=vec4, device=device)
-        self._c = wp.zeros(n, dtype=wp.types.matrix((3, 3), real), device=device)
-        self._e = wp.array(strain, dtype=wp.types.vector(6, real), device=device)
-        self._ln_j = wp.array(ln_j, dtype=real, device=device)
+        self._grid, layers = lay_grid(scene, real, self.time_step, volume, self._half is not None)
+        self._grid.on_plane = self._half.on_plane if self._half is not None else 0
+        self._soil = soil_parameters(real, scene.material, max(scene.bed.size))
         shear, bulk = 2.0 * scene.material.shear_modulus, scene.material.bulk_modulus
-        stress = shear * strain + bulk * ln_j[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
-        self._swelling = wp.zeros(n, dtype=real, device=device)
-        self._stress = wp.array(stress, dtype=wp.types.vector(6, real), device=device)
-        nodes = self._grid.nx * self._grid.ny * self._grid.nz
-        self._momentum, self._velocity, self._before, self._impulse = (
-            wp.zeros(nodes + 1, dtype=vec4, device=device)
-            for _ in range(4)  # + 1: see kernels/node_rows.py
+        n, node_count = len(positions), self._grid.nx * self._grid.ny * self._grid.nz
+        padded = node_count + 1  # see kernels/node_rows.py
+        self.particles = _with_arrays(
+            particle_struct(real),
+            device,
+            position=positions,
+            home=n,
+            velocity=velocities,
+            felt_velocity=np.pad(velocities, ((0, 0), (0, 1))),
+            velocity_gradient=n,
+            elastic_strain=strain,
+            log_volume=ln_j,
+            stress=shear * strain + bulk * ln_j[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
+            swelling=n,
+            fluidity=n if effects.fluidity else 0,
+            excess=n if effects.nonlocality else 0,
         )
-        cooperative = self.effects.nonlocality
-        self._cooperation = wp.zeros(nodes + 1 if cooperative else 0, dtype=vec4, device=device)
-        self._excess = wp.zeros(n if cooperative else 0, dtype=real, device=device)
-        self._inverse_mass = wp.zeros(nodes, dtype=real, device=device)
-        self._substep = wp.zeros(1, dtype=int, device=device)
-        self._top_speed = wp.zeros(1, dtype=real, device=device)
-        self._keep = wp.zeros(1, dtype=real, device=device)
-        self._stray = wp.zeros(4, dtype=int, device=device)
-
+        """The arrays of the particles that are computed, see kernels/grid.py."""
+        self._momentum, self._velocity, self._before, self._impulse = (zeros(vec4, padded) for _ in range(4))
+        self._inverse_mass = zeros(real, node_count)
+        self._cooperative_field, self._cooperation = (
+            zeros(vec4, padded if effects.nonlocality else 0) for _ in range(2)
+        )
+        self._top_speed, self._keep = zeros(real, 1), zeros(real, 1)
+        self._grid.substep, self._fault = zeros(int, 1), zeros(int, 4)
+        periodic = (axis for axis, kind in enumerate(scene.bed.walls.conditions) if kind == "periodic")
+        self._turns = {axis: zeros(int, n) for axis in periodic}
         self._body: RigidBody | None = None
         if scene.body is not None:
-            share = 1.0 if self._half is None else 0.5
-            self._body = RigidBody(
-                scene,
-                real,
-                device,
-                self.substeps_per_frame,
-                self.time_step,
-                n,
-                volume,
-                share,
-                self.effects.torque,
-            )
-        self._record_launches(n, nodes, ghosts)
+            self._body = RigidBody(scene, effects, real, device, self.substeps_per_frame, self.time_step, n)
+        self._remap, self._steps = self._programs(layers)
         self._memory = Memory(self._lasting())
+        if self._start is not None:
+            self._memory.load(self._start)
 
     def _lasting(self) -> dict[str, wp.array]:
         """What a frame leaves to the next one; the grid is filled anew at every remap."""
-        arrays = {
-            "position": self._x,
-            "velocity": self._v,
-            "felt_velocity": self._felt,
-            "velocity_gradient": self._c,
-            "elastic_strain": self._e,
-            "log_volume": self._ln_j,
-            "stress": self._stress,
-            "swelling": self._swelling,
-        }
+        names = ["position", "velocity", "felt_velocity", "velocity_gradient", "elastic_strain", "log_volume"]
+        names += ["stress", "swelling", *(["fluidity"] if self.effects.fluidity else [])]
+        arrays = {name: getattr(self.particles, name) for name in names}
         arrays |= {f"turns_{'xyz'[axis]}": turns for axis, turns in self._turns.items()}
-        if self.effects.fluidity:
-            arrays["fluidity"] = self._soil.g
-        if self._nonlocal is not None:
-            arrays["cooperative_fluidity"] = self._nonlocal.field
-        if self._body is not None:
-            arrays |= self._body.lasting()
-        return arrays
+        if self.effects.nonlocality:
+            arrays["cooperative_fluidity"] = self._cooperative_field
+        return arrays | (self._body.lasting() if self._body is not None else {})
 
-    def _record(self, kernel: SceneKernel, count: int, *arguments: Any) -> Launch:
-        return Launch(kernel, count, arguments, self.device)
+    def _programs(self, layers: dict[int, np.ndarray]) -> tuple[Program, Program]:
+        """A remap, and the steps from there to the next one."""
+        real, scene, device, body, particles = self._real, self.scene, self.device, self._body, self.particles
+        momentum, velocity, before, impulse = self._momentum, self._velocity, self._before, self._impulse
+        kernels = transfer(real, self.effects, body.law if body else None, atomic=device.is_cuda)
+        node_kernels, wrap = grid_step(real, scene.bed.walls.conditions), ghost_kernels(real).wrap
+        ghost_nodes = GhostNodes(real, device, self._grid, layers, mirrored=self._half is not None)
+        body_data = body.data if body else body_struct(real, ContactLaw())()
 
-    def _record_launches(self, n: int, nodes: int, ghosts: dict[int, np.ndarray]) -> None:
-        """What runs at a remap and in every step, in order."""
-        real, grid, soil, body = self._real, self._grid, self._soil, self._body
-        kernels = transfer(real, self.effects, body.law if body else None, atomic=self.device.is_cuda)
-        node = grid_step(real, self.scene.bed.walls.conditions)
-        ghost = Images(real, self.device, grid, ghosts, mirrored=self._half is not None)
-        x, home, v, felt, c, e, ln_j = (
-            self._x, self._home, self._v, self._felt, self._c, self._e, self._ln_j
-        )  # fmt: skip
-        watch = (self._substep, self._stray)
+        def over_particles(kernel: SceneKernel, *arguments: Any) -> Launch:
+            return Launch(kernel, self.computed_count, [particles, self._grid, *arguments], device)
 
-        self._to_grid = self._record_wraps(n)
-        scatter = []
-        for part, its_grid, its_body in self._parts(n):
-            particles = [a[part] for a in (x, v, c, home)]
-            self._to_grid.append(
-                self._record(
-                    kernels.to_grid,
-                    len(particles[0]),
-                    *particles,
-                    its_grid,
-                    self._momentum,
-                    self._top_speed,
-                    *watch,
-                )
-            )
-            particles = [a[part] for a in (x, home, felt, self._stress, self._swelling)]
-            rest = (its_grid, its_body, self._impulse, self._substep)
-            scatter.append(self._record(kernels.scatter, len(particles[0]), *particles, *rest))
-        fields = (self._momentum, self._velocity, self._before, self._inverse_mass, self._impulse)
-        self._begin = [
-            *ghost.fold(self._momentum),
-            self._record(node.begin, nodes, grid, *fields),
-            *ghost.unfold(self._before),
+        def over_nodes(kernel: SceneKernel, *arguments: Any) -> Launch:
+            return Launch(kernel, len(self._inverse_mass), [self._grid, *arguments], device)
+
+        remap = [
+            Launch(wrap, len(turns), [particles.position, turns, axis, scene.bed.size[axis]], device)
+            for axis, turns in self._turns.items()
         ]
-        self._step = [
-            *scatter,
+        remap.append(over_particles(kernels.to_grid, momentum, self._top_speed, self._fault))
+        begin = [
+            *ghost_nodes.fold(momentum),
+            over_nodes(node_kernels.begin, momentum, velocity, before, self._inverse_mass, impulse),
+            *ghost_nodes.unfold(before),
+        ]
+        step = [
+            over_particles(kernels.scatter, body_data, impulse),
             *(body.launches if body else ()),
-            *ghost.fold(self._impulse),
-            self._record(
-                node.step, nodes, grid, self._velocity, self._inverse_mass, self._impulse, self._substep
-            ),
-            *self._record_nonlocal(ghosts),
-            *ghost.unfold(self._velocity),
-            self._record(
-                kernels.gather,
-                n,
-                x,
-                home,
-                felt,
-                c,
-                grid,
-                self._velocity,
-                self._cooperation,
-                self._excess,
-                *watch,
-            ),
-            self._record(
-                kernels.material, n, felt, c, e, ln_j, self._stress, self._swelling, self._excess, grid, soil
-            ),
+            *ghost_nodes.fold(impulse),
+            over_nodes(node_kernels.step, velocity, self._inverse_mass, impulse),
+            *(self._nonlocal_launches(layers) if self.effects.nonlocality else ()),
+            *ghost_nodes.unfold(velocity),
+            over_particles(kernels.gather, velocity, self._cooperation, self._fault),
+            over_particles(kernels.material, self._soil),
         ]
-        self._from_grid = self._record(
-            kernels.from_grid, n, x, home, felt, v, grid, self._before, self._keep, ln_j
-        )
-        self._remap = Program(self._to_grid)
-        self._until_remap = Program(self._begin, self._step, [self._from_grid])
+        return Program(remap), Program(begin, step, [over_particles(kernels.from_grid, before, self._keep)])
 
-    def _parts(self, n: int) -> Iterator[tuple[slice, Any, Any]]:
-        """Particles with the grid and the body that they see. Those on the plane of symmetry count half."""
-        grid = self._grid
-        body = self._body.data if self._body else body_struct(self._real, ContactLaw())()
-        on_plane = self._half.on_plane if self._half is not None else 0
-        if not on_plane:
-            yield slice(0, n), grid, body
-            return
-        for part, share in ((slice(0, on_plane), 0.5), (slice(on_plane, n), 1.0)):
-            if part.start == part.stop:  # all lie on it
-                continue
-            its_grid, its_body = type(grid)(), type(body)()
-            its_grid.assign(grid)
-            its_body.assign(body)
-            its_grid.particle_mass, its_grid.particle_volume = (
-                share * grid.particle_mass,
-                share * grid.particle_volume,
-            )
-            if self._body is not None:
-                its_body.stiffness, its_body.damping = share * body.stiffness, share * body.damping
-                its_body.stick = body.stick[part]
-            yield part, its_grid, its_body
-
-    def _record_nonlocal(self, ghosts: dict[int, np.ndarray]) -> list[Launch]:
-        self._nonlocal: NonlocalFluidity | None = None
-        if not self.effects.nonlocality:
-            return []
-        real, grid = self._real, self._grid
-        sink = np.zeros(grid.nx * grid.ny * grid.nz)
+    def _nonlocal_launches(self, layers: dict[int, np.ndarray]) -> list[Launch]:
+        grid, field, cooperation = self._grid, self._cooperative_field, self._cooperation
+        sink = np.zeros(len(self._inverse_mass))
         if self.scene.material.fluidity_at_walls == "zero":
             sink = wall_sink((grid.nx, grid.ny, grid.nz), grid.low, grid.high)
-        particles = [self._home, self._e, self._ln_j]
-        ghost = Images(real, self.device, grid, ghosts, mirrored=False)  # fluidity has no direction
-        on_plane = self._half.on_plane if self._half is not None else 0
-        self._nonlocal = NonlocalFluidity(
-            real,
-            self.effects,
-            self.device,
-            sink,
-            particles,
-            grid,
-            self._soil,
-            ghost,
-            self._cooperation,
-            on_plane,
-        )
-        return [*self._nonlocal.launches, *ghost.unfold(self._cooperation)]
-
-    def _record_wraps(self, n: int) -> list[Launch]:
-        """Bring particles that left a periodic bin back in."""
-        self._turns: dict[int, wp.array] = {}
-        launches = []
-        for axis, kind in enumerate(self.scene.bed.walls.conditions):
-            if kind == "periodic":
-                self._turns[axis] = turns = wp.zeros(n, dtype=int, device=self.device)
-                wrap = images(self._real).wrap
-                launches.append(self._record(wrap, n, self._x, turns, axis, self.scene.bed.size[axis]))
-        return launches
+        ghost_nodes = GhostNodes(self._real, self.device, grid, layers, mirrored=False)
+        given = (self.particles, grid, self._soil, field, cooperation, ghost_nodes)
+        launches = nonlocal_launches(self._real, self.effects, sink, *given)
+        return [*launches, *ghost_nodes.unfold(cooperation)]
 
     # --- stepping -----------------------------------------------------------------------------------------
 
-    def _advance(self, index: int) -> Iterator[Work]:
+    def _advance(self, index: int) -> Iterator[Job]:
         """From frame index - 1 to frame `index`."""
-        self._substep.zero_()
+        self._grid.substep.zero_()
         if self._body is not None:
             self._body.start_frame(index - 1)
         left = self.substeps_per_frame
         while left:
             self._top_speed.zero_()
-            yield Work(self._remap, 1)
+            yield Job(self._remap, 1)
             top = float(self._top_speed.numpy()[0])
-            if not top <= self._guard.speed_bound:
-                fastest = int(np.argmax(np.linalg.norm(self._v.numpy(), axis=1)))
-                raise self._stopped(index, self.substeps_per_frame - left, fastest, self._guard.too_fast(top))
-            speed = max(self._top_body_speed, top)
-            steps = min(left, steps_to_remap(self.scene, self.time_step, speed))
+            if not top <= self._limits.top_speed:
+                fastest = int(np.argmax(np.linalg.norm(self.particles.velocity.numpy(), axis=1)))
+                substep = self.substeps_per_frame - left
+                raise self._stopped(index, substep, fastest, self._limits.too_fast(top))
+            steps = min(left, steps_to_remap(self.scene, self.time_step, max(self._top_body_speed, top)))
             left -= steps
             self._keep.fill_(math.exp(-steps * self.time_step / self.scene.velocity_memory))
-            yield Work(self._until_remap, steps)
+            yield Job(self._steps, steps)
         self._check(index)
 
     def _check(self, index: int) -> None:
         """At the end of frame `index`."""
-        count, particle, substep, near = (int(i) for i in self._stray.numpy())
+        particles, limits = self.particles, self._limits
+        count, particle, substep, near = (int(i) for i in self._fault.numpy())
         if count:
-            raise self._stopped(index, substep, particle, self._guard.strayed(bool(near)))
-        found = self._guard.too_strained(self._ln_j.numpy(), self._e.numpy())
-        found = found or self._guard.lost_fluidity(self._excess.numpy())
+            raise self._stopped(index, substep, particle, limits.strayed(bool(near)))
+        found = limits.too_strained(particles.log_volume.numpy(), particles.elastic_strain.numpy())
+        found = found or limits.lost_fluidity(particles.excess.numpy())
         if found is not None:
             raise self._stopped(index, self.substeps_per_frame, *found)
         if self._body is not None:
-            self._body.check(index / self.scene.frame_rate, self._guard.speed_bound)
+            self._body.check(index / self.scene.frame_rate, limits.top_speed)
 
     def _stopped(self, index: int, substep: int, particle: int, cause: str) -> SolverStopped:
         time = (index - 1) / self.scene.frame_rate + substep * self.time_step
-        at = ", ".join(f"{c:.4f}" for c in self._x.numpy()[particle])
+        at = ", ".join(f"{c:.4f}" for c in self.particles.position.numpy()[particle])
         if self._half is not None:
             particle = int(self._half.kept[particle])
         return SolverStopped(
@@ -421,7 +320,7 @@ class Solver:
         impulse = np.zeros((2, 3))
         if self._body is not None:
             pose, impulse = self._body.pose(time), self._body.impulse() * (scene.frame_rate if index else 0.0)
-        position, velocity = self._x.numpy(), self._felt.numpy()[:, :3]
+        position, velocity = self.particles.position.numpy(), self.particles.felt_velocity.numpy()[:, :3]
         for axis, turns in self._turns.items():
             position = position.copy()  # on the CPU it is the solver's own memory
             position[:, axis] += turns.numpy() * scene.bed.size[axis]
@@ -439,3 +338,89 @@ class Solver:
             force=impulse[0],
             torque=impulse[1],
         )
+
+
+# --- Many scenes at once ------------------------------------------------------------------------------------
+
+
+def frames_together(
+    scenes: Iterable[Scene],
+    effects: Effects | Iterable[Effects] | None = None,
+    device: str = "cpu",
+    precision: str = "float32",
+    at_once: int = 32,
+) -> Iterator[tuple[int, Frame | SceneError | SolverStopped]]:
+    """Computes scenes side by side, each as a `Solver` of its own would.
+
+        for number, frame in frames_together(scenes, device="cuda"):
+            if not isinstance(frame, Frame):
+                print(f"scene {number} ended: {frame}")
+
+    It pays on a GPU, which a scene of some ten thousand particles does not fill. Scenes may differ in anything; none
+    depends on which others are computed with it. Those of the same effects, walls, contact and precision
+    share every launch.
+
+    Args:
+        scenes: what to compute.
+        effects: which physics, for all of them or one for each.
+        device: `cpu` or `cuda`, `cuda:0`, ...
+        precision: `float32` or `float64`.
+        at_once: scenes that are under way at the same time; the next begins when one ends.
+
+    Yields:
+        The number of a scene and its next frame. Frames of one scene come in order, those of different scenes mixed.
+        In place of a frame that cannot be computed the error comes, as that scene's last; the others go on.
+    """
+
+    def frames(scene: Scene, effects: Effects | None) -> Generator[Frame | Exception | Job, None, None]:
+        try:
+            yield from Solver(scene, effects, device, precision).stages()
+        except (SceneError, SolverStopped) as error:
+            yield error
+
+    each = repeat(effects) if effects is None or isinstance(effects, Effects) else effects
+    return run_concurrently(map(frames, scenes, each), at_once, device)
+
+
+def run_concurrently(
+    tasks: Iterable[Generator[Any, None, None]], at_once: int, device: str
+) -> Iterator[tuple[int, Any]]:
+    """Advances `at_once` generators side by side, the next one as soon as one has ended.
+
+    Args:
+        tasks: what to advance; each is taken when its turn comes.
+        at_once: how many are under way.
+        device: where they compute.
+
+    Yields:
+        A task's number and what it yielded, unless that was a job. Jobs are run when all tasks have asked for one.
+    """
+    executor = Executor(find_device(device))
+    waiting = enumerate(tasks)
+    running = list(islice(waiting, at_once))
+    try:
+        while running:
+            jobs: list[Job] = []
+            while len(jobs) < len(running):
+                place = len(jobs)
+                number, task = running[place]
+                item = next(task, None)
+                if isinstance(item, Job):
+                    jobs.append(item)
+                elif item is not None:
+                    yield number, item
+                else:
+                    running[place : place + 1] = islice(waiting, 1)
+            executor.run(jobs)
+    finally:
+        for _, task in running:
+            task.close()
+
+
+def _with_arrays(struct: Any, device: wp.Device, **given: int | np.ndarray) -> Any:
+    """A struct whose arrays hold what is given, or so many zeros."""
+    filled = struct()
+    for name, values in given.items():
+        make: Any = wp.zeros if isinstance(values, int) else wp.array
+        setattr(filled, name, make(values, dtype=struct.vars[name].type.dtype, device=device))
+    return filled

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
-# --- What can go wrong, said to the user in one line ----------------------------------------------------
-
 
 class SceneError(ValueError):
     """A scene that cannot be simulated: what, where, what is allowed."""
@@ -21,9 +19,6 @@ class SolverStopped(RuntimeError):
     state: State | None = None
     """At the last good frame; `Solver(..., start=state)` goes on from there, with a smaller step if its scene has
     one."""
-
-
-# --- All that a solver needs to go on from a recorded frame ---------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +33,7 @@ class State:
 
 
 class Memory:
-    """The arrays that last from frame to frame, and what was in them at the last good frame.
-
-    Args:
-        arrays: by name; none may change its place or size.
-    """
+    """The arrays that last from frame to frame, by name, and what was in them at the last good frame."""
 
     def __init__(self, arrays: Mapping[str, wp.array]) -> None:
         self._arrays = dict(arrays)
@@ -62,11 +53,7 @@ class Memory:
         return State(self._frame, {name: array.numpy().copy() for name, array in self._good.items()})
 
     def load(self, state: State) -> None:
-        """Bring back what `state` holds.
-
-        Raises:
-            SceneError: it is of a scene or of effects with other arrays.
-        """
+        """Bring back what `state` holds; SceneError if it is of a scene or of effects with other arrays."""
         if set(state.arrays) != set(self._arrays):
             odd = sorted(set(state.arrays) ^ set(self._arrays))[0]
             raise SceneError(f"the state to start from does not fit: {odd!r} is on one side only")

@@ -48,7 +48,7 @@ def final_speed(law: str, tilt: float, grains: float, cells_per_grain: float) ->
     scene = Incline(bed=bed, material=soil, tilt=tilt, flowing=False, duration=duration, frame_rate=100.0)
     solver = Solver(scene, EFFECTS)
     depth = -scene.initial_positions()[:, 2]
-    solver._v.assign(np.column_stack([3.0 * (height - depth), 0.0 * depth, 0.0 * depth]))
+    solver.particles.velocity.assign(np.column_stack([3.0 * (height - depth), 0.0 * depth, 0.0 * depth]))
     *_, last = solver.frames()
     return float(last.velocity[depth < spacing, 0].mean())
 

@@ -45,10 +45,10 @@ def error_after_a_period(kind: str, cells: int, particles_per_cell: float, coura
     solver = Solver(scene, ELASTIC, precision="float64")
     start = np.zeros((solver.particle_count, 3))
     start[:, axis] = 1e-4 * speed * np.sin(2.0 * math.pi * scene.initial_positions()[:, 0] / LENGTH)
-    solver._v.assign(start)
+    solver.particles.velocity.assign(start)
     for _ in solver.frames():
         pass
-    return float(np.linalg.norm(solver._v.numpy() - start) / np.linalg.norm(start))
+    return float(np.linalg.norm(solver.particles.velocity.numpy() - start) / np.linalg.norm(start))
 
 
 def measure() -> list[dict]:

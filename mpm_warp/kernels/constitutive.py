@@ -37,17 +37,17 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
     - `strain_trial(e, A)` -> deviatoric trial strain (6),
     - `volume_step(A)` -> ln det(I + A),
     - `yield_stress(tau_trial, p, dt, soil)` -> equivalent shear stress after the plastic return,
-    - `update(e, ln_j, A, dt, soil, g)` -> new e (6) and new ln J as a 7-vector. `g` is a number of the effects that
-      have one, otherwise unused: with `nonlocality` alone the excess of the fluidity over its local value; with
-      `fluidity` the particle's fluidity [1/s], whose new value is then the eighth number of the answer,
+    - `update(e, ln_j, A, dt, soil, g)` -> new e (6), ln J and g as an 8-vector. `g` means something with two effects:
+      with `nonlocality` alone the excess of the fluidity over its local value, which stays; with `fluidity` the
+      particle's fluidity [1/s],
     - `kirchhoff(e, ln_j, soil)` -> Kirchhoff stress (3 x 3) [Pa].
     """
     vec3 = wp.types.vector(3, real)
     vec6 = wp.types.vector(6, real)
     mat33 = wp.types.matrix((3, 3), real)
-    Soil = soil_struct(real, effects.fluidity)
-    State = wp.types.vector(8 if effects.fluidity else 7, real)
-    fluid = fluidity(real, effects)
+    Soil = soil_struct(real)
+    State = wp.types.vector(8, real)
+    fluid = fluidity(real)
     coefficients, fluidity_step = fluid.coefficients, fluid.fluidity_step
     friction_with_excess = fluid.friction_with_excess
     second_order_limit = wp.constant(SECOND_ORDER_LIMIT**2)
@@ -116,37 +116,35 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
         return real(2.0) * e + real(2.0) * e2 + real(4.0) / real(3.0) * e3
 
     @wp.func
+    def symmetric(a: mat33):
+        half = real(0.5)
+        return vec6(
+            a[0, 0], a[1, 1], a[2, 2],
+            half * (a[0, 1] + a[1, 0]), half * (a[0, 2] + a[2, 0]), half * (a[1, 2] + a[2, 1]),
+        )  # fmt: skip
+
+    @wp.func
     def second_order(e: vec6, a: mat33):
-        d0 = a[0, 0]
-        d1 = a[1, 1]
-        d2 = a[2, 2]
-        d3 = real(0.5) * (a[0, 1] + a[1, 0])
-        d4 = real(0.5) * (a[0, 2] + a[2, 0])
-        d5 = real(0.5) * (a[1, 2] + a[2, 1])
-        w3 = a[0, 1] - d3
-        w4 = a[0, 2] - d4
-        w5 = a[1, 2] - d5
+        d = symmetric(a)
+        w3 = a[0, 1] - d[3]
+        w4 = a[0, 2] - d[4]
+        w5 = a[1, 2] - d[5]
         # Sum of d and twice the spin term's sources: (w e + (w e)^T) for e, half of it for d.
-        f0 = e[0] + real(0.5) * d0
-        f1 = e[1] + real(0.5) * d1
-        f2 = e[2] + real(0.5) * d2
-        f3 = e[3] + real(0.5) * d3
-        f4 = e[4] + real(0.5) * d4
-        f5 = e[5] + real(0.5) * d5
+        f = e + real(0.5) * d
         # A A^T / 2 - d^2 = (w d - d w - d^2 - w^2) / 2
         return vec6(
-            e[0] + d0 + real(2.0) * (w3 * f3 + w4 * f4)
-            - real(0.5) * (d0 * d0 + d3 * d3 + d4 * d4 - w3 * w3 - w4 * w4),
-            e[1] + d1 + real(2.0) * (w5 * f5 - w3 * f3)
-            - real(0.5) * (d1 * d1 + d3 * d3 + d5 * d5 - w3 * w3 - w5 * w5),
-            e[2] + d2 - real(2.0) * (w4 * f4 + w5 * f5)
-            - real(0.5) * (d2 * d2 + d4 * d4 + d5 * d5 - w4 * w4 - w5 * w5),
-            e[3] + d3 + w3 * (f1 - f0) + w4 * f5 + w5 * f4
-            - real(0.5) * (d0 * d3 + d3 * d1 + d4 * d5 - w4 * w5),
-            e[4] + d4 + w4 * (f2 - f0) + w3 * f5 - w5 * f3
-            - real(0.5) * (d0 * d4 + d3 * d5 + d4 * d2 + w3 * w5),
-            e[5] + d5 + w5 * (f2 - f1) - w3 * f4 - w4 * f3
-            - real(0.5) * (d3 * d4 + d1 * d5 + d5 * d2 - w3 * w4),
+            e[0] + d[0] + real(2.0) * (w3 * f[3] + w4 * f[4])
+            - real(0.5) * (d[0] * d[0] + d[3] * d[3] + d[4] * d[4] - w3 * w3 - w4 * w4),
+            e[1] + d[1] + real(2.0) * (w5 * f[5] - w3 * f[3])
+            - real(0.5) * (d[1] * d[1] + d[3] * d[3] + d[5] * d[5] - w3 * w3 - w5 * w5),
+            e[2] + d[2] - real(2.0) * (w4 * f[4] + w5 * f[5])
+            - real(0.5) * (d[2] * d[2] + d[4] * d[4] + d[5] * d[5] - w4 * w4 - w5 * w5),
+            e[3] + d[3] + w3 * (f[1] - f[0]) + w4 * f[5] + w5 * f[4]
+            - real(0.5) * (d[0] * d[3] + d[3] * d[1] + d[4] * d[5] - w4 * w5),
+            e[4] + d[4] + w4 * (f[2] - f[0]) + w3 * f[5] - w5 * f[3]
+            - real(0.5) * (d[0] * d[4] + d[3] * d[5] + d[4] * d[2] + w3 * w5),
+            e[5] + d[5] + w5 * (f[2] - f[1]) - w3 * f[4] - w4 * f[3]
+            - real(0.5) * (d[3] * d[4] + d[1] * d[5] + d[5] * d[2] - w3 * w4),
         )  # fmt: skip
 
     @wp.func
@@ -200,31 +198,23 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
 
     @wp.func
     def state_of(e: vec6, ln_j: real, g: real):
-        if wp.static(effects.fluidity):
-            return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j, g)
-        else:
-            return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j)
+        return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j, g)
 
     @wp.func
     def separated_fluidity(a: mat33, dt: real, soil: Soil):
         # Soil that comes back into contact flows as it did apart.
-        d = vec6(
-            a[0, 0], a[1, 1], a[2, 2],
-            real(0.5) * (a[0, 1] + a[1, 0]), real(0.5) * (a[0, 2] + a[2, 0]), real(0.5) * (a[1, 2] + a[2, 1]),
-        )  # fmt: skip
-        return wp.sqrt(real(2.0) * norm_squared(deviator(d))) / (dt * soil.static_friction)
+        return wp.sqrt(real(2.0) * norm_squared(deviator(symmetric(a)))) / (dt * soil.static_friction)
 
     @wp.func
     def update(e: vec6, ln_j: real, a: mat33, dt: real, soil: Soil, g: real):
         new_ln_j = ln_j + volume_step(a)
+        new_g = g
         if wp.static(effects.separation):
             if new_ln_j >= real(0.0):
                 if wp.static(effects.fluidity):
-                    return state_of(vec6(), new_ln_j, separated_fluidity(a, dt, soil))
-                else:
-                    return state_of(vec6(), new_ln_j, g)
+                    new_g = separated_fluidity(a, dt, soil)
+                return state_of(vec6(), new_ln_j, new_g)
         t = strain_trial(e, a)
-        new_g = g
         if wp.static(effects.yielding):
             p = -soil.bulk_modulus * new_ln_j
             if p <= real(0.0):

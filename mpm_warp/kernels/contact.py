@@ -1,34 +1,30 @@
-"""Contact between soil and a rigid body, and the motion of a body whose height is free."""
+"""Contact between soil and a rigid body, and the motion of a body whose height is free.
+
+A particle within the body is pushed out by a stiff damped spring along the body's normal. A second spring holds it back
+along the surface; it is stretched by the sliding since contact began, no further than Coulomb friction allows (Cundall
+& Strack 1979). Friction without such a memory could take no more from a particle than the momentum of its own sliding,
+far too little where soil slides at millimetres per second under a load. The body receives the opposite of both.
+Particles move with the soil, so the force changes smoothly as the body advances, while contact enforced at grid nodes
+comes and goes with every cell the body crosses.
+
+The grid spreads a push over the width of its B-splines, whose support reaches one and a half grid spacings, so a body
+acts further out than it is. Contact therefore begins at a margin of -1/4 grid spacings: when the soil's edge, half a
+particle spacing from a particle's centre, is that far inside. Wheels, which press on soil and hardly cut it, have none.
+
+Bilateral contact holds the soil as well: within a layer half a grid spacing thick outside the place where the spring
+begins, the damper takes away the particle's normal velocity relative to the body, towards it or away from it.
+"""
 
 from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 
 import warp as wp
 
 from ..launch import SceneKernel, scene_kernel
 from .signed_distance import shape_struct, signed_distance
 
-# --- Contact between soil particles and a rigid body ----------------------------------------------------
-# A particle within the body is pushed out by a stiff damped spring along the body's normal. A second spring
-# holds it back along the surface; it is stretched by the sliding since contact began, no further than Coulomb
-# friction allows (Cundall & Strack 1979). Friction without such a memory could take no more from a particle
-# than the momentum of its own sliding, far too little where soil slides at millimetres per second under a load.
-# The body receives the opposite of both. Particles move with the soil, so the force changes smoothly as the
-# body advances, while contact enforced at grid nodes comes and goes with every cell the body crosses.
-#
-# The grid spreads a push over the width of its B-splines, whose support reaches one and a half grid spacings,
-# so a body acts further out than it is. Contact therefore begins at a margin of -1/4 grid spacings: when the
-# soil's edge, half a particle spacing from a particle's centre, is that far inside. Wheels, which press on soil
-# and hardly cut it, have none.
-#
-# Bilateral contact holds the soil as well: within a layer half a grid spacing thick outside the place where the
-# spring begins, the damper takes away the particle's normal velocity relative to the body, towards it or away
-# from it.
-
 HOLDING_LAYER = 0.5
-"""Thickness of the layer of soil that bilateral contact holds, outside the place where the spring begins [grid
-spacings]."""
+"""Thickness of the layer of soil that bilateral contact holds [grid spacings]."""
 
 
 @dataclass(frozen=True)
@@ -65,20 +61,17 @@ def body_struct(real: type, law: ContactLaw) -> type:
         rotation: wp.array(dtype=quat)
         velocity: wp.array(dtype=vec3)  # pose difference over the substep [m/s]
         spin: wp.array(dtype=vec3)  # angular velocity, world frame [rad/s]
-        axle: wp.array(
-            dtype=wp.float64
-        )  # of a free body: height [m] and its rate [m/s] in place of the above
+        axle: wp.array(dtype=wp.float64)  # of a free body: height [m], its rate [m/s] in place of the above
         stick: wp.array(dtype=vec3)  # stretch of each particle's tangential spring, world frame [m]
-        impulse: wp.array(
-            dtype=vec3
-        )  # [0] by the soil on the body [N s], [1] its moment about the centre of mass, if that is asked for
+        impulse: wp.array(dtype=vec3)  # by the soil on the body [N s]; with `torque` also its moment [N m s]
 
     return Body
 
 
 @cache
-def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
-    """Warp function `push(p, x, v, mass, dt, s, body)` in precision `real`: impulse on particle p in substep s [N s].
+def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
+    """Warp function `push(p, x, v, mass, part, dt, s, body)` in precision `real`: impulse on particle p, of which
+    `part` is computed, in substep s [N s].
 
     The opposite impulse is added to the body; `atomic` is needed where many threads do so at once (a GPU).
     """
@@ -88,18 +81,14 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
     bilateral, free, torque = law.bilateral, law.free, law.torque
 
     @wp.func
-    def add(body: Body, impulse: vec3, arm: vec3):
+    def take(total: wp.array(dtype=vec3), i: int, amount: vec3):
         if wp.static(atomic):
-            wp.atomic_sub(body.impulse, 0, impulse)
-            if wp.static(torque):
-                wp.atomic_sub(body.impulse, 1, wp.cross(arm, impulse))
+            wp.atomic_sub(total, i, amount)
         else:
-            body.impulse[0] = body.impulse[0] - impulse
-            if wp.static(torque):
-                body.impulse[1] = body.impulse[1] - wp.cross(arm, impulse)
+            total[i] = total[i] - amount
 
     @wp.func
-    def push(p: int, x: vec3, v: vec3, mass: real, dt: real, s: int, body: Body):
+    def push(p: int, x: vec3, v: vec3, mass: real, part: real, dt: real, s: int, body: Body):
         centre = body.position[s]
         if wp.static(free):
             centre = vec3(centre[0], centre[1], real(body.axle[0]))
@@ -117,48 +106,44 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> SimpleNamespace:
                     velocity = vec3(velocity[0], velocity[1], real(body.axle[1]))
                 relative = v - velocity - wp.cross(body.spin[s], arm)
                 leaving = wp.dot(relative, normal)
-                hold = wp.min(dt * body.damping, mass)  # dampers may stop the particle, not turn it back
+                stiffness = part * body.stiffness
+                damping = part * body.damping
+                hold = wp.min(dt * damping, mass)  # dampers may stop the particle, not turn it back
                 pressed = real(0.0)
                 if wp.static(bilateral):
-                    pressed = dt * body.stiffness * wp.max(overlap, real(0.0)) - hold * leaving
+                    pressed = dt * stiffness * wp.max(overlap, real(0.0)) - hold * leaving
                 elif leaving < body.separation_speed:
-                    pressed = wp.max(dt * (body.stiffness * overlap - body.damping * leaving), real(0.0))
+                    pressed = wp.max(dt * (stiffness * overlap - damping * leaving), real(0.0))
                 if pressed != real(0.0):
                     sliding = relative - leaving * normal
                     stretch = body.stick[p]
                     stretch += dt * sliding - wp.dot(stretch, normal) * normal
-                    grip = dt * body.stiffness * stretch + hold * sliding
+                    grip = dt * stiffness * stretch + hold * sliding
                     size = wp.length(grip)
                     most = body.friction * wp.abs(pressed)
                     if size > most:
                         grip = grip * (most / size)
-                        stretch = grip / (dt * body.stiffness)
+                        stretch = grip / (dt * stiffness)
                     impulse = pressed * normal - grip
-                    add(body, impulse, arm)
+                    take(body.impulse, 0, impulse)
+                    if wp.static(torque):
+                        take(body.impulse, 1, wp.cross(arm, impulse))
             body.stick[p] = stretch
         return impulse
 
-    return SimpleNamespace(push=push)
-
-
-# --- A body whose height is free: it carries a load and rests on the soil -------------------------------
-# One thread on the device moves it once per substep with the impulse the soil gave it, so nothing waits for the
-# host and the step can be part of a captured graph. Height and speed are kept in double precision whatever the
-# solver's: in single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that sinks slower
-# than one such step per substep would hang in the air.
+    return push
 
 
 @cache
 def axle_step(real: type) -> SceneKernel:
-    """Kernel of one thread: symplectic Euler with the damping taken implicitly."""
+    """Kernel of one thread, which moves a body of free height (rigid_body.py): symplectic Euler with the damping taken
+    implicitly."""
     vec3 = wp.types.vector(3, real)
 
     @scene_kernel()
     def step(
         _: int,
-        axle: wp.array(
-            dtype=wp.float64
-        ),  # height [m], its rate [m/s], vertical impulse of this frame so far [N s]
+        axle: wp.array(dtype=wp.float64),  # height [m], its rate [m/s], vertical impulse of this frame [N s]
         impulse: wp.array(dtype=vec3),
         dt: wp.float64,
         mass: wp.float64,

@@ -7,16 +7,12 @@ from typing import Any
 
 import warp as wp
 
-from ..effects import Effects
 from ..material import Material
-
-# --- The soil's constants as a Warp struct --------------------------------------------------------------
 
 
 @cache
-def soil_struct(real: type, with_fluidity: bool) -> type:
-    """Struct of the soil constants in precision `real` (pressures in Pa, lengths in m), and with the effect
-    `fluidity` the particles' fluidity."""
+def soil_struct(real: type) -> type:
+    """Struct of the soil constants in precision `real` (pressures in Pa, lengths in m)."""
 
     @wp.struct
     class Soil:
@@ -30,18 +26,16 @@ def soil_struct(real: type, with_fluidity: bool) -> type:
         fluidity_time: real  # t_0 [s]
         cooperative_length: real  # A d [m]
         least_slowing: real  # (A d / xi)^2 at the largest xi, the size of the bed
-        if with_fluidity:
-            g: wp.array(dtype=real)  # fluidity of each particle [1/s]
 
     return Soil
 
 
-def soil_parameters(real: type, material: Material, bed_size: float, with_fluidity: bool) -> Any:
-    """The struct filled with the constants of `material`, without its arrays.
+def soil_parameters(real: type, material: Material, bed_size: float) -> Any:
+    """The struct filled with the constants of `material`.
 
     `bed_size` [m] bounds the cooperativity length, which has no bound at mu = mu_s.
     """
-    soil = soil_struct(real, with_fluidity)()
+    soil = soil_struct(real)()
     soil.shear_modulus, soil.bulk_modulus = material.shear_modulus, material.bulk_modulus
     soil.static_friction, soil.limit_friction = material.static_friction, material.limit_friction
     soil.reference_rate = material.reference_inertial_number / (
@@ -86,7 +80,7 @@ MAX_ITERATIONS = 60
 
 
 @cache
-def fluidity(real: type, effects: Effects) -> SimpleNamespace:
+def fluidity(real: type) -> SimpleNamespace:
     """Warp functions in precision `real`:
 
     - `coefficients(p, dt, soil)` -> a and c,
@@ -98,23 +92,19 @@ def fluidity(real: type, effects: Effects) -> SimpleNamespace:
       flow: that of the shortest wave along an axis of the grid.
     """
     vec2 = wp.types.vector(2, real)
-    Soil = soil_struct(real, effects.fluidity)
-    seed = wp.constant(SEED_INERTIAL_NUMBER)
-    least_fluidity = wp.constant(LEAST_FLUIDITY)
-    least_pressure = wp.constant(LEAST_PRESSURE)
-    least_gap = wp.constant(LEAST_GAP)
+    Soil = soil_struct(real)
     negligible = wp.constant(1e-8 if real is wp.float32 else 1e-16)
     tolerance = wp.constant(1e-6 if real is wp.float32 else 1e-13)
 
     @wp.func
     def coefficients(p: real, dt: real, soil: Soil):
-        pressure = wp.max(p, real(least_pressure) * soil.shear_modulus)
+        pressure = wp.max(p, real(LEAST_PRESSURE) * soil.shear_modulus)
         return vec2(soil.shear_modulus * dt / pressure, soil.reference_rate * wp.sqrt(pressure))
 
     @wp.func
     def steepening(mu: real, soil: Soil):
         # m in the saturating law.
-        gap = wp.max(soil.limit_friction - mu, real(least_gap) * soil.limit_friction)
+        gap = wp.max(soil.limit_friction - mu, real(LEAST_GAP) * soil.limit_friction)
         return (soil.limit_friction - soil.static_friction) / gap
 
     @wp.func
@@ -165,12 +155,12 @@ def fluidity(real: type, effects: Effects) -> SimpleNamespace:
             fading = mu_trial - mu_s
             if soil.linear_rate_law == 0:
                 fading = steepening(mu_trial, soil) * fading
-            return vec2(mu_trial, wp.max(g * wp.exp(steps * fading), real(least_fluidity)))
-        start = wp.max(g, real(least_fluidity))
+            return vec2(mu_trial, wp.max(g * wp.exp(steps * fading), real(LEAST_FLUIDITY)))
+        start = wp.max(g, real(LEAST_FLUIDITY))
         low = real(-1.0e4)
         high = low
         if mu_trial > mu_s:
-            start = wp.max(start, real(seed) * c / soil.reference_inertial_number)
+            start = wp.max(start, real(SEED_INERTIAL_NUMBER) * c / soil.reference_inertial_number)
             high = wp.log((mu_trial / mu_s - real(1.0)) / a)  # there mu = mu_s
             if soil.linear_rate_law == 0 and mu_trial > mu_2:
                 low = wp.log((mu_trial / mu_2 - real(1.0)) / a)  # there mu = mu_2
@@ -207,7 +197,7 @@ def fluidity(real: type, effects: Effects) -> SimpleNamespace:
             y = new
             if moved <= real(tolerance) * (real(1.0) + wp.abs(y)):
                 break
-        g_new = wp.exp(wp.max(y, wp.log(real(least_fluidity))))
+        g_new = wp.exp(wp.max(y, wp.log(real(LEAST_FLUIDITY))))
         return vec2(mu_trial / (real(1.0) + a * g_new), g_new)
 
     @wp.func

@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..launch import Launch, SceneKernel, scene_kernel
+from ..launch import Launch, scene_kernel
 
 _REACH = 2  # layers of ghost nodes: one more than the splines of a particle on the plane reach
 
 
-def mirror_pairs(sum_of_indices: int) -> np.ndarray:
+def mirror_layers(sum_of_indices: int) -> np.ndarray:
     """Ghost layers and their images, shape (m, 2), where layers j and `sum_of_indices` - j mirror each other."""
     first = (sum_of_indices + 1) // 2 - _REACH
     return np.array([(j, sum_of_indices - j) for j in range(first, sum_of_indices // 2 + 1)])
 
 
-def seam_pairs(low: int, cells: int) -> np.ndarray:
+def periodic_layers(low: int, cells: int) -> np.ndarray:
     """Ghost layers and their images, shape (m, 2), where layers j and j + `cells` are the same and layer `low` is
     the first of the period."""
     before = [(low - j, low - j + cells) for j in range(1, _REACH + 1)]
@@ -32,23 +32,17 @@ def seam_pairs(low: int, cells: int) -> np.ndarray:
 
 
 @cache
-def images(real: type) -> SimpleNamespace:
+def ghost_kernels(real: type) -> SimpleNamespace:
     """Kernels `fold`, `unfold` (one thread per row of nodes across the plane) and `wrap` in precision `real`."""
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    vec4s, layers = wp.array(dtype=vec4), wp.array(dtype=wp.vec2i)
 
     @wp.func
     def node_of(row: int, layer: int, stride: int, extent: int):
         return (row // stride) * stride * extent + row % stride + layer * stride
 
     @scene_kernel()
-    def fold(
-        row: int,
-        nodes: wp.array(dtype=vec4),
-        pairs: wp.array(dtype=wp.vec2i),
-        sign: vec4,
-        stride: int,
-        extent: int,
-    ):
+    def fold(row: int, nodes: vec4s, pairs: layers, sign: vec4, stride: int, extent: int):
         """Add ghost layers to their images; `sign` mirrors a node's momentum, `stride` and `extent` are the axis'."""
         for q in range(pairs.shape[0]):
             ghost = node_of(row, pairs[q][0], stride, extent)
@@ -59,14 +53,7 @@ def images(real: type) -> SimpleNamespace:
                 nodes[ghost] = vec4()
 
     @scene_kernel()
-    def unfold(
-        row: int,
-        velocity: wp.array(dtype=vec4),
-        pairs: wp.array(dtype=wp.vec2i),
-        sign: vec4,
-        stride: int,
-        extent: int,
-    ):
+    def unfold(row: int, velocity: vec4s, pairs: layers, sign: vec4, stride: int, extent: int):
         """Give ghost layers the velocity of their images."""
         for q in range(pairs.shape[0]):
             ghost = node_of(row, pairs[q][0], stride, extent)
@@ -89,36 +76,33 @@ def images(real: type) -> SimpleNamespace:
     return SimpleNamespace(fold=fold, unfold=unfold, wrap=wrap)
 
 
-class Images:
+class GhostNodes:
     """Launches that keep ghost nodes and their images in agreement.
 
     Args:
         real: precision.
         device: Warp device.
         grid: the solver's struct.
-        ghosts: axis → ghost layers and their images, shape (m, 2).
+        layers: axis → ghost layers and their images, shape (m, 2).
         mirrored: whether the layers along y are mirror images; all others are one period apart.
     """
 
     def __init__(
-        self, real: type, device: wp.Device, grid: Any, ghosts: dict[int, np.ndarray], mirrored: bool
+        self, real: type, device: wp.Device, grid: Any, layers: dict[int, np.ndarray], mirrored: bool
     ) -> None:
         vec4 = wp.types.vector(4, real)
-        self._kernels, self._device, self._axes = images(real), device, []
-        for axis, pairs in ghosts.items():
+        self._kernels, self._device, self._axes = ghost_kernels(real), device, []
+        for axis, pairs in layers.items():
             extent, stride = ((grid.nx, grid.ny * grid.nz), (grid.ny, grid.nz))[axis]
             sign = vec4(1.0, -1.0 if mirrored and axis == 1 else 1.0, 1.0, 1.0)
-            layers = wp.array(pairs, dtype=wp.vec2i, device=device)
             rows = grid.nx * grid.ny * grid.nz // extent
-            self._axes.append((rows, [layers, sign, stride, extent]))
+            self._axes.append((rows, wp.array(pairs, dtype=wp.vec2i, device=device), sign, stride, extent))
 
     def fold(self, nodes: wp.array) -> list[Launch]:
         """Add ghost layers to their images."""
-        return [self._record(self._kernels.fold, nodes, *axis) for axis in self._axes]
+        return [Launch(self._kernels.fold, rows, [nodes, *axis], self._device) for rows, *axis in self._axes]
 
     def unfold(self, nodes: wp.array) -> list[Launch]:
         """Give ghost layers the values of their images."""
-        return [self._record(self._kernels.unfold, nodes, *axis) for axis in reversed(self._axes)]
-
-    def _record(self, kernel: SceneKernel, nodes: wp.array, rows: int, rest: list) -> Launch:
-        return Launch(kernel, rows, [nodes, *rest], self._device)
+        axes = reversed(self._axes)
+        return [Launch(self._kernels.unfold, rows, [nodes, *axis], self._device) for rows, *axis in axes]

@@ -1,4 +1,4 @@
-"""The background grid: momentum to velocity, gravity, floor and walls."""
+"""The background grid and the particles on it: their arrays; momentum to velocity, gravity, floor and walls."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -22,6 +22,7 @@ def grid_struct(real: type) -> type:
         ny: int
         nz: int
         dt: real  # [s]
+        substep: wp.array(dtype=int)  # how many steps of the frame are done, (1,)
         volume_averaging: real  # share of a particle's own volume change that the mean replaces
         forgetting: real  # share of recent volume changes that a step forgets
         damping: real  # viscous time of the elastic strain / dt
@@ -29,18 +30,38 @@ def grid_struct(real: type) -> type:
         # Nodes with index <= low or >= high belong to the floor and the walls.
         low: wp.vec3i
         high: wp.vec3i
-        wall_friction: (
-            vec3  # Coulomb coefficient of the x walls, the y walls and the floor, where they have one
-        )
+        wall_friction: vec3  # Coulomb coefficient of x walls, y walls and floor, where they have one
         particle_mass: real  # [kg]
         particle_volume: real  # at the critical density [m^3]
+        on_plane: int  # so many particles, the first ones, lie on a plane of symmetry and count half
         density_per_mass: real  # of a node: soil's density there over that of an undisturbed bed [1/kg]
-        beyond_walls: (
-            vec3  # the whole around a node on an x wall, a y wall, the floor over its part in the bin
-        )
+        beyond_walls: vec3  # whole around a node on an x wall, a y wall, the floor over its part in the bin
         speed_limit: real  # one cell per step [m/s]
 
     return Grid
+
+
+@cache
+def particle_struct(real: type) -> type:
+    """Struct of the particles' arrays in precision `real`."""
+    vec3, vec4, vec6 = (wp.types.vector(size, real) for size in (3, 4, 6))
+    mat33 = wp.types.matrix((3, 3), real)
+
+    @wp.struct
+    class Particles:
+        position: wp.array(dtype=vec3)  # [m]
+        home: wp.array(dtype=vec3)  # position at the last remap [m]
+        velocity: wp.array(dtype=vec3)  # at the last remap [m/s]
+        felt_velocity: wp.array(dtype=vec4)  # of the grid at `home` [m/s], and the mean of `swelling` there
+        velocity_gradient: wp.array(dtype=mat33)  # [1/s]
+        elastic_strain: wp.array(dtype=vec6)  # deviatoric part
+        log_volume: wp.array(dtype=real)  # ln J
+        stress: wp.array(dtype=vec6)  # Kirchhoff [Pa]
+        swelling: wp.array(dtype=real)  # sum of the recent volume changes
+        fluidity: wp.array(dtype=real)  # [1/s], with the effect `fluidity`
+        excess: wp.array(dtype=real)  # fluidity that cooperative flow adds [1/s], with `nonlocality`
+
+    return Particles
 
 
 @cache
@@ -55,7 +76,7 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
     (`Walls.conditions`); the kernels hold no code of other kinds.
     """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    Grid = grid_struct(real)
+    Grid, vec4s, reals = grid_struct(real), wp.array(dtype=vec4), wp.array(dtype=real)
 
     @wp.func
     def no_slip(v: vec3, inward: vec3, friction: real):
@@ -100,11 +121,11 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
     def begin(
         n: int,
         grid: Grid,
-        momentum: wp.array(dtype=vec4),
-        velocity: wp.array(dtype=vec4),
-        before: wp.array(dtype=vec4),
-        inverse_mass: wp.array(dtype=real),
-        impulse: wp.array(dtype=vec4),
+        momentum: vec4s,
+        velocity: vec4s,
+        before: vec4s,
+        inverse_mass: reals,
+        impulse: vec4s,
     ):
         node = momentum[n]
         mass = node[3]
@@ -122,18 +143,11 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
         inverse_mass[n] = inverse
 
     @scene_kernel()
-    def step(
-        n: int,
-        grid: Grid,
-        velocity: wp.array(dtype=vec4),
-        inverse_mass: wp.array(dtype=real),
-        impulse: wp.array(dtype=vec4),
-        substep: wp.array(dtype=int),
-    ):
+    def step(n: int, grid: Grid, velocity: vec4s, inverse_mass: reals, impulse: vec4s):
         # `static` around the walls' functions: Warp knows a kernel by its text and its functions, but not under which
         # names it calls these. Without, walls x slip, y no_slip would get the kernel of x no_slip, y slip.
         if n == 0:
-            substep[0] = substep[0] + 1
+            grid.substep[0] = grid.substep[0] + 1
         inverse = inverse_mass[n]
         if inverse > real(0.0):
             change = impulse[n]
@@ -141,23 +155,20 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
             impulse[n] = vec4()
             v = vec3(now[0], now[1], now[2]) + grid.dt * grid.gravity
             at = place(n, grid)
-            i = at[0]
-            j = at[1]
-            k = at[2]
             low = grid.low
             high = grid.high
             rough = grid.wall_friction
             if wp.static(walls[0] != "periodic"):
-                if i <= low[0]:
+                if at[0] <= low[0]:
                     v = wp.static(at_x)(v, vec3(real(1.0), real(0.0), real(0.0)), rough[0])
-                if i >= high[0]:
+                if at[0] >= high[0]:
                     v = wp.static(at_x)(v, vec3(real(-1.0), real(0.0), real(0.0)), rough[0])
             if wp.static(walls[1] != "periodic"):
-                if j <= low[1]:
+                if at[1] <= low[1]:
                     v = wp.static(at_y)(v, vec3(real(0.0), real(1.0), real(0.0)), rough[1])
-                if j >= high[1]:
+                if at[1] >= high[1]:
                     v = wp.static(at_y)(v, vec3(real(0.0), real(-1.0), real(0.0)), rough[1])
-            if k <= low[2]:
+            if at[2] <= low[2]:
                 v = wp.static(at_floor)(v, vec3(real(0.0), real(0.0), real(1.0)), rough[2])
             velocity[n] = vec4(v[0], v[1], v[2], inverse * change[3])
 

@@ -22,7 +22,7 @@ APART = 0.005
 
 
 @cache
-def loose(real: type) -> SimpleNamespace:
+def loose_soil(real: type) -> SimpleNamespace:
     """Warp functions in precision `real` for particles with ln J > 0, which bear no stress:
 
     - `apart(ln_j)`: 0 for dense soil to 1 for soil that is loose for good,

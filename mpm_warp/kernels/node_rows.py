@@ -7,8 +7,6 @@ import warp as wp
 
 from .grid import grid_struct
 
-# --- Quadratic B-splines: which 27 nodes a particle touches, and with what weights ----------------------
-
 
 @cache
 def splines(real: type) -> SimpleNamespace:
@@ -53,7 +51,7 @@ def splines(real: type) -> SimpleNamespace:
 
 
 @cache
-def rows(real: type, gpu: bool) -> SimpleNamespace:
+def row_operations(real: type, gpu: bool) -> SimpleNamespace:
     """Type `row` of four nodes (16 numbers, the last node is padding) in precision `real`, and Warp functions
 
     - `plus(a, w, b)` -> a + w b,

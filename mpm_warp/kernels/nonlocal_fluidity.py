@@ -37,8 +37,8 @@ import warp as wp
 from ..effects import Effects
 from ..launch import Launch, scene_kernel
 from .fluidity import fluidity, soil_struct
-from .ghost_nodes import Images
-from .grid import grid_struct
+from .ghost_nodes import GhostNodes
+from .grid import grid_struct, particle_struct
 from .node_rows import splines
 
 WALL_CONDUCTANCE = 32.0
@@ -84,55 +84,47 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
     - `place`: what particles get to the nodes' `cooperation`.
     """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    vec6 = wp.types.vector(6, real)
-    Soil, Grid = soil_struct(real, effects.fluidity), grid_struct(real)
-    spline, law = splines(real), fluidity(real, effects)
+    vec4s = wp.array(dtype=vec4)
+    Soil, Grid, Particles = soil_struct(real), grid_struct(real), particle_struct(real)
+    spline, law = splines(real), fluidity(real)
     base_and_offset, weights = spline.base_and_offset, spline.weights
     coefficients, local_fluidity, slowing = law.coefficients, law.local_fluidity, law.slowing
     fading = law.fading
 
     @wp.func
-    def source(e: vec6, ln_j: real, p: int, dt: real, soil: Soil):
+    def source(p: int, particles: Particles, dt: real, soil: Soil):
         # Weight 1, g and s of a dense particle; all 0 for one without stress.
-        pressure = -soil.bulk_modulus * ln_j
+        pressure = -soil.bulk_modulus * particles.log_volume[p]
         if pressure <= real(0.0):
             return vec3()
         if wp.static(effects.fluidity):
-            return vec3(real(1.0), soil.g[p], soil.fluidity_time / dt)
+            return vec3(real(1.0), particles.fluidity[p], soil.fluidity_time / dt)
         else:
             ac = coefficients(pressure, dt, soil)
+            e = particles.elastic_strain[p]
             size = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
             size += real(2.0) * (e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
             mu = wp.sqrt(real(2.0) * size) * ac[0] / dt
             return vec3(real(1.0), local_fluidity(mu, ac[1], soil), slowing(mu, soil))
 
     @wp.func
-    def deposit(sums: wp.array(dtype=vec4), at: int, amount: vec4):
+    def deposit(sums: vec4s, at: int, amount: vec4):
         if wp.static(atomic):
             wp.atomic_add(sums, at, amount)
         else:
             sums[at] = sums[at] + amount
 
     @scene_kernel()
-    def project(
-        p: int,
-        home: wp.array(dtype=vec3),
-        e: wp.array(dtype=vec6),
-        ln_j: wp.array(dtype=real),
-        grid: Grid,
-        soil: Soil,
-        on_plane: int,  # so many particles, the first ones, lie on a mirror plane and count half
-        sums: wp.array(dtype=vec4),
-    ):
-        found = source(e[p], ln_j[p], p, grid.dt, soil)
+    def project(p: int, particles: Particles, grid: Grid, soil: Soil, sums: vec4s):
+        found = source(p, particles, grid.dt, soil)
         if found[0] > real(0.0):
-            base, f = base_and_offset(home[p], grid)
+            base, f = base_and_offset(particles.home[p], grid)
             wx = weights(f[0])
             wy = weights(f[1])
             wz = weights(f[2])
             size = grid.inverse_spacing * grid.inverse_spacing * grid.inverse_spacing
             size = size * grid.particle_volume
-            if p < on_plane:
+            if p < grid.on_plane:
                 size = real(0.5) * size
             amount = size * vec4(found[0], found[1], found[2], real(0.0))
             for i in range(3):
@@ -144,7 +136,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
                     deposit(sums, row + 2, wz[2] * at)
 
     @scene_kernel()
-    def prepare(n: int, sums: wp.array(dtype=vec4), field: wp.array(dtype=vec4)):
+    def prepare(n: int, sums: vec4s, field: vec4s):
         s = sums[n]
         filled = s[0]
         if filled > real(0.0):
@@ -159,28 +151,32 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         else:
             field[n] = vec4()
 
+    @wp.func
+    def stride(axis: int, grid: Grid):
+        # Entries from a node to the next one along an axis.
+        if axis == 0:
+            return grid.ny * grid.nz
+        if axis == 1:
+            return grid.nz
+        return 1
+
     @scene_kernel()
     def sweep(
         n: int,
         ratio: real,  # (A d / dx)^2
-        nz: int,
-        plane: int,  # nodes of one x, ny nz
+        grid: Grid,
         sink: wp.array(dtype=real),  # R of each node
-        field: wp.array(dtype=vec4),
-        swept: wp.array(dtype=vec4),
+        field: vec4s,
+        swept: vec4s,
     ):
         here = field[n]
+        plane = stride(0, grid)
         # No soil lies in the outermost layers of the grid, so only the ends of the array need care.
         if here[0] > real(0.0) and n >= plane and n < field.shape[0] - plane:
             total = real(0.0)
             flux = real(0.0)
             for side in range(6):
-                stride = plane
-                if side // 2 == 1:
-                    stride = nz
-                if side // 2 == 2:
-                    stride = 1
-                other = field[n + (2 * (side % 2) - 1) * stride]
+                other = field[n + (2 * (side % 2) - 1) * stride(side // 2, grid)]
                 if other[0] > real(0.0):
                     joint = wp.max(here[0], other[0])
                     total += joint
@@ -190,96 +186,72 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
         swept[n] = here
 
     @wp.func
-    def sharpened(n: int, here: vec4, nz: int, plane: int, field: wp.array(dtype=vec4)):
+    def sharpened(n: int, here: vec4, grid: Grid, field: vec4s):
         # G less the quarter of dx^2 laplacian(G) by which the way to the grid and back smooths it, along every axis
         # on which both neighbours hold soil. Ghost nodes have their G from the sweeps.
         sharp = here[1]
         for axis in range(3):
-            stride = plane
-            if axis == 1:
-                stride = nz
-            if axis == 2:
-                stride = 1
-            before = field[n - stride]
-            after = field[n + stride]
+            before = field[n - stride(axis, grid)]
+            after = field[n + stride(axis, grid)]
             if wp.min(before[0], after[0]) > real(0.25) * here[0]:
                 sharp -= real(0.25) * (before[1] - real(2.0) * here[1] + after[1])
         return sharp
 
     @scene_kernel()
-    def place(
-        n: int,
-        grid: Grid,
-        soil: Soil,
-        nz: int,
-        plane: int,
-        field: wp.array(dtype=vec4),
-        cooperation: wp.array(dtype=vec4),
-    ):
+    def place(n: int, grid: Grid, soil: Soil, field: vec4s, cooperation: vec4s):
         found = field[n]
         amount = real(0.0)
         if found[0] > real(0.0):
             amount = found[3] - found[1]
             if wp.static(effects.fluidity):
+                plane = stride(0, grid)
                 if n >= plane and n < field.shape[0] - plane:
                     lost = real(1.0) - fading(grid.inverse_spacing, grid.dt, soil)
-                    amount += lost * sharpened(n, found, nz, plane, field)
+                    amount += lost * sharpened(n, found, grid, field)
         cooperation[n] = vec4(amount, real(0.0), real(0.0), real(0.0))
 
     return SimpleNamespace(project=project, prepare=prepare, sweep=sweep, place=place)
 
 
-class NonlocalFluidity:
-    """The arrays of the cooperative term on the grid and the launches that compute it in every step.
+def nonlocal_launches(
+    real: type,
+    effects: Effects,
+    sink: np.ndarray,
+    particles: Any,
+    grid: Any,
+    soil: Any,
+    field: wp.array,
+    cooperation: wp.array,
+    ghost_nodes: GhostNodes,
+) -> list[Launch]:
+    """What computes the cooperative term: in order, after the grid step and before the particles read the grid.
 
     Args:
         real: precision.
         effects: which physics.
-        device: Warp device.
         sink: R of each node, see `wall_sink`.
-        particles: arrays home, e and ln J.
-        grid, soil: the solver's structs.
-        images: ghost nodes, with plain signs: what is carried here has no direction, so a mirror does not turn it.
+        particles, grid, soil: the solver's structs.
+        field: filled volume [cells], mean g or g_loc [1/s], s [-] and g [1/s] of the nodes, shape (nodes, 4).
         cooperation: of the nodes; its first number takes the answer.
-        on_plane: number of particles, the first ones, that lie on a mirror plane.
+        ghost_nodes: with plain signs: what is carried here has no direction, so a mirror does not turn it.
     """
+    device, count = field.device, len(field)
+    kernels = nonlocal_kernels(real, effects, atomic=device.is_cuda)
+    sums, other = (wp.zeros_like(field) for _ in range(2))
+    walls = wp.array(sink, dtype=real, device=device)
+    ratio = (soil.cooperative_length / grid.spacing) ** 2
+    relaxation = soil.fluidity_time / grid.dt if effects.fluidity else None
 
-    def __init__(
-        self,
-        real: type,
-        effects: Effects,
-        device: wp.Device,
-        sink: np.ndarray,
-        particles: list[wp.array],
-        grid: Any,
-        soil: Any,
-        images: Images,
-        cooperation: wp.array,
-        on_plane: int = 0,
-    ) -> None:
-        kernels = nonlocal_kernels(real, effects, atomic=device.is_cuda)
-        vec4 = wp.types.vector(4, real)
-        count = len(cooperation)
-        sums, field, other = (wp.zeros(count, dtype=vec4, device=device) for _ in range(3))
-        walls = wp.array(sink, dtype=real, device=device)
-        self._arrays = (sums, other, walls)  # a recorded launch does not promise to keep its arrays
-        self.field = field
-        """Filled volume in cells, mean g or g_loc [1/s], s [-] and nodal fluidity g [1/s], shape (nodes, 4)."""
-        ratio = (soil.cooperative_length / grid.spacing) ** 2
-        relaxation = soil.fluidity_time / grid.dt if effects.fluidity else None
-        strides = (grid.nz, grid.ny * grid.nz)
-
-        def sweep(start: wp.array, end: wp.array) -> list[Launch]:
-            inputs = [ratio, *strides, walls, start, end]
-            return [*images.unfold(start), Launch(kernels.sweep, count, inputs, device)]
-
-        inputs = [*particles, grid, soil, on_plane, sums]
-        project = Launch(kernels.project, len(particles[0]), inputs, device)
-        self.launches = [
-            project,
-            *images.fold(sums),
-            Launch(kernels.prepare, count, [sums, field], device),
-            *[*sweep(field, other), *sweep(other, field)] * (sweep_count(ratio, relaxation) // 2),
-            Launch(kernels.place, count, [grid, soil, *strides, field, cooperation], device),
+    def sweep(start: wp.array, end: wp.array) -> list[Launch]:
+        return [
+            *ghost_nodes.unfold(start),
+            Launch(kernels.sweep, count, [ratio, grid, walls, start, end], device),
         ]
-        """In order, after the grid step and before the particles read the grid."""
+
+    return [
+        Launch(kernels.project, len(particles.home), [particles, grid, soil, sums], device),
+        *ghost_nodes.fold(sums),
+        Launch(kernels.prepare, count, [sums, field], device),
+        *[*sweep(field, other), *sweep(other, field)] * (sweep_count(ratio, relaxation) // 2),
+        Launch(kernels.place, count, [grid, soil, field, cooperation], device),
+    ]

@@ -31,9 +31,7 @@ def shape_struct(real: type, shape: str) -> type:
             grousers: int
             tip_radius: real
             grouser_half: real  # half the thickness
-            grouser_offset: (
-                real  # added to the grousers' distance, so that they begin to act at a depth of their own
-            )
+            grouser_offset: real  # added to the grousers' distance: they begin to act at a depth of their own
 
         return CylinderSize
 

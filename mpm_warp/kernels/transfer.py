@@ -20,18 +20,18 @@ from ..launch import scene_kernel
 from .constitutive import constitutive
 from .contact import ContactLaw, body_struct, contact
 from .fluidity import fluidity, soil_struct
-from .grid import grid_struct
-from .loose_soil import loose
-from .node_rows import rows, splines
+from .grid import grid_struct, particle_struct
+from .loose_soil import loose_soil
+from .node_rows import row_operations, splines
 
 
 @cache
-def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: bool) -> SimpleNamespace:
+def transfer(real: type, effects: Effects, contact_law: ContactLaw | None, atomic: bool) -> SimpleNamespace:
     """Kernels in precision `real` with only the physics in `effects`: `to_grid` and `from_grid` at a remap;
     `scatter`, `gather` and `material` in every step.
 
-    `touch` is the contact with a body, None without one; `atomic` is needed where many threads write to the grid at
-    once (a GPU).
+    `contact_law` is that with a body, None without one; `atomic` is needed where many threads write to the grid at once
+    (a GPU).
     """
     # Warp writes a product and the sum it goes into as two statements: without the flag they stay two instructions.
     fused = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast"}
@@ -39,16 +39,16 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
     vec4 = wp.types.vector(4, real)
     law = constitutive(real, effects)
     vec6, mat33 = law.vec6, law.mat33
-    Soil, Grid = soil_struct(real, effects.fluidity), grid_struct(real)
-    Body = body_struct(real, touch or ContactLaw())
-    with_body = touch is not None
-    push = contact(real, touch or ContactLaw(), atomic).push
+    Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real, contact_law or ContactLaw())
+    Particles, vec4s, reals, ints = particle_struct(real), *(wp.array(dtype=t) for t in (vec4, real, int))
+    with_body = contact_law is not None
+    push = contact(real, contact_law or ContactLaw(), atomic)
     update, kirchhoff = law.update, law.kirchhoff
-    fading = fluidity(real, effects).fading
-    apart, loose_volume = loose(real).apart, loose(real).volume
+    fading = fluidity(real).fading
+    apart, loose_volume = loose_soil(real).apart, loose_soil(real).volume
     spline = splines(real)
     base_and_offset, weights, moments = spline.base_and_offset, spline.weights, spline.moments
-    lanes = rows(real, gpu=atomic)
+    lanes = row_operations(real, gpu=atomic)
     row, plus, gather_row, scatter_row, spread, fold = (
         lanes.row, lanes.plus, lanes.gather, lanes.scatter, lanes.spread, lanes.fold
     )  # fmt: skip
@@ -58,15 +58,23 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         return ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
 
     @wp.func
-    def fault(stray: wp.array(dtype=int), p: int, substep: int, left_grid: int):
+    def fail(fault: ints, p: int, substep: int, near_home: int):
         # The first faulty particle is remembered; the solver stops at the end of the frame.
-        if wp.atomic_add(stray, 0, 1) == 0:
-            stray[1] = p
-            stray[2] = substep
-            stray[3] = left_grid
+        if wp.atomic_add(fault, 0, 1) == 0:
+            fault[1] = p
+            fault[2] = substep
+            fault[3] = near_home
 
     @wp.func
-    def deposit(base: wp.vec3i, f: vec3, corner: vec4, q: mat33, grid: Grid, nodes: wp.array(dtype=vec4)):
+    def part(p: int, grid: Grid):
+        # Of a particle that counts: half on a plane of symmetry.
+        if wp.static(effects.symmetry):
+            return wp.where(p < grid.on_plane, real(0.5), real(1.0))
+        else:
+            return real(1.0)
+
+    @wp.func
+    def deposit(base: wp.vec3i, f: vec3, corner: vec4, q: mat33, grid: Grid, nodes: vec4s):
         # Adds weight times an affine field: `corner` at the lowest node, the columns of q more with every cell along
         # x, y, z. The sum over a row is the same for all nine rows but for the weights.
         wx = weights(f[0])
@@ -84,71 +92,41 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
             plane = plus(plane, real(1.0), row_x)
 
     @scene_kernel(fused)
-    def to_grid(
-        p: int,
-        x: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        c: wp.array(dtype=mat33),
-        home: wp.array(dtype=vec3),
-        grid: Grid,
-        momentum: wp.array(dtype=vec4),
-        top_speed: wp.array(dtype=real),
-        substep: wp.array(dtype=int),
-        stray: wp.array(dtype=int),
-    ):
-        speed = wp.length(v[p])
+    def to_grid(p: int, particles: Particles, grid: Grid, momentum: vec4s, top_speed: reals, fault: ints):
+        x = particles.position[p]
+        v = particles.velocity[p]
+        speed = wp.length(v)
         if not (speed < grid.speed_limit):  # true for a NaN, too
-            fault(stray, p, substep[0], 0)
+            fail(fault, p, grid.substep[0], 0)
             return
         wp.atomic_max(top_speed, 0, speed)
-        home[p] = x[p]
-        base, f = base_and_offset(x[p], grid)
-        q = c[p] * (grid.particle_mass * grid.spacing)
-        start = grid.particle_mass * v[p] - q * f
-        deposit(base, f, vec4(start[0], start[1], start[2], grid.particle_mass), q, grid, momentum)
+        particles.home[p] = x
+        base, f = base_and_offset(x, grid)
+        mass = part(p, grid) * grid.particle_mass
+        q = particles.velocity_gradient[p] * (mass * grid.spacing)
+        start = mass * v - q * f
+        deposit(base, f, vec4(start[0], start[1], start[2], mass), q, grid, momentum)
 
     @scene_kernel(fused)
-    def scatter(
-        p: int,
-        x: wp.array(dtype=vec3),
-        home: wp.array(dtype=vec3),
-        felt: wp.array(dtype=vec4),
-        stress: wp.array(dtype=vec6),
-        swelling: wp.array(dtype=real),
-        grid: Grid,
-        body: Body,
-        impulse: wp.array(dtype=vec4),
-        substep: wp.array(dtype=int),
-    ):
-        base, f = base_and_offset(home[p], grid)
+    def scatter(p: int, particles: Particles, grid: Grid, body: Body, impulse: vec4s):
+        base, f = base_and_offset(particles.home[p], grid)
+        mass = part(p, grid) * grid.particle_mass
         # Of the stress: -dt V D^-1 tau (x_i - x_p), D = dx^2 / 4; q is per cell.
-        t = stress[p]
+        t = particles.stress[p]
         q = mat33(t[0], t[3], t[4], t[3], t[1], t[5], t[4], t[5], t[2]) * (
-            real(-4.0) * grid.dt * grid.particle_volume * grid.inverse_spacing
+            real(-4.0) * grid.dt * (part(p, grid) * grid.particle_volume) * grid.inverse_spacing
         )
         start = -(q * f)
         if wp.static(with_body):
-            u = vec3(felt[p][0], felt[p][1], felt[p][2])
-            start += push(p, x[p], u, grid.particle_mass, grid.dt, substep[0], body)
-        deposit(
-            base, f, vec4(start[0], start[1], start[2], grid.particle_mass * swelling[p]), q, grid, impulse
-        )
+            felt = particles.felt_velocity[p]
+            u = vec3(felt[0], felt[1], felt[2])
+            start += push(p, particles.position[p], u, mass, part(p, grid), grid.dt, grid.substep[0], body)
+        swelling = mass * particles.swelling[p]
+        deposit(base, f, vec4(start[0], start[1], start[2], swelling), q, grid, impulse)
 
     @scene_kernel(fused)
-    def gather(
-        p: int,
-        x: wp.array(dtype=vec3),
-        home: wp.array(dtype=vec3),
-        felt: wp.array(dtype=vec4),
-        c: wp.array(dtype=mat33),
-        grid: Grid,
-        velocity: wp.array(dtype=vec4),
-        cooperation: wp.array(dtype=vec4),
-        excess: wp.array(dtype=real),
-        substep: wp.array(dtype=int),
-        stray: wp.array(dtype=int),
-    ):
-        base, f = base_and_offset(home[p], grid)
+    def gather(p: int, particles: Particles, grid: Grid, velocity: vec4s, cooperation: vec4s, fault: ints):
+        base, f = base_and_offset(particles.home[p], grid)
         wx = weights(f[0])
         wy = weights(f[1])
         wz = weights(f[2])
@@ -174,14 +152,14 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
             around = row()
             for i in range(3):
                 for j in range(3):
-                    nodes = gather_row(cooperation, node_index(base, i, j, grid))
-                    around = plus(around, wx[i] * wy[j], nodes)
-            excess[p] = fold(wz, around)[0]
+                    given = gather_row(cooperation, node_index(base, i, j, grid))
+                    around = plus(around, wx[i] * wy[j], given)
+            particles.excess[p] = fold(wz, around)[0]
         gx = fold(wz, all_x)
         gy = fold(wz, all_y)
         gz = fold(az, all_v)
         scale = real(4.0) * grid.inverse_spacing
-        moved = x[p] + grid.dt * vec3(total[0], total[1], total[2])
+        moved = particles.position[p] + grid.dt * vec3(total[0], total[1], total[2])
         g = (moved - grid.origin) * grid.inverse_spacing
         inside = (
             g[0] >= real(0.5) and g[1] >= real(0.5) and g[2] >= real(0.5)
@@ -189,70 +167,60 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
             and g[1] < real(grid.ny) - real(1.5)
             and g[2] < real(grid.nz) - real(1.5)
         )  # fmt: skip
-        near = wp.length_sq(moved - home[p]) < grid.spacing * grid.spacing  # false for a NaN, too
+        near = wp.length_sq(moved - particles.home[p]) < grid.spacing * grid.spacing  # false for a NaN, too
         if inside and near:
-            x[p] = moved
-            felt[p] = total
-            c[p] = mat33(
+            particles.position[p] = moved
+            particles.felt_velocity[p] = total
+            particles.velocity_gradient[p] = mat33(
                 gx[0] * scale, gy[0] * scale, gz[0] * scale,
                 gx[1] * scale, gy[1] * scale, gz[1] * scale,
                 gx[2] * scale, gy[2] * scale, gz[2] * scale,
             )  # fmt: skip
         else:
-            c[p] = mat33()  # the particle keeps its last good state
-            fault(stray, p, substep[0], wp.where(near, 1, 0))
+            particles.velocity_gradient[p] = mat33()  # the particle keeps its last good state
+            fail(fault, p, grid.substep[0], wp.where(near, 1, 0))
 
     # A kernel of its own: in one with the transfer the C++ compiler makes both slower.
     @scene_kernel(fused)
-    def material(
-        p: int,
-        felt: wp.array(dtype=vec4),
-        c: wp.array(dtype=mat33),
-        e: wp.array(dtype=vec6),
-        ln_j: wp.array(dtype=real),
-        stress: wp.array(dtype=vec6),
-        swelling: wp.array(dtype=real),
-        excess: wp.array(dtype=real),
-        grid: Grid,
-        soil: Soil,
-    ):
-        # What `update` means by its last number; `excess` is what cooperative flow adds (nonlocal_fluidity.py).
+    def material(p: int, particles: Particles, grid: Grid, soil: Soil):
+        # What `update` means by its last number; the excess is what cooperative flow adds (nonlocal_fluidity.py).
         g = real(0.0)
         if wp.static(effects.nonlocality):
-            g = excess[p]
+            g = particles.excess[p]
         if wp.static(effects.fluidity):
             kept = real(1.0)
             if wp.static(effects.nonlocality):
                 kept = fading(grid.inverse_spacing, grid.dt, soil)
-            g = wp.max(kept * soil.g[p] + g, real(0.0))
-        before = e[p]
+            g = wp.max(kept * particles.fluidity[p] + g, real(0.0))
+        before = particles.elastic_strain[p]
         # Volume changes as the mean over the nodes around does: what a particle's own gradient says besides is noise,
         # and is taken back within the time a wave needs for a cell. `swelling` is the sum of its recent changes, and
-        # felt[p][3] the mean of that. Soil that bears no stress has no say in it and repeats the mean: its changes are
+        # `mean` the mean of that. Soil that bears no stress has no say in it and repeats the mean: its changes are
         # large, and shared out they would compress the dense soil that it falls on.
-        recent = swelling[p]
-        averaged = grid.volume_averaging * grid.forgetting * (felt[p][3] - recent)
+        recent = particles.swelling[p]
+        mean = particles.felt_velocity[p][3]
+        averaged = grid.volume_averaging * grid.forgetting * (mean - recent)
         if wp.static(effects.separation):
-            averaged *= real(1.0) - apart(ln_j[p])
-        volume_before = ln_j[p] + averaged
-        state = update(before, volume_before, grid.dt * c[p], grid.dt, soil, g)
+            averaged *= real(1.0) - apart(particles.log_volume[p])
+        volume_before = particles.log_volume[p] + averaged
+        state = update(before, volume_before, grid.dt * particles.velocity_gradient[p], grid.dt, soil, g)
         after = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
-        e[p] = after
-        ln_j[p] = state[6]
+        particles.elastic_strain[p] = after
+        particles.log_volume[p] = state[6]
         changes = (real(1.0) - grid.forgetting) * recent + state[6] - volume_before
         if wp.static(effects.separation):
-            mean = (real(1.0) - grid.forgetting) * felt[p][3]
+            mean = (real(1.0) - grid.forgetting) * mean
             changes += apart(wp.max(volume_before, state[6])) * (mean - changes)
-        swelling[p] = changes
+        particles.swelling[p] = changes
         if wp.static(effects.fluidity):
-            soil.g[p] = state[7]
+            particles.fluidity[p] = state[7]
         # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone. It
         # takes away at most half of the pressure, since soil can bear no tension.
         volume = state[6] + grid.damping * (state[6] - volume_before)
         if wp.static(effects.separation):
             volume = wp.where(state[6] < real(0.0), wp.min(volume, real(0.5) * state[6]), state[6])
         t = kirchhoff(after + grid.damping * (after - before), volume, soil)
-        stress[p] = vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])
+        particles.stress[p] = vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])
 
     @wp.func
     def within_walls(x: vec3, grid: Grid):
@@ -264,20 +232,10 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
         return x
 
     @scene_kernel(fused)
-    def from_grid(
-        p: int,
-        x: wp.array(dtype=vec3),
-        home: wp.array(dtype=vec3),
-        felt: wp.array(dtype=vec4),
-        v: wp.array(dtype=vec3),
-        grid: Grid,
-        before: wp.array(dtype=vec4),
-        keep: wp.array(dtype=real),
-        ln_j: wp.array(dtype=real),
-    ):
+    def from_grid(p: int, particles: Particles, grid: Grid, before: vec4s, keep: reals):
         # The particle's own velocity changes by what changed on the grid; of the part that the grid does not resolve
         # the share `keep` is left.
-        base, f = base_and_offset(home[p], grid)
+        base, f = base_and_offset(particles.home[p], grid)
         wx = weights(f[0])
         wy = weights(f[1])
         total = row()
@@ -285,12 +243,16 @@ def transfer(real: type, effects: Effects, touch: ContactLaw | None, atomic: boo
             for j in range(3):
                 total = plus(total, wx[i] * wy[j], gather_row(before, node_index(base, i, j, grid)))
         smooth = fold(weights(f[2]), total)
-        u = vec3(felt[p][0], felt[p][1], felt[p][2])
-        x[p] = within_walls(x[p], grid)
+        felt = particles.felt_velocity[p]
+        u = vec3(felt[0], felt[1], felt[2])
+        particles.position[p] = within_walls(particles.position[p], grid)
+        ln_j = particles.log_volume[p]
         if wp.static(effects.separation):
-            if ln_j[p] > real(0.0):
-                ln_j[p] = loose_volume(ln_j[p], node_index(base, 0, 0, grid), f, before, grid)
-        v[p] = u + keep[0] * (v[p] - vec3(smooth[0], smooth[1], smooth[2]))
+            if ln_j > real(0.0):
+                first = node_index(base, 0, 0, grid)
+                particles.log_volume[p] = loose_volume(ln_j, first, f, before, grid)
+        v = particles.velocity[p]
+        particles.velocity[p] = u + keep[0] * (v - vec3(smooth[0], smooth[1], smooth[2]))
 
     return SimpleNamespace(
         to_grid=to_grid, scatter=scatter, gather=gather, material=material, from_grid=from_grid

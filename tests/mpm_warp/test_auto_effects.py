@@ -234,7 +234,7 @@ def test_no_array_of_what_is_off():
     silent = Solver(SHEARED, Effects(torque=False))
     assert (len(plain._body.data.impulse), len(silent._body.data.impulse)) == (2, 1)
     assert plain._body._axle is None and len(driven._body._axle) == 3
-    assert (len(halved._x), len(plain._x)) == (1920, 3840)
+    assert (len(halved.particles.position), len(plain.particles.position)) == (1920, 3840)
     names = {k.kernel.name for k in launches(plain)}
     assert not names & {"fold", "unfold", "wrap", "project", "sweep", "place"}
     assert {"fold", "unfold"} <= {k.kernel.name for k in launches(halved)}

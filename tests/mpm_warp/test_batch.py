@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, replace
+from collections import Counter
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -24,11 +25,10 @@ from mpm_warp import (
     frames_together,
 )
 from mpm_warp import launch as work_module
-from mpm_warp.batch import all_together
-from mpm_warp.launch import Launch, Program, Together, Work
+from mpm_warp.launch import BatchedLaunch, Job, Launch, Program
+from mpm_warp.solver import run_concurrently
 from sgns_testing.scenes import UNDAMPED, block, cut
-
-needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
+from sgns_testing.solvers import assert_same_frames
 
 
 class Thrown(Scene):
@@ -36,23 +36,6 @@ class Thrown(Scene):
 
     def initial_velocities(self):
         return np.tile([0.0, 0.0, 4.0], (len(self.filled[0]), 1))
-
-
-def different_scenes():
-    """Scenes of different motion, gravity, material, grid, kind, time step and number of frames."""
-    return [
-        cut(duration=0.15),
-        cut(duration=0.12, rake=30.0, gravity=1.62, material=Material(youngs_modulus=2.0e6)),
-        cut(duration=0.12, bed=Bed(size=(0.5, 0.3, 0.1), spacing=0.025, headroom=0.12)),
-        Wheel(bed=cut().bed, duration=0.08, settle=0.02, **UNDAMPED),
-        Wheel(bed=cut().bed, duration=0.1, settle=0.02, load=60.0, **UNDAMPED),
-    ]
-
-
-def assert_same(one, two):
-    """Two frames are equal bit by bit."""
-    for a, b in zip(astuple(one), astuple(two), strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def by_scene(frames):
@@ -63,72 +46,75 @@ def by_scene(frames):
     return [found[number] for number in sorted(found)]
 
 
-@pytest.mark.parametrize("at_once", [2, 32])
-def test_scenes_together_are_the_scenes_alone(at_once):
-    scenes = different_scenes()
-    together = by_scene(frames_together(scenes, at_once=at_once))
-    for scene, frames in zip(scenes, together, strict=True):
-        assert len(frames) == scene.frame_count
-        for one, two in zip(frames, Solver(scene).frames(), strict=True):
-            assert_same(one, two)
-        assert np.linalg.norm(frames[-1].force) > 0.1
+def wheel(**kw):
+    return Wheel(bed=cut().bed, **{"settle": 0.02, **UNDAMPED} | kw)
+
+
+DIFFERENT = [  # in motion, gravity, material, grid, kind, time step and number of frames
+    cut(duration=0.1),
+    cut(duration=0.08, rake=30.0, gravity=1.62, material=Material(youngs_modulus=2.0e6)),
+    cut(duration=0.08, bed=Bed(size=(0.5, 0.3, 0.1), spacing=0.025, headroom=0.12)),
+    wheel(duration=0.05),
+    wheel(duration=0.07, load=60.0),
+]
+BEDS = [  # with 15 and 16 rows across: particles on the plane of symmetry and none
+    cut(
+        duration=0.05,
+        material=Material(grain_diameter=5e-3),
+        bed=Bed(size=(0.5, width, 0.16), spacing=0.025, headroom=0.12),
+    )
+    for width in (0.375, 0.4)
+]
+PERIODIC = [  # bins of different length
+    Incline(
+        bed=Bed(size=(length, 0.06, 0.05), spacing=0.01, walls=Walls(x="periodic", y="periodic")),
+        material=Material(),
+        tilt=40.0,
+        flowing=True,
+        duration=0.05,
+    )
+    for length in (0.06, 0.1)
+]
+OWN = [Effects(), Effects(rate_dependence=False), Effects(separation=False)]
 
 
 @pytest.mark.parametrize(
-    "effects",
+    ("scenes", "effects", "at_once"),
     [
-        Effects(symmetry=True),
-        Effects(fluidity=True, nonlocality=True),
-        Effects(symmetry=True, nonlocality=True, torque=False),
+        (DIFFERENT, None, 2),
+        (DIFFERENT, None, 32),
+        ([*BEDS, replace(BEDS[0], depth=0.04, rake=20.0)], Effects(symmetry=True), 32),
+        (BEDS, Effects(fluidity=True, nonlocality=True), 32),
+        (BEDS, Effects(symmetry=True, nonlocality=True, torque=False), 32),
+        (PERIODIC, None, 32),
+        ([cut(duration=0.15)] * 3, OWN, 32),
     ],
+    ids=["two", "all", "symmetric", "fluid", "nonlocal", "periodic", "effects"],
 )
-def test_every_effect_knows_its_own_scene(effects):
-    """Beds with 15 and 16 rows across have particles on the plane of symmetry and none."""
-    material = Material(grain_diameter=5e-3)
-    scenes = [
-        cut(duration=0.05, material=material, bed=Bed(size=(0.5, width, 0.16), spacing=0.025, headroom=0.12))
-        for width in (0.375, 0.4)
-    ]
-    scenes.append(replace(scenes[0], depth=0.04, rake=20.0))
-    for scene, frames in zip(scenes, by_scene(frames_together(scenes, effects)), strict=True):
-        assert_same(frames[-1], list(Solver(scene, effects).frames())[-1])
-
-
-def test_periodic_bins_keep_their_own_length():
-    scenes = [
-        Incline(
-            bed=Bed(size=(length, 0.06, 0.05), spacing=0.01, walls=Walls(x="periodic", y="periodic")),
-            material=Material(),
-            tilt=40.0,
-            flowing=True,
-            duration=0.05,
-        )
-        for length in (0.06, 0.1)
-    ]
-    for scene, frames in zip(scenes, by_scene(frames_together(scenes)), strict=True):
-        assert_same(frames[-1], list(Solver(scene).frames())[-1])
+def test_scenes_together_are_the_scenes_alone(scenes, effects, at_once):
+    own = effects if isinstance(effects, list) else [effects] * len(scenes)
+    together = by_scene(frames_together(scenes, effects, at_once=at_once))
+    for scene, its_effects, frames in zip(scenes, own, together, strict=True):
+        assert_same_frames(frames, Solver(scene, its_effects).frames())
+    assert len({frames[-1].velocity.tobytes() for frames in together}) == len(scenes)
 
 
 def test_scenes_of_the_same_kernels_share_every_launch(monkeypatch):
     """As many launches as the scene with the most steps makes alone, whatever the others are."""
-    counts = {"alone": 0, "together": 0}
+    counts = Counter()
 
-    def counted(kind, launch):
-        def launches(self, step=0):
-            counts[kind] += 1
-            launch(self, step)
+    def counted(kind):
+        launch = kind.launch
+        return lambda self, step=0: counts.update([kind]) or launch(self, step)
 
-        return launches
-
-    monkeypatch.setattr(Launch, "launch", counted("alone", Launch.launch))
-    monkeypatch.setattr(Together, "launch", counted("together", Together.launch))
+    for kind in (Launch, BatchedLaunch):
+        monkeypatch.setattr(kind, "launch", counted(kind))
     scenes = [cut(duration=0.05, speed=speed, depth=0.03) for speed in (0.1, 0.15, 0.2)]
     for _ in Solver(scenes[-1]).frames():
         pass
-    alone = counts.pop("alone")
-    counts["alone"] = 0
+    alone = counts.pop(Launch)
     by_scene(frames_together(scenes))
-    assert counts == {"alone": 0, "together": alone}
+    assert counts == {BatchedLaunch: alone}
 
 
 @pytest.mark.parametrize("effects", [Effects(), Effects(symmetry=True, fluidity=True, nonlocality=True)])
@@ -136,7 +122,7 @@ def test_captured_graphs_are_the_launches(effects):
     """What a GPU replays, here captured and replayed by Warp on the CPU: the same bits, alone and together, though the
     numbers of steps differ from scene to scene and from remap to remap."""
     scenes = [cut(duration=0.06, speed=speed, depth=0.03, remap_time=4e-3) for speed in (0.1, 0.25)]
-    scenes.append(Wheel(bed=cut().bed, duration=0.06, settle=0.02, load=60.0, **UNDAMPED))
+    scenes.append(wheel(duration=0.06, load=60.0))
 
     def computed():
         alone = [list(Solver(scene, effects).frames()) for scene in scenes]
@@ -152,20 +138,7 @@ def test_captured_graphs_are_the_launches(effects):
         captured = computed()
     assert len(launched) > 2 * len(set(launched)) > 10  # each graph served more than once
     for one, two in zip(plain, captured, strict=True):
-        assert len(one) == len(two) > 2
-        for a, b in zip(one, two, strict=True):
-            assert_same(a, b)
-
-
-def test_scenes_may_have_effects_of_their_own():
-    scene, effects = (
-        cut(duration=0.15),
-        [Effects(), Effects(rate_dependence=False), Effects(separation=False)],
-    )
-    found = [frames[-1].force for frames in by_scene(frames_together([scene] * 3, effects))]
-    for force, own in zip(found, effects, strict=True):
-        np.testing.assert_array_equal(force, list(Solver(scene, own).frames())[-1].force)
-    assert len({tuple(force) for force in found}) == 3
+        assert_same_frames(one, two)
 
 
 def test_scenes_that_fail_leave_the_others():
@@ -188,12 +161,12 @@ def test_tasks_go_side_by_side_and_the_next_begins_when_one_ends():
     def task(name, turns):
         log.append(f"{name} begins")
         for turn in range(turns):
-            yield Work(Program([]), 0)
+            yield Job(Program([]), 0)
             yield name, turn
         log.append(f"{name} ends")
 
     given = list(
-        all_together((task(name, turns) for name, turns in [("a", 2), ("b", 1), ("c", 2)]), 2, "cpu")
+        run_concurrently((task(name, turns) for name, turns in [("a", 2), ("b", 1), ("c", 2)]), 2, "cpu")
     )
     assert given == [(0, ("a", 0)), (1, ("b", 0)), (0, ("a", 1)), (2, ("c", 0)), (2, ("c", 1))]
     assert log == ["a begins", "b begins", "b ends", "c begins", "a ends", "c ends"]
@@ -205,25 +178,20 @@ def test_when_one_breaks_the_others_are_closed():
     def waits(name):
         try:
             while True:
-                yield Work(Program([]), 0)
+                yield Job(Program([]), 0)
         finally:
             closed.append(name)
 
     def breaks():
-        yield Work(Program([]), 0)
+        yield Job(Program([]), 0)
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        list(all_together([waits("a"), breaks(), waits("b")], 3, "cpu"))
+        list(run_concurrently([waits("a"), breaks(), waits("b")], 3, "cpu"))
     assert sorted(closed) == ["a", "b"]
 
 
-def test_unknown_device():
-    with pytest.raises(SceneError, match="device is 'tpu'; allowed here: cpu"):
-        list(all_together([], 2, "tpu"))
-
-
-@needs_cuda
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
 def test_many_scenes_on_cuda_agree_with_the_cpu():
     scenes = [cut(duration=0.15, depth=depth) for depth in np.linspace(0.02, 0.06, 9)]
     for scene, frames in zip(

@@ -72,7 +72,7 @@ def test_a_layer_on_a_slope_below_its_friction_angle_stays_still(floor):
 def test_only_a_wall_with_friction_lets_soil_go(floor, leaves):
     scene = replace(box_on_floor(Walls(floor=floor), duration=0.02), gravity=0.0)
     solver = Solver(scene, ELASTIC, precision="float64")
-    solver._v.assign(np.tile([0.0, 0.0, 0.5], (solver.particle_count, 1)))
+    solver.particles.velocity.assign(np.tile([0.0, 0.0, 0.5], (solver.particle_count, 1)))
     last = list(solver.frames())[-1]
     lowest = last.position[:, 2].min() - scene.initial_positions()[:, 2].min()
     assert (lowest > 0.5 * 0.5 * 0.02) == leaves
@@ -89,11 +89,11 @@ def test_a_periodic_seam_is_nowhere(axis):
     for b in (bed, across):
         scene = Scene(bed=b, gravity=0.0, duration=0.1, frame_rate=100.0)
         solver = Solver(scene, precision="float64")
-        x = solver._x.numpy()
+        x = solver.particles.position.numpy()
         middle = x.mean(axis=0)
         pushed = -2.0 * (x - middle)
         pushed[:, axis] += 0.6
-        solver._v.assign(pushed)
+        solver.particles.velocity.assign(pushed)
         frames = list(solver.frames())
         start.append(frames[0].position)
         last.append(frames[-1].position)
@@ -108,10 +108,10 @@ def test_momentum_along_periodic_axes_is_conserved():
     )
     solver = Solver(Scene(bed=bed, duration=0.05, frame_rate=200.0), precision="float64")
     kick = np.random.default_rng(0).normal(size=(solver.particle_count, 3)) * 0.1
-    solver._v.assign(kick)
+    solver.particles.velocity.assign(kick)
     for _ in solver.frames():
         pass
-    after = solver._v.numpy().sum(axis=0)
+    after = solver.particles.velocity.numpy().sum(axis=0)
     np.testing.assert_allclose(after[:2], kick.sum(axis=0)[:2], atol=1e-12 * np.abs(kick).sum())
 
 
@@ -170,9 +170,9 @@ def test_plain_walls_cost_nothing():
         Solver(cut(bed=Bed(size=(0.48, 0.4, 0.16), spacing=0.02, walls=Walls(y=y))))
         for y in ("no_slip", "periodic")
     )
-    assert len(plain._step) == 4
+    assert len(plain._steps.step) == 4
     assert plain._turns == {}
-    assert len(periodic._step) == 6
+    assert len(periodic._steps.step) == 6
 
 
 # --- Beds: full, inside, reproducible -------------------------------------------------------------------

@@ -8,7 +8,7 @@ import warp as wp
 from stand_in import Checked, Threads, compiler, on_stand_in
 
 from mpm_warp import Bed, Plate, Solver
-from mpm_warp.launch import Launch, Program, Work, Worker, find_device, scene_kernel
+from mpm_warp.launch import Executor, Job, Launch, Program, find_device, scene_kernel
 from sgns_testing.scenes import cut
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="needs g++ on Linux")
@@ -56,7 +56,7 @@ def test_what_is_wrong_is_found(kernel, parts, conflicts, outside):
     numbers = wp.zeros(10, dtype=float, device=device)
     with on_stand_in(Checked()) as checked:
         launches = [Launch(kernel, b - a, [numbers[a:b]], device) for a, b in parts]
-        Worker(device).do([Work(Program([launch]), 1) for launch in launches])
+        Executor(device).run([Job(Program([launch]), 1) for launch in launches])
     (report,) = checked.reports()
     assert (report.conflicts, report.outside) == (conflicts, outside)
     assert bool(report.first) == bool(conflicts + outside)

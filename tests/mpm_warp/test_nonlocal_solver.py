@@ -1,14 +1,16 @@
-"""Fluidity and nonlocality in a whole solver: what is off costs nothing, precisions, symmetry, seams, inertness."""
+"""Fluidity and nonlocality in a whole solver: what is off costs nothing, precisions, symmetry, seams, inclines."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import warp as wp
+import stopping
+from scipy.integrate import solve_bvp
 
-from mpm_warp import Bed, Effects, Material, Scene, Solver, SolverStopped, Walls
+from mpm_warp import Bed, Effects, Incline, Material, Scene, Solver, SolverStopped, Walls
 from sgns_testing.scenes import cut
-from sgns_testing.solvers import compiled_source, launches
+from sgns_testing.solvers import change, compiled_source, launches
 
 STEADY, DYNAMIC = Effects(nonlocality=True), Effects(fluidity=True, nonlocality=True)
 PRESSURE = 1000.0
@@ -36,15 +38,15 @@ def test_a_periodic_seam_is_nowhere(effects, at_walls):
         solver = Solver(scene, effects, precision="float64")
         e, flow = np.zeros((len(order), 6)), np.roll(mu, moved, axis=(0, 1)).ravel()
         e[order, 4] = flow * PRESSURE / (2.0 * material.shear_modulus)
-        solver._e.assign(e)
-        solver._ln_j.fill_(-PRESSURE / material.bulk_modulus)
+        solver.particles.elastic_strain.assign(e)
+        solver.particles.log_volume.fill_(-PRESSURE / material.bulk_modulus)
         if effects.fluidity:
             g = np.zeros(len(order))
             g[order] = 10.0 * flow
-            solver._soil.g.assign(g)
-        for launch in (*solver._to_grid, *solver._begin, *solver._step):
+            solver.particles.fluidity.assign(g)
+        for launch in (*solver._remap.begin, *solver._steps.begin, *solver._steps.step):
             launch.launch()
-        found = solver._excess.numpy()[order].reshape(cells)
+        found = solver.particles.excess.numpy()[order].reshape(cells)
         return np.roll(found, [-m for m in moved], axis=(0, 1))
 
     still = excess((0, 0))
@@ -58,10 +60,10 @@ def test_what_is_off_costs_nothing():
     assert [launch.kernel.name for launch in launches(plain)] == [
         "to_grid", "begin", "scatter", "step", "gather", "material", "from_grid"
     ]  # fmt: skip
-    assert len(fluid._step) > len(plain._step)
-    assert not hasattr(plain._soil, "g")
-    assert fluid._soil.g.shape == (fluid.particle_count,)
-    assert "fluidity_step" in compiled_source(fluid._step[-1])
+    assert len(fluid._steps.step) > len(plain._steps.step)
+    assert len(plain.particles.fluidity) == 0
+    assert fluid.particles.fluidity.shape == (fluid.particle_count,)
+    assert "fluidity_step" in compiled_source(fluid._steps.step[-1])
     for launch in launches(plain):
         found = compiled_source(launch)
         assert (
@@ -85,25 +87,9 @@ def test_stops_where_the_fluidity_is_no_number():
     solver = Solver(cut(duration=0.1, material=Material(grain_diameter=5e-3)), STEADY)
     frames = solver.frames()
     next(frames), next(frames)
-    field = solver._nonlocal.field.numpy().copy()
-    field[:, 3] = np.nan  # which the sweeps of the steady form go on from
-    solver._nonlocal.field.assign(field)
+    change(solver._cooperative_field, np.nan, at=(..., 3))  # which the steady form's sweeps go on from
     with pytest.raises(SolverStopped, match="its fluidity is not finite"):
         list(frames)
-
-
-def test_inert_nonlocality_leaves_a_cut_as_it_is():
-    """The paper's sand on a 2 cm grid: A d is a hundred and forty times smaller. The RMS of all particles is judged: a
-    single one at the edge of the heap may go another way after the smallest change."""
-    one, two = (list(Solver(cut(), e).frames())[-1] for e in (Effects(), STEADY))
-    np.testing.assert_allclose(two.force, one.force, atol=0.01 * np.linalg.norm(one.force))
-    assert np.sqrt(np.mean((one.position - two.position) ** 2)) < 1e-4
-
-
-@pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
-def test_cuda_agrees_with_the_cpu():
-    one, two = (list(Solver(cut(duration=0.1), DYNAMIC, device=d).frames())[-1] for d in ("cpu", "cuda"))
-    np.testing.assert_allclose(one.force, two.force, atol=0.01 * np.linalg.norm(one.force))
 
 
 @pytest.mark.parametrize("effects", [STEADY, DYNAMIC])
@@ -125,3 +111,76 @@ def test_half_is_whole(effects, width):
     assert np.linalg.norm(whole.force) > 1.0
     np.testing.assert_allclose(half.force, whole.force, atol=1e-10 * np.linalg.norm(whole.force))
     np.testing.assert_allclose(half.position, whole.position, atol=1e-9)
+
+
+# --- Uniform layers of glass beads on an endless incline ---------------------------------------------------
+
+GRAIN = 3e-3
+
+
+def speed_in_theory(material, effects, angle, height):
+    """Heights and velocity of the steady layer: the one-dimensional equation of g with mu = tan(angle)."""
+    z = np.linspace(0.0, height, 300)
+    mu, span = math.tan(angle), material.limit_friction - material.static_friction
+    steep = span / (material.limit_friction - mu) if material.rate_law == "saturating" else 1.0
+    growth = steep * (mu - material.static_friction)
+    length = material.nonlocal_amplitude * GRAIN
+
+    def quadratic(z):
+        pressure = material.packing * 9.81 * math.cos(angle) * np.maximum(height - z, 1e-9)  # over rho_s
+        return span * mu * GRAIN / (material.reference_inertial_number * np.sqrt(pressure))
+
+    def slope(z, y):
+        if effects.fluidity:
+            return np.vstack([y[1], (quadratic(z) * y[0] ** 2 - growth * y[0]) / length**2])
+        return np.vstack([y[1], (y[0] - growth / quadratic(z)) * growth / length**2])
+
+    guess = growth / quadratic(z) * (1.0 - np.exp(-z / length))
+    found = solve_bvp(
+        slope, lambda a, b: np.array([a[0], b[1]]), z, np.vstack([guess, 0.0 * z]), max_nodes=20000
+    )
+    assert found.success
+    g = found.sol(z)[0]
+    return z, np.concatenate([[0.0], np.cumsum(0.5 * mu * (g[1:] + g[:-1]) * np.diff(z))])
+
+
+def flow(material, effects, angle, height, start, duration, spacing):
+    """Heights of the particles' rows above the base and their velocity along the incline, at the start `start`(z)."""
+    spacing = height / round(height / spacing)
+    bed = Bed(
+        size=(4 * spacing, 4 * spacing, height),
+        spacing=spacing,
+        headroom=0.6 * height,
+        walls=Walls("periodic", "periodic"),
+    )
+    values = {"duration": duration, "frame_rate": 1.0 / duration, "tilt": math.degrees(angle)}
+    solver = Solver(Incline(bed=bed, material=material, flowing=False, **values), effects)
+    z = (solver.scene.initial_positions()[:, 2] + height).round(7)
+    solver.particles.velocity.assign(np.column_stack([start(z), 0.0 * z, 0.0 * z]))
+    *_, last = solver.frames()
+    rows = np.unique(z)
+    return rows, np.array([last.velocity[z == row, 0].mean() for row in rows])
+
+
+@pytest.mark.parametrize("effects", [STEADY, DYNAMIC], ids=["steady", "dynamic"])
+def test_speed_profile(effects):
+    """26 degrees, 6 grains: the layer keeps to the profile of the one-dimensional equation, far from the local one."""
+    angle, height, material = math.radians(26.0), 6 * GRAIN, stopping.beads("saturating")
+    z, theory = speed_in_theory(material, effects, angle, height)
+    inertial = 0.278 * (math.tan(angle) - 0.3819) / (0.6435 - math.tan(angle))
+    bagnold = 2.0 * inertial / (3.0 * GRAIN) * math.sqrt(0.6 * 9.81 * math.cos(angle)) * height**1.5
+    assert theory[-1] < 0.75 * bagnold
+    rows, found = flow(material, effects, angle, height, lambda h: np.interp(h, z, theory), 0.3, 0.5 * GRAIN)
+    np.testing.assert_allclose(found, np.interp(rows, z, theory), atol=0.03 * theory[-1])
+
+
+@pytest.mark.parametrize(("grains", "flows"), [(2.4, False), (2.7, False), (3.1, True)])
+def test_layers_stop_below_the_stopping_height(grains, flows):
+    """24.23 degrees, linear law: 2.89 grains."""
+    angle = math.radians(24.23)
+    assert stopping.stopping_height("linear", 24.23)[0] == pytest.approx(2.889, abs=2e-3)
+    _, found = flow(
+        stopping.beads("linear"), DYNAMIC, angle, grains * GRAIN, lambda h: 10.0 * h, 0.15, GRAIN / 3
+    )
+    assert (found[-1] > 1e-3) == flows
+    assert found[-1] < 1e-4 or flows

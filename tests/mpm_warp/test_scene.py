@@ -226,9 +226,8 @@ def test_the_size_is_that_of_the_solver(arrangement):
     assert (size.substeps, size.steps) == (solver.substeps_per_frame, 30 * solver.substeps_per_frame)
     assert size.nodes == len(solver._inverse_mass)
     assert bed.particle_volume == bed.filled[1]
-    arrays = [a for a in vars(solver).values() if isinstance(a, wp.array)] + list(
-        solver._memory._good.values()
-    )
+    held = [*vars(solver).values(), *vars(solver.particles).values(), *solver._memory._good.values()]
+    arrays = [a for a in held if isinstance(a, wp.array)]
     assert sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays) < size.memory
 
 

@@ -23,7 +23,7 @@ from mpm_warp import (
     substeps_per_frame,
 )
 from mpm_warp.auto_effects import expected_flow
-from mpm_warp.limits import Guard, top_body_speed
+from mpm_warp.limits import PhysicalLimits, top_body_speed
 from mpm_warp.material import static_friction
 from mpm_warp.poses import about_y, rotate, sampled_poses
 from mpm_warp.rigid_body import stable_step
@@ -112,7 +112,7 @@ def test_the_fastest_point_counts():
     rim = 120.0 * math.pi * scene.tool.reach
     assert top_body_speed(scene) == pytest.approx(rim)
     assert substeps_per_frame(scene) > 2 * substeps_per_frame(turning((0.0, 0.0)))
-    assert Guard(scene, 1e-4).speed_bound > 4.0 * rim
+    assert PhysicalLimits(scene, 1e-4).top_speed > 4.0 * rim
     np.testing.assert_allclose(expected_flow(scene).speed, rim)
 
 

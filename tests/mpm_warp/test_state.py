@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from mpm_warp import Bed, Effects, Incline, Material, SceneError, Solver, SolverStopped, State, Walls, Wheel
-from mpm_warp.batch import all_together
-from mpm_warp.limits import Guard
+from mpm_warp.limits import PhysicalLimits
+from mpm_warp.solver import run_concurrently
 from sgns_testing.scenes import UNDAMPED, block, cut
+from sgns_testing.solvers import assert_same_frames, change
 
 
 def wheel() -> Wheel:
@@ -22,6 +23,17 @@ def wheel() -> Wheel:
 def slope(**kw) -> Incline:
     bed = Bed(size=(0.08, 0.08, 0.04), spacing=0.02, headroom=0.04, walls=Walls(x="periodic", y="periodic"))
     return Incline(bed=bed, material=Material(friction_angle=20.0), duration=0.1, flowing=False, tilt=30.0)
+
+
+def with_state(scene, effects=None, frame=2):
+    """All frames, and the state at one of them."""
+    solver, whole, state = Solver(scene, effects), [], None
+    for found in solver.frames():
+        whole.append(found)
+        if found.index == frame:
+            state = solver.state()
+    assert state.frame == frame
+    return whole, state
 
 
 @pytest.mark.parametrize(
@@ -37,64 +49,54 @@ def slope(**kw) -> Incline:
     ids=["cut", "half", "fluidity", "nonlocal", "wheel", "periodic"],
 )
 def test_the_rest_is_bit_equal(scene, effects):
-    """A second solver that starts from a frame of the first goes on as the first did."""
-    solver, whole, state = Solver(scene, effects), [], None
-    for frame in solver.frames():
-        whole.append(frame)
-        if frame.index == 2:
-            state = solver.state()
-    assert state.frame == 2
-    rest = list(Solver(scene, effects, start=state).frames())
-    assert [f.index for f in rest] == [f.index for f in whole[3:]]
-    for one, two in zip(rest, whole[3:], strict=True):
-        for name in ("position", "velocity", "body_pose", "force", "torque"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    """A second solver that starts from a frame of the first goes on as the first did, every time that it is asked."""
+    whole, state = with_state(scene, effects)
+    later = Solver(scene, effects, start=state)
+    state.arrays["position"] += 1.0  # no longer the solver's business
+    assert_same_frames(later.frames(), whole[3:])
+    stages = [stage for _, stage in run_concurrently([later.stages()], 1, "cpu")]
+    assert_same_frames(stages, whole[3:])
 
 
-def stopped(scene, frame: int = 3) -> tuple[list, SolverStopped]:
-    """Frames of a solver that loses a particle in `frame`, and the error."""
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("velocity", 20.0, r"it moves at 34.6 m/s, which nothing here can cause \(\d"),
+        ("velocity", np.nan, r"particle \d+ at .* of frame 3: its speed is not finite"),
+        ("elastic_strain", np.nan, "speed is not finite"),
+    ],
+)
+def test_what_soil_cannot_do_stops_the_solver(name, value, words):
+    """It gives its last good frame, from where a solver with a shorter step goes on, near to where an undisturbed one
+    gets."""
+    scene = cut(duration=0.1, material=Material(youngs_modulus=1e6))
     solver, frames = Solver(scene), []
-    with pytest.raises(SolverStopped) as caught:
+    with pytest.raises(SolverStopped, match=words) as caught:
         for found in solver.frames():
             frames.append(found)
-            if found.index == frame - 1:
-                v = solver._v.numpy()
-                v[17] = np.nan
-                solver._v.assign(v)
-    return frames, caught.value
-
-
-def test_a_stopped_solver_gives_its_last_good_frame():
-    """From there a solver with a shorter step goes on, near to where an undisturbed one gets."""
-    frames, error = stopped(cut(duration=0.1))
-    assert error.state.frame == frames[-1].index == 2
-    np.testing.assert_array_equal(error.state.arrays["position"].astype(np.float32), frames[-1].position)
-    shorter = replace(cut(duration=0.1), courant=0.3)
-    *_, last = Solver(shorter, start=error.state).frames()
-    *_, undisturbed = Solver(cut(duration=0.1)).frames()
+            if found.index == 2:
+                change(getattr(solver.particles, name), value, at=17)
+    text, state = str(caught.value), caught.value.state
+    assert "\n" not in text
+    assert "particle" in text and "substep" in text and "of frame 3" in text
+    assert state.frame == frames[-1].index == 2
+    np.testing.assert_array_equal(state.arrays["position"].astype(np.float32), frames[-1].position)
+    *_, last = Solver(replace(scene, courant=0.3), start=state).frames()
+    *_, undisturbed = Solver(scene).frames()
     assert last.index == undisturbed.index
     assert np.abs(last.position - undisturbed.position).max() < 1e-3
 
 
-@pytest.mark.parametrize("stopping", ["speed", "nan"])
-def test_what_soil_cannot_do_stops_the_solver(stopping):
-    scene = cut(duration=0.1, material=Material(youngs_modulus=1e6))
-    solver = Solver(scene)
+def test_with_symmetry_the_message_names_the_right_particle():
+    """15 rows across: particles on the plane of symmetry come first and count half."""
+    scene = cut(duration=0.1, bed=Bed(size=(0.5, 0.375, 0.16), spacing=0.025, headroom=0.12))
+    solver = Solver(scene, Effects(symmetry=True))
+    assert solver._half.on_plane < 500
     frames = solver.frames()
     next(frames)
-    array, value, words = {
-        "speed": (solver._v, 20.0, r"it moves at 34.6 m/s, which nothing here can cause \(\d"),
-        "nan": (solver._e, np.nan, "speed is not finite"),
-    }[stopping]
-    values = array.numpy()
-    values[17] = value
-    array.assign(values)
-    with pytest.raises(SolverStopped, match=words) as caught:
+    change(solver.particles.velocity, np.nan, at=500)
+    with pytest.raises(SolverStopped, match=f"^particle {solver._half.kept[500]} at "):
         next(frames)
-    text = str(caught.value)
-    assert "\n" not in text
-    assert "particle" in text and "substep" in text and "of frame 1" in text
-    assert caught.value.state.frame == 0
 
 
 @pytest.mark.parametrize(
@@ -110,10 +112,10 @@ def test_what_soil_cannot_do_stops_the_solver(stopping):
 )
 def test_strains_that_soil_cannot_have(volume, shear, courant, words):
     scene = cut(courant=courant)
-    guard = Guard(scene, Solver(scene).time_step)
+    limits = PhysicalLimits(scene, Solver(scene).time_step)
     ln_j, strain = np.full(5, -0.01), np.zeros((5, 6))
     ln_j[3], strain[3, 4] = volume, shear
-    found = guard.too_strained(ln_j, strain)
+    found = limits.too_strained(ln_j, strain)
     if words is None:
         assert found is None
     else:
@@ -130,6 +132,7 @@ def test_a_body_that_jumps_stops_the_solver():
 
 
 def test_a_state_of_another_scene_is_refused():
+    assert Solver(cut()).state() is None
     solver = Solver(cut(duration=0.1))
     next(solver.frames())
     state = solver.state()
@@ -140,19 +143,6 @@ def test_a_state_of_another_scene_is_refused():
     state.arrays["log_volume"][3] = np.nan
     with pytest.raises(SceneError, match="log_volume is not finite"):
         Solver(cut(), start=state)
-
-
-def test_nothing_to_go_on_from_before_the_first_frame():
-    assert Solver(cut()).state() is None
-
-
-def same(one, two) -> bool:
-    """Whether two sequences of frames are equal bit by bit."""
-    return len(one) == len(two) and all(
-        np.array_equal(getattr(a, name), getattr(b, name))
-        for a, b in zip(one, two, strict=True)
-        for name in ("index", "time", "position", "velocity", "body_pose", "body_points", "force", "torque")
-    )
 
 
 @pytest.mark.parametrize(
@@ -168,31 +158,16 @@ def test_every_call_begins_anew(scene, effects):
     """Whatever the call before left: all frames, some of them, none, or a soil that went wrong."""
     solver = Solver(scene, effects)
     first = list(solver.frames())
-    assert same(list(solver.frames()), first)
+    assert_same_frames(solver.frames(), first)
     some = [frame for frame, _ in zip(solver.frames(), range(2), strict=False)]
-    assert same(some, first[:2])
-    solver._v.fill_(np.nan)
+    assert_same_frames(some, first[:2])
+    solver.particles.velocity.fill_(np.nan)
     frames = solver.frames()
     next(frames)
-    solver._v.fill_(np.nan)
+    solver.particles.velocity.fill_(np.nan)
     with pytest.raises(SolverStopped):
         next(frames)
-    assert same(list(solver.frames()), first)
-
-
-def test_every_call_begins_at_the_state_that_was_given():
-    scene, whole = cut(duration=0.1), []
-    solver = Solver(scene)
-    for frame in solver.frames():
-        whole.append(frame)
-        if frame.index == 2:
-            state = solver.state()
-    later = Solver(scene, start=state)
-    state.arrays["position"] += 1.0  # no longer the solver's business
-    assert same(list(later.frames()), whole[3:])
-    assert same(list(later.frames()), whole[3:])
-    stages = [stage for _, stage in all_together([later.stages()], 1, "cpu")]
-    assert same(stages, whole[3:])
+    assert_same_frames(solver.frames(), first)
 
 
 def test_an_earlier_call_ends_where_a_later_one_begins():
@@ -202,9 +177,9 @@ def test_an_earlier_call_ends_where_a_later_one_begins():
     first = next(later)
     with pytest.raises(SceneError, match="asked for again, and it began anew: take them from the later call"):
         next(earlier)
-    assert same([first, *later], list(Solver(cut(duration=0.05)).frames()))
+    assert_same_frames([first, *later], Solver(cut(duration=0.05)).frames())
     with pytest.raises(SceneError, match="make a Solver for each"):
-        list(all_together([solver.stages(), solver.stages()], 2, "cpu"))
+        list(run_concurrently([solver.stages(), solver.stages()], 2, "cpu"))
 
 
 def test_what_was_given_stays_as_it_was():
@@ -217,6 +192,6 @@ def test_what_was_given_stays_as_it_was():
         before = copy.deepcopy((given, state))
         for _ in frames:
             pass
-        assert same(given, before[0])
+        assert_same_frames(given, before[0])
         for name, array in before[1].arrays.items():
             np.testing.assert_array_equal(state.arrays[name], array)

@@ -10,9 +10,7 @@ import numpy as np
 import warp as wp
 
 from mpm_warp import Effects, Material, Solver
-from mpm_warp.kernels.constitutive import constitutive
-from mpm_warp.kernels.fluidity import soil_parameters, soil_struct
-from mpm_warp.launch import start_warp
+from sgns_testing.points import shear_stress, updated
 from sgns_testing.scenes import block, cut
 
 from .measures import frames_of
@@ -32,8 +30,8 @@ LAWS = {
 DT = 2.0e-4  # [s]
 
 
-def updated(effects: Effects, material: Material, pressure, ratio, a=None, g=1.0, real=wp.float32):
-    """mu, pressure [Pa] and the new fluidity after a step at trial states.
+def stepped(effects: Effects, material: Material, pressure, ratio, a=0.0, g=1.0, real=wp.float32):
+    """Shear stress and pressure [Pa] and the new fluidity after a step at trial states.
 
     Args:
         pressure: [Pa], shape (n,).
@@ -41,39 +39,12 @@ def updated(effects: Effects, material: Material, pressure, ratio, a=None, g=1.0
         a: dt times the velocity gradient, shape (3, 3).
         g: fluidity before, or the excess of cooperative flow [1/s].
     """
-    start_warp()
-    law, Soil = constitutive(real, effects), soil_struct(real, effects.fluidity)
-    vec6, mat33, update, with_g = law.vec6, law.mat33, law.update, effects.fluidity
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def step(
-        e: wp.array(dtype=vec6),
-        j: wp.array(dtype=real),
-        g: wp.array(dtype=real),
-        a: mat33,
-        dt: real,
-        soil: Soil,
-    ):
-        p = wp.tid()
-        state = update(e[p], j[p], a, dt, soil, g[p])
-        e[p] = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
-        j[p] = state[6]
-        if wp.static(with_g):
-            g[p] = state[7]
-
     pressure, ratio = (np.ravel(v).astype(float) for v in np.broadcast_arrays(pressure, ratio))
-    strain = np.zeros((len(pressure), 6))
-    strain[:, 3] = ratio * pressure / (2.0 * material.shear_modulus)
-    e = wp.array(strain, dtype=vec6, device="cpu")
-    j = wp.array(-pressure / material.bulk_modulus, dtype=real, device="cpu")
-    fluid = wp.array(np.full(len(pressure), g), dtype=real, device="cpu")
-    soil = soil_parameters(real, material, 1.0, effects.fluidity)
-    motion = mat33(*(np.zeros(9) if a is None else np.ravel(a)))
-    wp.launch(step, len(pressure), [e, j, fluid, motion, DT, soil], device="cpu")
-    found, p = e.numpy().astype(float), -material.bulk_modulus * j.numpy().astype(float)
-    size = np.sqrt(np.sum(found[:, :3] ** 2, axis=1) + 2.0 * np.sum(found[:, 3:] ** 2, axis=1))
-    tau = np.sqrt(2.0) * material.shear_modulus * size
-    return tau, p, fluid.numpy().astype(float)
+    strain = np.zeros((len(pressure), 3, 3))
+    strain[:, 0, 1] = strain[:, 1, 0] = ratio * pressure / (2.0 * material.shear_modulus)
+    ln_j = -pressure / material.bulk_modulus
+    strain, ln_j, g = updated(material, strain, ln_j, a, DT, g=g, effects=effects, real=real)
+    return shear_stress(material, strain), -material.bulk_modulus * ln_j, g
 
 
 def no_pressure(law: str) -> tuple[float, str]:
@@ -88,24 +59,24 @@ def no_pressure(law: str) -> tuple[float, str]:
     shear = np.zeros((3, 3))
     shear[0, 2] = 1e-3
     worst = 0.0
-    for a in (None, shear):
-        tau, p, g = updated(effects, material, pressure, ratio, a)
+    for a in (0.0, shear):
+        tau, p, g = stepped(effects, material, pressure, ratio, a)
         if not (np.isfinite(tau).all() and np.isfinite(p).all() and np.isfinite(g).all()):
             return np.nan, "the update at a point is not finite"
         most = material.limit_friction * np.maximum(p, 0.0)
         if material.rate_law == "linear":
-            trial = ratio.ravel() * pressure.ravel() + material.shear_modulus * 1e-3 * (a is not None)
+            trial = ratio.ravel() * pressure.ravel() + material.shear_modulus * 1e-3 * np.any(a)
             most = np.maximum(most, 1.001 * trial)
         # Where stress has no meaning in single precision any more, it must be negligible.
         worst = max(worst, float(np.max(tau / (most + 1e-6))))
     scene = block(duration=0.05, frame_rate=20.0, material=material)
     solver = Solver(scene, effects)
     turning = np.cross([3.0, -2.0, 5.0], scene.initial_positions() - 0.15)
-    solver._v.assign(turning + 0.2 * np.random.default_rng(0).normal(size=turning.shape))
-    start = solver._v.numpy().astype(float)
+    solver.particles.velocity.assign(turning + 0.2 * np.random.default_rng(0).normal(size=turning.shape))
+    start = solver.particles.velocity.numpy().astype(float)
     for _ in solver.frames():
         pass
-    lost = np.linalg.norm(np.sum(solver._v.numpy() - start, axis=0)) / np.abs(start).sum()
+    lost = np.linalg.norm(np.sum(solver.particles.velocity.numpy() - start, axis=0)) / np.abs(start).sum()
     return max(
         worst, float(lost) / 1e-4
     ), f"shear stress {worst:.3g} of its bound; momentum lost {lost:.2g} (1e-4)"
@@ -123,7 +94,7 @@ def near(friction: str, laws: tuple[str, ...]) -> tuple[float, str]:
         centre = getattr(material, f"{friction}_friction")
         for pressure in (1.0, 1e3, 1e5):
             for g in (0.0, 1e-6, 1.0, 1e4):
-                tau, p, after = updated(effects, material, pressure, centre + offsets, g=g, real=wp.float64)
+                tau, p, after = stepped(effects, material, pressure, centre + offsets, g=g, real=wp.float64)
                 mu = tau / p
                 if not (np.isfinite(mu).all() and np.isfinite(after).all()):
                     return np.nan, f"{name} at {pressure:g} Pa, g {g:g} 1/s is not finite"
@@ -174,7 +145,7 @@ def inverted() -> tuple[float, str]:
         np.full((3, 3), 50.0),
         3e3 * np.eye(3),
     ):
-        tau, p, _ = updated(Effects(), SAND, np.logspace(-3, 5, 9), 0.5, a)
+        tau, p, _ = stepped(Effects(), SAND, np.logspace(-3, 5, 9), 0.5, a)
         if not (np.isfinite(tau).all() and np.isfinite(p).all()):
             return np.nan, f"not finite after {a.tolist()}"
         worst = max(worst, float(np.max(tau / (SAND.limit_friction * np.maximum(p, 0.0) + 1e-6))))

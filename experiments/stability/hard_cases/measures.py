@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
+from leakage import leakage
 
 from mpm_warp import Frame, Scene, SceneError, Solver, SolverStopped
-from mpm_warp.diagnostics import leakage
 from mpm_warp.poses import rotate
 from sgns.config import UserError
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from leakage import leakage
 
 from mpm_warp import (
     Bed,
@@ -21,7 +22,6 @@ from mpm_warp import (
     Solver,
     Walls,
 )
-from mpm_warp.diagnostics import leakage
 from sgns_testing.scenes import BlockBed, block, cut
 
 from .measures import energies, frames_of, shares, stopped_with, top_speed, volume_gain, work_on_soil
@@ -226,7 +226,7 @@ def push_without_gravity() -> tuple[float, str]:
     scene = cut(bed=free.bed, gravity=0.0, motion="path", path=path, duration=0.05, frame_rate=200.0)
     solver = Solver(scene)
     impulse = sum(f.force for f in solver.frames()) / scene.frame_rate
-    gained = solver._grid.particle_mass * solver._v.numpy().astype(float).sum(axis=0)
+    gained = solver._grid.particle_mass * solver.particles.velocity.numpy().astype(float).sum(axis=0)
     return float(np.linalg.norm(impulse + gained) / np.linalg.norm(gained)), f"{gained[0]:.3g} N s given"
 
 

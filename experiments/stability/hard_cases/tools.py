@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from leakage import leakage
 
 from mpm_warp import Effects, Excavation, MeshBody, Plate, Push, Solver
-from mpm_warp.diagnostics import leakage
 from sgns_testing.meshes import box_corners, box_triangles, write_obj
 from sgns_testing.scenes import cut
 

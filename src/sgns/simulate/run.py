@@ -13,8 +13,8 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from mpm_warp import Effects, Scene, Solver, SolverStopped, State
-from mpm_warp.batch import all_together
-from mpm_warp.launch import Work
+from mpm_warp.launch import Job
+from mpm_warp.solver import run_concurrently
 from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.data.run import Run, read_state
@@ -175,7 +175,9 @@ class Timing:
 
 def simulate_scene(scene: Scene, output: Path, **settings: Any) -> Timing:
     """Compute a scene and write its run file; arguments as in `scene_stages`."""
-    ((_, timing),) = all_together([scene_stages(scene, output, **settings)], 1, settings.get("device", "cpu"))
+    ((_, timing),) = run_concurrently(
+        [scene_stages(scene, output, **settings)], 1, settings.get("device", "cpu")
+    )
     return timing
 
 
@@ -190,7 +192,7 @@ def scene_stages(
     precision: str = "float32",
     progress: Any = None,
     restart: Restart | None = None,
-) -> Generator[Timing | Work, None, None]:
+) -> Generator[Timing | Job, None, None]:
     """Compute a scene and write its run file, with the particles that `scene.bed.store_every` leaves in it.
 
     Args:
@@ -199,7 +201,7 @@ def scene_stages(
         restart: a stopped run of this scene; its frames are copied and the solver begins after them.
 
     Yields:
-        All work that the device has to do (mpm_warp.launch.Work), and at the end what it cost.
+        All work that the device has to do (mpm_warp.launch.Job), and at the end what it cost.
 
     Raises:
         SolverStopped: the line says where the frames before it are kept and how to go on.
@@ -239,7 +241,7 @@ def scene_stages(
         wall_time, seen, shared_by = before, None, 1
         try:
             for stage in solver.stages():
-                if isinstance(stage, Work):
+                if isinstance(stage, Job):
                     if there and stage.steps and seen is None:
                         seen = time.perf_counter()
                     yield stage

@@ -20,8 +20,8 @@ import numpy as np
 from tqdm import tqdm
 
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
-from mpm_warp.batch import all_together
-from mpm_warp.launch import Work
+from mpm_warp.launch import Job
+from mpm_warp.solver import run_concurrently
 from sgns.clock import elapsed
 from sgns.config import UserError, flattened
 from sgns.data.files import file_lock, remove_abandoned
@@ -304,7 +304,7 @@ def _make_share(
     `_make` says of each."""
     tasks = (_make(*job, seed, device, precision) for _, *job in jobs)
     outcomes = {}
-    for number, outcome in all_together(tasks, batch, device):
+    for number, outcome in run_concurrently(tasks, batch, device):
         name, index, *_ = jobs[number]
         outcomes[name] = outcome
         _ended[index] = True
@@ -320,7 +320,7 @@ def _make(
     seed: int,
     device: str,
     precision: str,
-) -> Generator[tuple[str, str] | Work, None, None]:
+) -> Generator[tuple[str, str] | Job, None, None]:
     """Make one run unless another process does, passing on the work for the device; gives made, elsewhere or failed,
     and what went wrong in words."""
 
@@ -342,7 +342,7 @@ def _make(
                 outcome = "elsewhere", ""
             else:
                 for stage in scene_stages(scene, output, progress=count_frame, **settings):
-                    if isinstance(stage, Work):
+                    if isinstance(stage, Job):
                         yield stage
     except (UserError, SceneError, SolverStopped) as error:
         outcome = "failed", str(error)

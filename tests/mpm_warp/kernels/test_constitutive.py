@@ -1,6 +1,7 @@
 """The stress update at a single point, against exact answers (float64) and in float32."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,70 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from mpm_warp import Effects, Material
 from mpm_warp.kernels.constitutive import constitutive
-from mpm_warp.kernels.fluidity import soil_parameters, soil_struct
+from sgns_testing.points import COLUMN, ROW, shear_stress, sheared, updated
 
 SAND = Material(youngs_modulus=15e6)
-ALL = Effects()
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
-
-class Point:
-    """Runs the Warp functions on many single points."""
-
-    def __init__(self, real=wp.float64, effects=ALL, material=SAND):
-        law, Soil = constitutive(real, effects), soil_struct(real, effects.fluidity)
-        vec6, mat33 = law.vec6, law.mat33
-        update, trial, volume = law.update, law.strain_trial, law.volume_step
-
-        @wp.kernel(module="unique", enable_backward=False)
-        def steps(
-            e: wp.array(dtype=vec6),
-            j: wp.array(dtype=real),
-            a: wp.array(dtype=mat33),
-            dt: real,
-            n: int,
-            soil: Soil,
-        ):
-            p = wp.tid()
-            for _ in range(n):
-                state = update(e[p], j[p], a[p], dt, soil, real(0.0))
-                e[p] = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
-                j[p] = state[6]
-
-        @wp.kernel(module="unique", enable_backward=False)
-        def trials(e: wp.array(dtype=vec6), j: wp.array(dtype=real), a: wp.array(dtype=mat33)):
-            p = wp.tid()
-            e[p] = trial(e[p], a[p])
-            j[p] = volume(a[p])
-
-        self._steps, self._trials, self.types = steps, trials, (vec6, real, mat33)
-        self.soil = soil_parameters(real, material, 1.0, effects.fluidity)
-
-    def _arrays(self, strain, ln_j, a):
-        six = np.array([[s[i, k] for i, k in PAIRS] for s in strain])
-        vec6, real, mat33 = self.types
-        return (
-            wp.array(six, dtype=vec6, device="cpu"),
-            wp.array(ln_j, dtype=real, device="cpu"),
-            wp.array(a, dtype=mat33, device="cpu"),
-        )
-
-    @staticmethod
-    def _full(six):
-        full = np.empty((len(six), 3, 3))
-        for n, (i, k) in enumerate(PAIRS):
-            full[:, i, k] = full[:, k, i] = six[:, n]
-        return full
-
-    def update(self, strain, ln_j, a, dt, n=1):
-        e, j, a = self._arrays(strain, ln_j, a)
-        wp.launch(self._steps, len(ln_j), [e, j, a, dt, n, self.soil], device="cpu")
-        return self._full(e.numpy()), j.numpy()
-
-    def trial(self, strain, a):
-        e, j, a = self._arrays(strain, np.zeros(len(a)), a)
-        wp.launch(self._trials, len(a), [e, j, a], device="cpu")
-        return self._full(e.numpy()), j.numpy()
+ELASTIC = Effects(yielding=False, rate_dependence=False, separation=False)
+NOTHING = np.zeros((1, 3, 3))
 
 
 def random_strains(rng, n, size):
@@ -81,6 +23,25 @@ def random_strains(rng, n, size):
     s = s + np.swapaxes(s, 1, 2)
     s -= np.trace(s, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3
     return size * s / np.linalg.norm(s, axis=(1, 2), keepdims=True)
+
+
+def trial(strain, a):
+    """The trial strains (n, 3, 3) and the changes of ln J (n,)."""
+    law = constitutive(wp.float64, Effects())
+    vec6, mat33, strain_trial, volume_step = law.vec6, law.mat33, law.strain_trial, law.volume_step
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def run(e: wp.array(dtype=vec6), ln_j: wp.array(dtype=wp.float64), a: wp.array(dtype=mat33)):
+        p = wp.tid()
+        e[p] = strain_trial(e[p], a[p])
+        ln_j[p] = volume_step(a[p])
+
+    e = wp.array(strain[:, ROW, COLUMN], dtype=vec6, device="cpu")
+    ln_j = wp.zeros(len(a), dtype=wp.float64, device="cpu")
+    wp.launch(run, len(a), [e, ln_j, wp.array(a, dtype=mat33, device="cpu")], device="cpu")
+    full = np.empty(a.shape)
+    full[:, ROW, COLUMN] = full[:, COLUMN, ROW] = e.numpy()
+    return full, ln_j.numpy()
 
 
 def exact_trial(strain, a):
@@ -104,7 +65,7 @@ def test_trial_strain_is_the_matrix_logarithm(size, step, tolerance):
     rng = np.random.default_rng(0)
     strain, a = random_strains(rng, 20, size), rng.normal(size=(20, 3, 3))
     a *= step / np.linalg.norm(a, axis=(1, 2), keepdims=True)
-    found, volume = Point().trial(strain, a)
+    found, volume = trial(strain, a)
     exact = np.array([exact_trial(s, x) for s, x in zip(strain, a, strict=True)])
     assert np.abs(found - exact).max() < tolerance * step
     np.testing.assert_allclose(volume, np.log(np.linalg.det(np.eye(3) + a)), rtol=1e-6, atol=1e-12)
@@ -113,52 +74,47 @@ def test_trial_strain_is_the_matrix_logarithm(size, step, tolerance):
 def test_float32_keeps_slow_straining():
     """Ten thousand steps of 1e-7 on a strain of 1e-4: what a stored deformation gradient would lose."""
     steps, rate = 10_000, 1e-7
-    strain = np.zeros((1, 3, 3))
-    strain[0, 0, 0], strain[0, 1, 1] = 1e-4, -1e-4
-    a = np.zeros((1, 3, 3))
-    a[0, 0, 2] = rate
-    elastic = Effects(yielding=False, rate_dependence=False, separation=False)
-    single, _ = Point(wp.float32, elastic).update(strain, np.array([-1e-3]), a, 1e-4, steps)
-    double, _ = Point(wp.float64, elastic).update(strain, np.array([-1e-3]), a, 1e-4, steps)
+    strain = np.array([np.diag([1e-4, -1e-4, 0.0])])
+    single, double = (
+        updated(SAND, strain, -1e-3, sheared(rate), 1e-4, steps, effects=ELASTIC, real=real)[0]
+        for real in (wp.float32, wp.float64)
+    )
     assert np.abs(single - double).max() < 1e-3 * np.abs(double).max()
 
 
+@pytest.mark.parametrize("law", ["saturating", "linear"])
 @pytest.mark.parametrize("rate", [0.1, 10.0, 1000.0])
-def test_simple_shear_reaches_mu_of_i(rate):
+def test_simple_shear_reaches_mu_of_i(rate, law):
     """Steady simple shear at constant volume: tau / p = mu(I) exactly, at any rate."""
-    pressure, dt = 1000.0, 1e-5
-    ln_j = np.array([-pressure / SAND.bulk_modulus])
-    a = np.zeros((1, 3, 3))
-    a[0, 0, 2] = rate * dt
+    pressure, dt, material = 1000.0, 1e-5, replace(SAND, rate_law=law)
+    ln_j = -pressure / SAND.bulk_modulus
     # Enough strain to pass the elastic range (p / G is about 2e-4), whatever the rate.
-    strain, after = Point().update(np.zeros((1, 3, 3)), ln_j, a, dt, int(2e-2 / (rate * dt)) + 2000)
-    assert after == pytest.approx(ln_j, rel=1e-9)
-    tau = math.sqrt(2.0) * SAND.shear_modulus * np.linalg.norm(strain[0])
-    inertial = rate * SAND.grain_diameter * math.sqrt(SAND.grain_density / pressure)
-    mu = SAND.static_friction + (SAND.limit_friction - SAND.static_friction) / (
-        1 + SAND.reference_inertial_number / inertial
+    steps = int(2e-2 / (rate * dt)) + 2000
+    strain, after, _ = updated(material, NOTHING, ln_j, sheared(rate * dt), dt, steps)
+    assert after[0] == pytest.approx(ln_j, rel=1e-9)
+    number = (
+        rate * SAND.grain_diameter * math.sqrt(SAND.grain_density / pressure) / SAND.reference_inertial_number
     )
+    share = number if law == "linear" else number / (1.0 + number)
+    mu = SAND.static_friction + (SAND.limit_friction - SAND.static_friction) * share
     # The plastic rate equals the shear rate up to the elastic strain's small rotation.
-    assert tau / pressure == pytest.approx(mu, rel=2e-4)
+    assert shear_stress(SAND, strain)[0] / pressure == pytest.approx(mu, rel=2e-4)
 
 
 def test_without_rate_dependence_friction_is_static():
-    a = np.zeros((1, 3, 3))
-    a[0, 0, 2] = 1e-3
     effects = Effects(rate_dependence=False)
-    strain, _ = Point(effects=effects).update(np.zeros((1, 3, 3)), np.array([-1e-4]), a, 1e-5, 2000)
-    tau = math.sqrt(2.0) * SAND.shear_modulus * np.linalg.norm(strain[0])
-    assert tau == pytest.approx(SAND.static_friction * SAND.bulk_modulus * 1e-4, rel=1e-9)
+    strain, *_ = updated(SAND, NOTHING, -1e-4, sheared(1e-3), 1e-5, 2000, effects=effects)
+    assert shear_stress(SAND, strain)[0] == pytest.approx(
+        SAND.static_friction * SAND.bulk_modulus * 1e-4, rel=1e-9
+    )
 
 
 def test_update_converges_in_the_step():
     """Start of shear at a fixed strain: the error falls in proportion to the step."""
-    ln_j, rate, total = np.array([-5e-5]), 50.0, 4e-4 / 50.0
-    found = []
-    for n in (10, 20, 40, 5120):
-        a = np.zeros((1, 3, 3))
-        a[0, 0, 2] = rate * total / n
-        found.append(Point().update(np.zeros((1, 3, 3)), ln_j, a, total / n, n)[0])
+    rate, total = 50.0, 4e-4 / 50.0
+    found = [
+        updated(SAND, NOTHING, -5e-5, sheared(rate * total / n), total / n, n)[0] for n in (10, 20, 40, 5120)
+    ]
     errors = [np.abs(f - found[-1]).max() for f in found[:-1]]
     assert errors[0] > 1e-12
     assert errors[1] < 0.7 * errors[0]
@@ -170,35 +126,16 @@ def test_frame_indifference():
     rng = np.random.default_rng(1)
     q = Rotation.random(rng=rng).as_matrix()
     strain, a = random_strains(rng, 10, 1e-4), 1e-4 * rng.normal(size=(10, 3, 3))
-    ln_j = np.full(10, -1e-4)
-    plain, j = Point().update(strain, ln_j, a, 1e-4)
-    turned, j_turned = Point().update(q @ strain @ q.T, ln_j, q @ a @ q.T, 1e-4)
+    plain, j, _ = updated(SAND, strain, -1e-4, a, 1e-4)
+    turned, j_turned, _ = updated(SAND, q @ strain @ q.T, -1e-4, q @ a @ q.T, 1e-4)
     np.testing.assert_allclose(turned, q @ plain @ q.T, atol=1e-16)
     np.testing.assert_allclose(j, j_turned, rtol=1e-12)
-
-
-def test_rotation_turns_the_strain():
-    """A quarter turn in small steps carries the elastic strain with it."""
-    n = 2000
-    a = np.zeros((1, 3, 3))
-    a[0, 0, 1], a[0, 1, 0] = -0.5 * math.pi / n, 0.5 * math.pi / n
-    strain = np.zeros((1, 3, 3))
-    strain[0, 0, 0], strain[0, 2, 2] = 1e-4, -1e-4
-    elastic = Effects(yielding=False, rate_dependence=False, separation=False)
-    found, _ = Point(effects=elastic).update(strain, np.zeros(1), a, 1e-4, n)
-    # I + A of a spin stretches by theta^2 / 2n in its plane; the rest is the turned strain.
-    expected = np.diag([0.0, 1e-4, -1e-4])
-    spurious = 0.5 * (0.5 * math.pi) ** 2 / n * np.diag([1.0, 1.0, -2.0]) / 3
-    # The second-order update misses size^2 of the strain in every step.
-    missed = n * 2.0 * (0.5 * math.pi / n) ** 2 * np.linalg.norm(strain)
-    assert missed < 0.01 * np.linalg.norm(strain)
-    np.testing.assert_allclose(found[0], expected + spurious, atol=missed)
 
 
 def test_separated_soil_has_no_stress_and_forgets_its_strain():
     strain = np.array([np.diag([1e-4, -1e-4, 0.0])])
     a = np.array([1e-3 * np.eye(3)])
-    found, ln_j = Point().update(strain, np.array([-1e-3]), a, 1e-4, 1)
+    found, ln_j, _ = updated(SAND, strain, -1e-3, a, 1e-4)
     assert ln_j[0] > 0
     assert not found.any()
 
@@ -208,8 +145,7 @@ def test_return_stays_between_the_two_frictions(real):
     """mu_s p < tau < mu_2 p after yielding, at any pressure down to nothing."""
     rng = np.random.default_rng(2)
     ln_j = -(10.0 ** rng.uniform(-12, -2, 200))
-    strain, after = Point(real).update(random_strains(rng, 200, 0.02), ln_j, np.zeros((200, 3, 3)), 1e-4)
-    tau = math.sqrt(2.0) * SAND.shear_modulus * np.linalg.norm(strain, axis=(1, 2))
-    ratio = tau / (-SAND.bulk_modulus * after)
+    strain, after, _ = updated(SAND, random_strains(rng, 200, 0.02), ln_j, NOTHING, 1e-4, real=real)
+    ratio = shear_stress(SAND, strain) / (-SAND.bulk_modulus * after)
     assert np.all(ratio > SAND.static_friction * (1 - 1e-5))
     assert np.all(ratio < SAND.limit_friction * (1 + 1e-5))

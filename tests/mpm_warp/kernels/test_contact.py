@@ -29,7 +29,7 @@ def test_sliding_friction_is_coulombs_at_any_speed(speed, friction):
     duration = 0.004 / speed
     height = (
         0.03 - 0.01 - 0.0001
-    )  # the highest particles' centres are half a particle spacing below the surface
+    )  # the highest particles' centres lie half a particle spacing below the surface
     scene = Push(
         bed=BED,
         tool=lid,
@@ -67,6 +67,7 @@ def test_a_body_scene_survives_plain_data(tool):
     scene = Push(bed=BED, tool=tool, path=path(0.2, 0.1))
     assert Scene.from_dict(scene.to_dict()) == scene
     assert len(scene.body_points()) == len(tool.points())
+    assert scene.mesh is None
 
 
 @pytest.mark.parametrize(
@@ -105,4 +106,3 @@ def test_a_mesh_scene_survives_plain_data_with_its_mesh(tmp_path):
     again = Scene.from_dict(scene.to_dict(), scene.mesh)
     assert again == scene
     np.testing.assert_array_equal(again.body_points(), scene.body_points())
-    assert Push(bed=BED, path=path(0.2, 0.1)).mesh is None

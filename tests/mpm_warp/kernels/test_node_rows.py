@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import warp as wp
 
-from mpm_warp.kernels.node_rows import rows
+from mpm_warp.kernels.node_rows import row_operations
 
 
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 @pytest.mark.parametrize("gpu", [False, True])
 def test_row_operations(real, gpu):
     """Node k of row 2..4 of six nodes: everything the transfers do with a row, once."""
-    lanes = rows(real, gpu)
+    lanes = row_operations(real, gpu)
     vec3, vec4, row = wp.types.vector(3, real), wp.types.vector(4, real), lanes.row
     plus, gather, scatter, spread, fold = lanes.plus, lanes.gather, lanes.scatter, lanes.spread, lanes.fold
 

@@ -38,27 +38,31 @@ def distances(body, points, real=wp.float64, margin=0.0):
     return found.numpy()[:, :3], found.numpy()[:, 3]
 
 
-def test_box():
-    normal, distance = distances(
-        Plate(thickness=0.04, width=0.4, length=0.2),
-        [[0.03, 0, 0], [0, 0, -0.13], [0.015, 0.1, 0.05], [0.05, 0, 0.14], [-0.018, 0, 0]],
-    )
-    np.testing.assert_allclose(distance, [0.01, 0.03, -0.005, 0.05, -0.002], atol=1e-15)
-    np.testing.assert_allclose(
-        normal, [[1, 0, 0], [0, 0, -1], [1, 0, 0], [0.6, 0, 0.8], [-1, 0, 0]], atol=1e-12
-    )
+R = math.sqrt(0.5)
 
 
-def test_smooth_cylinder():
-    r = math.sqrt(0.5)
-    normal, distance = distances(
-        Cylinder(diameter=0.2, width=0.1),
-        [[0.0, 0, -0.12], [0.07 * r, 0.01, 0.07 * r], [0.05, -0.048, 0], [0.13, 0.09, 0], [0, 0.07, 0]],
-    )
-    np.testing.assert_allclose(distance, [0.02, -0.03, -0.002, 0.05, 0.02], atol=1e-12)
-    np.testing.assert_allclose(
-        normal, [[0, 0, -1], [r, 0, r], [0, -1, 0], [0.6, 0.8, 0], [0, 1, 0]], atol=1e-12
-    )
+@pytest.mark.parametrize(
+    ("body", "points", "exact", "normals"),
+    [
+        (
+            Plate(thickness=0.04, width=0.4, length=0.2),
+            [[0.03, 0, 0], [0, 0, -0.13], [0.015, 0.1, 0.05], [0.05, 0, 0.14], [-0.018, 0, 0]],
+            [0.01, 0.03, -0.005, 0.05, -0.002],
+            [[1, 0, 0], [0, 0, -1], [1, 0, 0], [0.6, 0, 0.8], [-1, 0, 0]],
+        ),
+        (
+            Cylinder(diameter=0.2, width=0.1),
+            [[0.0, 0, -0.12], [0.07 * R, 0.01, 0.07 * R], [0.05, -0.048, 0], [0.13, 0.09, 0], [0, 0.07, 0]],
+            [0.02, -0.03, -0.002, 0.05, 0.02],
+            [[0, 0, -1], [R, 0, R], [0, -1, 0], [0.6, 0.8, 0], [0, 1, 0]],
+        ),
+    ],
+    ids=["plate", "cylinder"],
+)
+def test_known_distances(body, points, exact, normals):
+    normal, distance = distances(body, points)
+    np.testing.assert_allclose(distance, exact, atol=1e-12)
+    np.testing.assert_allclose(normal, normals, atol=1e-12)
 
 
 def test_grousers_stand_on_the_rim():
@@ -70,7 +74,7 @@ def test_grousers_stand_on_the_rim():
         [0, 0, -0.13],  # of another bar
         [0.11, 0, 0.008],  # beside a bar
         [-0.115, 0, -0.003],  # within one
-        [0.11 * math.sqrt(0.5), 0, 0.11 * math.sqrt(0.5)],  # half-way between two: the rim
+        [0.11 * R, 0, 0.11 * R],  # half-way between two: the rim
     ]
     normal, distance = distances(wheel, points)
     np.testing.assert_allclose(distance, [0.01, 0.01, 0.003, -0.002, 0.01], atol=1e-12)
@@ -88,16 +92,6 @@ def test_thin_grousers_act_although_contact_begins_inside():
     np.testing.assert_array_equal(distance < margin, [True, False, True])
 
 
-def numeric_gradient(body, points, step):
-    return np.stack(
-        [
-            (distances(body, points + step * e)[1] - distances(body, points - step * e)[1]) / (2 * step)
-            for e in np.eye(3)
-        ],
-        axis=-1,
-    )
-
-
 @pytest.mark.parametrize(
     "body",
     [
@@ -113,7 +107,9 @@ def test_the_normal_is_the_gradient_of_the_distance(body):
     points = rng.uniform(-1.5, 1.5, (400, 3)) * body.half_size
     normal, _ = distances(body, points)
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-9)
-    gradient = numeric_gradient(body, points, 1e-6)
+    steps = 1e-6 * np.eye(3)
+    ahead, behind = ([distances(body, points + sign * step)[1] for step in steps] for sign in (1, -1))
+    gradient = (np.array(ahead) - np.array(behind)).T / 2e-6
     # Two faces equally near: the difference quotient is neither's normal; that happens at few random points.
     agree = np.linalg.norm(gradient - normal, axis=1) < 1e-4
     assert agree.mean() > 0.98

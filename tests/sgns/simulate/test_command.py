@@ -10,7 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from mpm_warp import Bed, Effects, Excavation, SolverStopped
-from mpm_warp.batch import all_together
+from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.files import only_here
@@ -89,7 +89,7 @@ def test_a_run_that_stops_leaves_no_file(tmp_path, monkeypatch):
 def test_scenes_side_by_side_share_the_time_that_passes(tmp_path):
     scenes, begin = list(campaign(tmp_path).scenes.values())[:2], time.perf_counter()
     stages = [scene_stages(scene, tmp_path / f"{n}.h5", effects=Effects()) for n, scene in enumerate(scenes)]
-    timings = dict(all_together(stages, 2, "cpu"))
+    timings = dict(run_concurrently(stages, 2, "cpu"))
     passed = time.perf_counter() - begin
     assert 0.0 < sum(timing.wall_time for timing in timings.values()) < passed
     for number, timing in timings.items():
@@ -126,7 +126,7 @@ def test_a_campaign_refuses_a_pipe_before_the_first_frame(tmp_path, monkeypatch)
     os.mkfifo(place)
     described = scene.to_dict(), None
     task = campaign_runs._make(0, described, place, Effects(), Effects().described(), 0, "cpu", "float32")
-    ((_, (kind, words)),) = all_together([task], 1, "cpu")
+    ((_, (kind, words)),) = run_concurrently([task], 1, "cpu")
     assert kind == "failed" and "it is a pipe" in words
     assert campaign_runs._frames_done == [0]
     assert place.is_fifo()

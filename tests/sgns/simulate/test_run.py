@@ -24,7 +24,7 @@ from mpm_warp import (
     effects_for,
 )
 from mpm_warp import mesh as mesh_file
-from mpm_warp.batch import all_together
+from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run, read_state, stopped_path
@@ -161,7 +161,7 @@ def test_a_campaign_says_where_its_run_is_kept(stops, tmp_path, monkeypatch):
     task = campaign_runs._make(
         0, (small().to_dict(), None), output, Effects(), Effects().described(), 0, "cpu", "float32"
     )
-    ((_, (kind, words)),) = all_together([task], 1, "cpu")
+    ((_, (kind, words)),) = run_concurrently([task], 1, "cpu")
     assert kind == "failed"
     assert f"continue_from={stopped_path(output)}" in words
     assert check_run(stopped_path(output))[0].startswith("the run stopped after 4 good frames")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from leakage import leakage, leaked, pushed_plate
 
 from mpm_warp import Frame, Plate, Solver
-from mpm_warp.diagnostics import leakage, leaked
 from mpm_warp.poses import about_y
 from sgns_testing.scenes import cut
 
@@ -44,15 +44,7 @@ def test_a_plate_that_moves_through_resting_soil_leaks():
 def test_plates_do_not_leak(cells, margin):
     """A plate goes down 4 cm and then 10 cm forward: nothing comes through more than half a cell from its edges, and at
     the default margin nothing at all."""
-    rows = [(0.0, 0.104, 0.105), (0.2, 0.104, 0.06), (0.7, 0.204, 0.06)]
-    scene = cut(
-        blade=Plate(length=0.2, width=0.193, thickness=cells * 0.02),
-        contact_margin=margin,
-        motion="path",
-        path=tuple((t, x, 0.2, z, 0, 0, 0, 1) for t, x, z in rows),
-        duration=0.7,
-        frame_rate=100.0,
-    )
+    scene = pushed_plate(cells, margin)
     frames = list(Solver(scene).frames())
     assert -np.mean([f.force[0] for f in frames[40:]]) > 20.0
     assert leakage(frames, scene.body, edge=0.01 if margin < cut().contact_margin else 0.0) == 0.0
