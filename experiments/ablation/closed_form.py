@@ -30,8 +30,17 @@ from sgns.model.dynamics import Dynamics
 from sgns.model.features import moves_freely, varying_context
 from sgns.model.settings import FitSettings, PolynomialSettings
 from sgns.reduction.reduce import ReducedRun, reduce_dataset
-from sgns.train.callbacks import RolloutScore, ValidationRollouts
-from sgns.train.polynomial import best_polynomial, candidates, moments, select, unfitted
+from sgns.train.polynomial import (
+    Moments,
+    best_polynomial,
+    candidates,
+    moments,
+    ridge,
+    select,
+    solved,
+    unfitted,
+)
+from sgns.train.validation import RolloutScore, ValidationRollouts
 from sgns.train.windows import TrainingWindows
 
 HERE = Path(__file__).parent
@@ -122,7 +131,10 @@ def scores(
         shared = time.perf_counter() - began
         for threshold in thresholds:
             began = time.perf_counter()
-            motion, _, force = select(model, candidates(known, settings.penalties, threshold), others[0])
+            found = candidates(known, settings.penalties)
+            if threshold:
+                found = {of: sparse(known[of.noise], of.penalty, threshold) for of in found}
+            motion, _, force = select(model, found, others[0])
             about = {
                 "model": NAMES[degree] + (", sparse" if threshold else " ridge"),
                 "threshold": threshold,
@@ -135,6 +147,28 @@ def scores(
                 "seconds": round(shared + time.perf_counter() - began, 1),
             }
             yield about, [rollouts.measure(model) for rollouts in others]
+
+
+def sparse(known: Moments, penalty: float, threshold: float, rounds: int = 10) -> torch.Tensor:
+    """Sequentially thresholded least squares (SINDy: Brunton, Proctor, Kutz 2016, doi:10.1073/pnas.1517384113): ridge
+    regression of each output, repeated without the terms whose RMS in a normalised output is below a threshold until
+    there is none; shape (m, o), most of them zero."""
+    size = known.gram.diagonal().sqrt()
+    weight = torch.full_like(size, penalty)
+    weight[0] = 0.0
+    full = ridge(known, penalty)
+    found = torch.zeros_like(full)
+    for column, values in enumerate(full.unbind(1)):
+        kept = torch.arange(len(full))
+        for _ in range(rounds):
+            large = values.abs() * size[kept] > threshold
+            if bool(large.all()):
+                break
+            kept = kept[large]
+            gram = known.gram[kept][:, kept] + weight[kept].diag()
+            values = solved(gram, known.target[kept, column, None])[:, 0]
+        found[kept, column] = values
+    return found
 
 
 def own_rows(config: Any, settings: FitSettings, checkpoint: Path | None) -> Iterator[dict[str, Any]]:
@@ -178,7 +212,7 @@ def fold_scores(
     for degree in degrees:
         model = PolynomialSettings(HISTORY, degree, context)
         began = time.perf_counter()
-        fitted = best_polynomial(known, known[::3], PUBLISHED_MODES, model, settings, wheel)
+        fitted = best_polynomial(known, known[::3], PUBLISHED_MODES, model, settings)
         about = {
             "model": f"{NAMES[degree]} ridge",
             "library": len(fitted.dynamics.terms),

@@ -32,9 +32,9 @@ from sgns.data.dataset import Dataset
 from sgns.model.checkpoint import load_surrogate
 from sgns.reduction.reduce import ReducedDataset, ReducedRun, reduce_dataset
 from sgns.train import lightning_module as learning
-from sgns.train.callbacks import RolloutScore, ValidationRollouts
 from sgns.train.command import train
 from sgns.train.lightning_module import SurrogateTraining
+from sgns.train.validation import RolloutScore, ValidationRollouts
 from sgns.train.windows import Batch
 
 HERE = Path(__file__).parent

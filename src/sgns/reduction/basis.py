@@ -260,20 +260,20 @@ def check_centring(centring: str) -> None:
 class ReductionCurves:
     """What the subspace holds for r = 1 … R modes, shape (R,)."""
 
-    energy: np.ndarray
-    """The paper's energy on the training runs."""
-    displacement_energy: np.ndarray
-    """Share of the motion's variance on the training runs."""
-    training: np.ndarray
-    """Reduction MSE on the training runs [m²]."""
-    held_out: np.ndarray
-    """Reduction MSE on other runs [m²] for r = 0 … R, shape (R + 1,); NaN without runs."""
+    energy: np.ndarray  # the paper's energy on the training runs
+    displacement_energy: np.ndarray  # share of the motion's variance on the training runs
+    training: np.ndarray  # reduction MSE on the training runs [m²]
+    held_out: np.ndarray  # reduction MSE on other runs [m²] for r = 0 … R, shape (R + 1,); NaN without runs
 
 
 def reduction_curves(basis: Basis, paths: Sequence[Path]) -> ReductionCurves:
     """Energy and reconstruction error of a basis on the runs that it was fitted on and on the given ones."""
-    own = (np.asarray(of()) for of in (basis.energy, basis.displacement_energy, basis.residual_mse))
-    return ReductionCurves(*own, reconstruction_curve(paths, basis))
+    return ReductionCurves(
+        np.asarray(basis.energy()),
+        np.asarray(basis.displacement_energy()),
+        np.asarray(basis.residual_mse()),
+        reconstruction_curve(paths, basis),
+    )
 
 
 def reconstruction_curve(paths: Sequence[Path], basis: Basis) -> np.ndarray:

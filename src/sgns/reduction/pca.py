@@ -34,7 +34,7 @@ _LARGEST = 1e100
 class _Moments(NamedTuple):
     """What is remembered of the frames absorbed so far, relative to the reference frame."""
 
-    count: int  # frames
+    frames: int
     mean: Tensor  # (3, n) [m]
     sketch: Tensor  # (k, n) [m], orthogonal rows: sketch^T sketch is the scatter per particle and axis
     scatter: float  # trace of that scatter [m^2], dropped directions included
@@ -127,7 +127,7 @@ class IncrementalPCA:
             self._begin(x[0])
         self._input_noise += (torch.finfo(x.dtype).eps / 2 * norm) ** 2
         while len(x):
-            waiting = self.frame_count - self._moments.count
+            waiting = self.frame_count - self._moments.frames
             taken = x[: len(self._pending) - 1 - waiting]
             frames = self._pending[waiting : waiting + len(taken)]
             frames.copy_(taken.to(self.device).permute(0, 2, 1)).sub_(self._reference)
@@ -184,7 +184,7 @@ class IncrementalPCA:
                 f"num_modes is {wanted} but the data has rank {found.rank} ({self.frame_count} frames of "
                 f"{len(found.mean)} particles, centring {centring}); {cure} runs that move differently"
             )
-        rows, modes = 3 * found.moments.count, found.modes[:, :wanted]
+        rows, modes = 3 * found.moments.frames, found.modes[:, :wanted]
         # The first of the (nearly) largest entries, so that a tie is not decided by round-off.
         magnitude = modes.abs()
         first = (magnitude >= (1.0 - 1e-6) * magnitude.amax(0)).to(torch.uint8).argmax(0)
@@ -215,7 +215,7 @@ class IncrementalPCA:
         elif centring == "scalar":
             centre = mean.mean().expand_as(mean)
         if centring != "particle_axis":
-            layout = math.sqrt(moments.count) * (mean - centre)
+            layout = math.sqrt(moments.frames) * (mean - centre)
             total += float(layout.square().sum())
             # The largest rows first: QR then keeps the accuracy of the small ones.
             sketch = torch.cat([layout, sketch])
@@ -225,7 +225,7 @@ class IncrementalPCA:
         error = orthonormality_error(modes)
         if error > 1e-9:
             raise ArithmeticError(f"modes are orthonormal to {error:.1e} only")
-        rows = 3 * moments.count
+        rows = 3 * moments.frames
         largest = float(singular[0]) if len(singular) else 0.0
         # Rounding moves no singular value by more than the Frobenius norm of all rounding errors
         # (Weyl): input, then arithmetic.
@@ -235,11 +235,11 @@ class IncrementalPCA:
 
     def _absorb(self) -> None:
         """Take the full block of pending frames into the moments."""
-        before = self._moments.count
+        before = self._moments.frames
         rows, self._moments = _centred(self._pending, self._moments)
         gram = _gram(rows)
         values, vectors = torch.linalg.eigh(gram)
-        limit = self._weakest * (1.0 - before / self._moments.count)
+        limit = self._weakest * (1.0 - before / self._moments.frames)
         # Round-off may hide that a weak direction holds more than its eigenvalue says.
         first = int((values.clamp_min(_RESOLVED * float(values[-1])) <= limit).sum())
         kept = len(rows) - first
@@ -263,7 +263,7 @@ class IncrementalPCA:
         """The moments with everything that waits merged in; changes nothing."""
         found = self._moments
         waiting = [self._queue[: self._queued]]
-        if pending := self.frame_count - found.count:
+        if pending := self.frame_count - found.frames:
             rows, found = _centred(self._pending[: pending + 1].clone(), found)
             waiting.append(rows)
         room = self._rooms[1]  # empty between merges
@@ -330,12 +330,12 @@ def _centred(frames: Tensor, old: _Moments) -> tuple[Tensor, _Moments]:
     mean = frames[:m].mean(0)
     move = mean - old.mean
     frames[:m] -= mean
-    count = old.count + m
-    if old.count:
-        torch.mul(move, math.sqrt(old.count * m / count), out=frames[m])
-    rows = frames[: m + (old.count > 0)].flatten(0, 1)
+    count = old.frames + m
+    if old.frames:
+        torch.mul(move, math.sqrt(old.frames * m / count), out=frames[m])
+    rows = frames[: m + (old.frames > 0)].flatten(0, 1)
     scatter = old.scatter + float(torch.linalg.vector_norm(rows)) ** 2
-    return rows, old._replace(count=count, mean=old.mean + move * (m / count), scatter=scatter)
+    return rows, old._replace(frames=count, mean=old.mean + move * (m / count), scatter=scatter)
 
 
 def _merged(old: _Moments, rows: Tensor, room: Tensor, gram: Tensor | None = None) -> tuple[_Moments, float]:

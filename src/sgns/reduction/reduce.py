@@ -6,7 +6,6 @@ import hashlib
 import json
 import logging
 import math
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -80,14 +79,14 @@ def choose_modes(basis: Basis, settings: Mapping[str, Any], validation: Sequence
             reconstruction_curve(validation, basis)[1:] if validation else np.asarray(basis.residual_mse())
         )
         values = 1e3 * np.sqrt(curve)
-        key, unit, sign, better, change = "tolerance", " mm", "≤", np.less_equal, "raise"
+        key, unit, sign, change = "tolerance", " mm", "≤", "raise"
         what = f"RMSE on {len(validation)} validation runs" if validation else "RMSE on the training runs"
     else:
         values = np.asarray(getattr(basis, settings["choose"])())
-        key, unit, sign, better, change = "share", "", "≥", np.greater_equal, "lower"
+        key, unit, sign, change = "share", "", "≥", "lower"
         what = f"{settings['choose'].replace('_', ' ')} of the training runs"
     limit = settings[key]
-    enough = better(values, limit)
+    enough = values <= limit if key == "tolerance" else values >= limit
     asked = f"{sign} reduction.{key}={limit:g}{unit}"
     if not enough.any():
         # With fewer modes than were asked for there are no more to be had.
@@ -134,38 +133,25 @@ _SERIES: dict[str, tuple[int | str, ...]] = {
 class ReducedRun:
     """A run whose soil is a few modes."""
 
-    name: str
-    """File name of the run without its ending."""
-    latent: np.ndarray
-    """Modes [m], shape (T, r, 3)."""
-    time: np.ndarray
-    """[s], shape (T,)."""
-    pose: np.ndarray
-    """Centre of mass [m] and quaternion x, y, z, w, shape (T, 7)."""
-    body_points: np.ndarray
-    """World frame [m], shape (T, M, 3)."""
-    force: np.ndarray
-    """By the soil on the body [N], shape (T, 3)."""
-    torque: np.ndarray
-    """About the centre of mass [N m], shape (T, 3)."""
-    scene: dict[str, Any]
-    """The complete scene as plain data."""
+    name: str  # file name of the run without its ending
+    latent: np.ndarray  # modes [m], shape (T, r, 3)
+    time: np.ndarray  # [s], shape (T,)
+    pose: np.ndarray  # centre of mass [m] and quaternion x, y, z, w, shape (T, 7)
+    body_points: np.ndarray  # world frame [m], shape (T, M, 3)
+    force: np.ndarray  # by the soil on the body [N], shape (T, 3)
+    torque: np.ndarray  # about the centre of mass [N m], shape (T, 3)
+    scene: dict[str, Any]  # the complete scene as plain data
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedDataset:
     """A dataset in the basis of its training split."""
 
-    basis: Basis
-    """With all `max_modes` modes; `basis.sliced(r)` keeps the first r, `latent[:, :r]` likewise."""
-    num_modes: int
-    """r, the modes to use: `reduction.num_modes`, or what `auto` chose."""
-    folder: Path
-    """Where it is cached."""
-    frame_rate: float
-    """[Hz]."""
-    start_positions: np.ndarray
-    """Common start of the soil [m], shape (n, 3), float64."""
+    basis: Basis  # with all `max_modes` modes; `basis.sliced(r)` keeps the first r, `latent[:, :r]` likewise
+    num_modes: int  # r, the modes to use: `reduction.num_modes`, or what `auto` chose
+    folder: Path  # where it is cached
+    frame_rate: float  # [Hz]
+    start_positions: np.ndarray  # common start of the soil [m], shape (n, 3), float64
     _runs: Mapping[str, Sequence[ReducedRun]] = field(repr=False)
 
     @property
@@ -206,7 +192,7 @@ def reduce_dataset(
         )
     content, frame_rate = check_one_bed(everything)
     folder = dataset.path / "reduced" / cache_key([content[path] for path in paths["train"]], settings)
-    bar = {"disable": not (progress and sys.stderr.isatty()), "unit": "run", "leave": False}
+    bar = {"disable": None if progress else True, "unit": "run", "leave": False}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         cached = [folder / "basis.h5", *(folder / f"{one}.h5" for one in content.values())]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,6 @@ from sgns.config import UserError
 from sgns.model.features import BodyTrack
 from sgns.model.polynomial import PolynomialDynamics, normalised, polynomial_terms
 from sgns.model.settings import PolynomialSettings
-from sgns.train.callbacks import ValidationRollouts
 from sgns.train.polynomial import (
     Selection,
     Setting,
@@ -22,12 +23,13 @@ from sgns.train.polynomial import (
     refitted,
     ridge,
     select,
-    sparse,
     take,
     unfitted,
 )
+from sgns.train.validation import ValidationRollouts
 from sgns.train.windows import TrainingWindows
 
+sparse = runpy.run_path(str(Path(__file__).parents[3] / "experiments/ablation/closed_form.py"))["sparse"]
 HISTORY = 3
 
 
