@@ -425,8 +425,8 @@ def make_trainer(task: Task, callbacks: list[L.Callback]) -> L.Trainer:
 
 @contextmanager
 def quiet_lightning() -> Iterator[None]:
-    """Lightning's log without its information (which devices there are, tips, that it stopped when it should), and no
-    warnings that are none of ours."""
+    """Hides what Lightning tells of itself (devices, tips, that it stopped when it should) and warnings that do not
+    concern us."""
     logger = logging.getLogger("lightning.pytorch")
     before = logger.level
     logger.setLevel(logging.WARNING)

@@ -195,16 +195,12 @@ def test_constant_data_has_no_modes(value):
     assert pca.rank("particle") == 2
     with pytest.raises(UserError, match=r"rank 0 .*; add runs"):
         pca.basis("particle_axis", 1)
+    layout = pca.basis("particle", 2)
+    assert layout.displacement_variance == 0.0
+    assert layout.energy(1) < 1.0 and layout.energy(2) == pytest.approx(1.0)
+    assert layout.displacement_energy(1) == -np.inf
     one_point = fit(np.full((5, 20, 3), value), 4)
     assert [one_point.rank(c) for c in CENTRINGS] == [0, 0, 0]
-
-
-def test_constant_data_centred_by_particle_is_all_layout():
-    basis = fit(np.repeat(soil(1, 20), 9, axis=0), 2).basis("particle")
-    assert basis.displacement_variance == 0.0
-    assert basis.energy(2) == pytest.approx(1.0)
-    assert basis.energy(1) < 1.0
-    assert basis.displacement_energy(1) == -np.inf
 
 
 def test_duplicated_frames_and_particles():

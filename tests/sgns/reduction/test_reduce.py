@@ -6,17 +6,14 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from sgns.config import UserError
 from sgns.data.run import Run
-from sgns.model.checkpoint import load_surrogate
 from sgns.reduction import reduce as module
 from sgns.reduction.basis import reconstruction_curve
 from sgns.reduction.reduce import choose_modes, reduce_dataset
-from sgns.train.command import main
 from sgns_testing.runs import make_run
-from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset
+from sgns_testing.tiny import REDUCTION, make_dataset
 
 
 @pytest.fixture(params=["particle_axis", "particle"])
@@ -62,23 +59,6 @@ def test_a_tolerance_out_of_reach_names_what_is_reached(case) -> None:
     with pytest.raises(UserError, match=r"lower reduction\.share") as caught:
         choose_modes(basis, settings | {"choose": "energy", "share": 1.0, "max_modes": 9}, validation)
     assert "max_modes" not in str(caught.value)
-
-
-def test_training_uses_what_was_chosen(tmp_path) -> None:
-    three = reduce_dataset(make_dataset(tmp_path / "data"), REDUCTION).basis.energy(3)
-    cfg = {
-        "dataset": {"path": str(tmp_path / "data"), "name": "tiny"},
-        "reduction": REDUCTION | {"num_modes": "auto", "choose": "energy", "share": three},
-        "model": MODEL,
-        "training": TRAINING | {"max_steps": 2, "validate_every": 2},
-        "preset": {"name": "default"},
-        "checkpoint": None,
-        "output": str(tmp_path / "out"),
-        "seed": 0,
-        "device": "cpu",
-    }
-    main(OmegaConf.create(cfg))
-    assert load_surrogate(tmp_path / "out" / "best.ckpt").dynamics.num_modes == 3
 
 
 # --- The cache of reduced runs: what is reused, what is made anew, what is refused ----------------------

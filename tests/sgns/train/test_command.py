@@ -14,13 +14,15 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sgns.config import UserError
+from sgns.model.checkpoint import load_surrogate
 from sgns.model.network_dynamics import Path
+from sgns.reduction.reduce import reduce_dataset
 from sgns.simulator import Simulator
 from sgns.train import lightning_module as module
 from sgns.train.command import main, train
 from sgns.train.lightning_module import TrainingSettings
 from sgns.train.validation import ValidationRollouts
-from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset
+from sgns_testing.tiny import BRIEF, MODEL, REDUCTION, TRAINING, make_dataset
 
 
 def run(data, output, start_from=None, model=MODEL, **changes) -> float:
@@ -85,11 +87,7 @@ def test_other_settings_do_not_mix(data, tmp_path) -> None:
     run(data, tmp_path, max_steps=1, validate_every=1)
     with pytest.raises(UserError) as caught:
         run(data, tmp_path, max_steps=2, validate_every=1, batch_size=4, noise=0.3)
-    for words in (
-        "training.max_steps is 1 there and 2 here",
-        "batch_size is 8 there",
-        "noise is 0.1 there",
-    ):
+    for words in ("training.max_steps is 1 there and 2 here", "batch_size is 8 there", "noise is 0.1 there"):
         assert words in str(caught.value)
     assert "\n" not in str(caught.value)
     run(data, tmp_path, max_steps=2, validate_every=1, resume=False)
@@ -139,19 +137,17 @@ def test_a_checkpoint_of_another_model_or_basis_is_refused(data, trained, tmp_pa
 def test_skill_of_truth_and_of_a_frozen_bed(data) -> None:
     rollouts = ValidationRollouts(data.runs("validation"), 4, 3, "pose")
 
-    class Known(torch.nn.Module):
+    class Known(torch.nn.Linear):
         """Gives the answers instead of learning them."""
-
-        def __init__(self, latent, force) -> None:
-            super().__init__()
-            self.weight = torch.nn.Parameter(torch.zeros(1))
-            self.answers = latent, force
 
         predicts_body = False
 
+        def __init__(self, *answers) -> None:
+            super().__init__(1, 1)
+            self.answers = answers
+
         def unroll(self, latent, body, context):
-            frames = body.position.shape[1]
-            pad = frames - self.answers[0].shape[1]
+            pad = body.position.shape[1] - self.answers[0].shape[1]
             answers = [torch.cat([a[:, :1].expand(-1, pad, *a.shape[2:]), a], 1) for a in self.answers]
             return Path(*answers, None, body)
 
@@ -198,25 +194,25 @@ def test_wrong_settings_name_their_key(key, value) -> None:
         TrainingSettings.from_dict(TRAINING | {key: value})
 
 
-def test_the_command(tmp_path) -> None:
-    make_dataset(tmp_path / "data")
-    cfg = OmegaConf.create(
-        {
-            "dataset": {"name": "tiny", "path": str(tmp_path / "data")},
-            "reduction": REDUCTION,
-            "model": MODEL,
-            "training": TRAINING | {"max_steps": 5, "validate_every": 5},
-            "preset": {"name": "default"},
-            "output": str(tmp_path / "out"),
-            "checkpoint": None,
-            "seed": 0,
-            "device": "cpu",
-        }
-    )
-    skill = main(cfg)
+def test_the_command_trains_with_the_number_of_modes_that_was_chosen(tmp_path) -> None:
+    three = reduce_dataset(make_dataset(tmp_path / "data"), REDUCTION).basis.energy(3)
+    cfg = {
+        "dataset": {"name": "tiny", "path": str(tmp_path / "data")},
+        "reduction": REDUCTION | {"num_modes": "auto", "choose": "energy", "share": three},
+        "model": MODEL,
+        "training": BRIEF,
+        "preset": {"name": "default"},
+        "output": str(tmp_path / "out"),
+        "checkpoint": None,
+        "seed": 0,
+        "device": "cpu",
+    }
+    skill = main(OmegaConf.create(cfg))
     assert json.loads((tmp_path / "out" / "training.json").read_text())["skill"] == skill
-    card = content(tmp_path / "out" / "best.ckpt")["hyper_parameters"]
-    assert card["settings"]["preset"] == "default" and card["settings"]["dataset"] == "tiny"
+    surrogate = load_surrogate(tmp_path / "out" / "best.ckpt")
+    assert surrogate.dynamics.num_modes == 3
+    settings = surrogate.card["settings"]
+    assert settings["preset"] == "default" and settings["dataset"] == "tiny"
 
 
 def poisoned(data, split: str, what: str):
