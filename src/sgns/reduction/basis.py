@@ -9,7 +9,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +37,10 @@ class Basis:
 
     Attributes:
         mean: What is subtracted before projecting [m], (n, 3) float64, whatever the centring.
-        modes: Modes, orthonormal columns, (n, r) float64; the largest entry of each is positive.
-        eigenvalues: Population variance along each mode over the (frame, axis) rows [m^2], decreasing,
-            (r,) float64.
+        modes: Orthonormal columns, (n, r) float64; the largest entry of each is positive.
+        eigenvalues: Population variance along each mode over the (frame, axis) rows [m^2], falling, (r,) float64.
         total_variance: Sum of all eigenvalues, also those of modes not kept [m^2].
-        displacement_variance: The total variance when every particle is centred on every axis: the
-            motion alone [m^2].
+        displacement_variance: The same when every particle is centred on every axis: the motion alone [m^2].
         centring: One of `CENTRINGS`.
         arrangement_hash: The particle arrangement the modes belong to.
         fitted_on: Names of the runs the basis was fitted on.
@@ -57,7 +55,7 @@ class Basis:
     displacement_variance: float
     centring: str
     arrangement_hash: str = ""
-    fitted_on: list[str] | None = None
+    fitted_on: list[str] = field(default_factory=list)
     residual_variance: float | None = None
 
     def __post_init__(self) -> None:
@@ -68,8 +66,6 @@ class Basis:
                 f"basis arrays do not belong together: mean {shapes[0]}, modes {shapes[1]}, eigenvalues "
                 f"{shapes[2]}; expected (n, 3), (n, r) and (r,)"
             )
-        if self.fitted_on is None:
-            object.__setattr__(self, "fitted_on", [])
         if self.residual_variance is None:
             rest = max(self.total_variance - float(self.eigenvalues.sum()), 0.0)
             object.__setattr__(self, "residual_variance", rest)
@@ -120,11 +116,8 @@ class Basis:
         )
 
     def energy(self, r: int | None = None) -> float | Tensor:
-        """Share of the total variance in the first `r` modes: the paper's measure.
-
-        Args:
-            r: Number of modes, 0 to num_modes; None: all from 1 to num_modes, (num_modes,).
-        """
+        """Share of the total variance in the first `r` modes, the paper's measure; without r for each of 1 to
+        num_modes, (num_modes,)."""
         return self._explained(self.total_variance, r)
 
     def displacement_energy(self, r: int | None = None) -> float | Tensor:
@@ -144,7 +137,7 @@ class Basis:
     def state(self) -> dict[str, Any]:
         """Tensors and plain Python values, fit for a checkpoint that loads under `weights_only`."""
         values = {key: getattr(self, key) for key in (*_ARRAYS, *_NUMBERS, *_WORDS)}
-        return {"format_version": _FORMAT_VERSION, **values, "fitted_on": list(self.fitted_on or [])}
+        return {"format_version": _FORMAT_VERSION, **values, "fitted_on": list(self.fitted_on)}
 
     @classmethod
     def from_state(cls, state: dict[str, Any], where: str = "basis state") -> Basis:
@@ -159,18 +152,16 @@ class Basis:
                     f"{where}: basis format {state['format_version']} is newer than this program reads "
                     f"({_FORMAT_VERSION}); update sgns"
                 )
-            arrays = {k: torch.as_tensor(state[k]).to(torch.float64) for k in _ARRAYS}
-            numbers = {k: float(state[k]) for k in _NUMBERS}
-            names = [str(name) for name in state["fitted_on"]]
-            words = {k: str(state[k]) for k in _WORDS}
+            values: dict[str, Any] = {k: torch.as_tensor(state[k]).to(torch.float64) for k in _ARRAYS}
+            values |= {k: float(state[k]) for k in _NUMBERS} | {k: str(state[k]) for k in _WORDS}
+            values["fitted_on"] = [str(name) for name in state["fitted_on"]]
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise UserError(f"{where}: not a basis ({error!r}); fit it again with `sgns reduce`") from error
-        finite = [bool(x.isfinite().all()) for x in arrays.values()] + [*map(math.isfinite, numbers.values())]
-        if not all(finite):
+        if not all(bool(torch.as_tensor(values[k]).isfinite().all()) for k in (*_ARRAYS, *_NUMBERS)):
             raise UserError(
                 f"{where}: the basis holds values that are not finite; fit it again with `sgns reduce`"
             )
-        basis = cls(**arrays, **numbers, **words, fitted_on=names)
+        basis = cls(**values)
         deviation = orthonormality_error(basis.modes)
         if deviation > 1e-6:
             raise UserError(
@@ -262,45 +253,35 @@ def check_centring(centring: str) -> None:
         raise UserError(f"unknown centring {centring!r}; allowed: {', '.join(CENTRINGS)}")
 
 
-# --- What the first r modes of a basis hold, for every r: energies and errors ---------------------------
-# Letters: n particles, R modes of the basis.
+# --- What the first r modes of a basis hold, for every r up to R: energies and errors --------------------
 
 
 @dataclass(frozen=True)
 class ReductionCurves:
-    """What the subspace holds for r = 1 … R modes.
+    """What the subspace holds for r = 1 … R modes, shape (R,)."""
 
-    Attributes:
-        energy: the paper's energy on the training runs, shape (R,).
-        displacement_energy: share of the motion's variance on the training runs, shape (R,).
-        training: reduction MSE on the training runs [m²], shape (R,).
-        held_out: reduction MSE on other runs [m²] for r = 0 … R, shape (R + 1,); NaN without runs.
-    """
-
-    energy: np.ndarray
-    displacement_energy: np.ndarray
-    training: np.ndarray
-    held_out: np.ndarray
+    energy: np.ndarray  # the paper's energy on the training runs
+    displacement_energy: np.ndarray  # share of the motion's variance on the training runs
+    training: np.ndarray  # reduction MSE on the training runs [m²]
+    held_out: np.ndarray  # reduction MSE on other runs [m²] for r = 0 … R, shape (R + 1,); NaN without runs
 
 
 def reduction_curves(basis: Basis, paths: Sequence[Path]) -> ReductionCurves:
     """Energy and reconstruction error of a basis on the runs that it was fitted on and on the given ones."""
     return ReductionCurves(
-        energy=np.asarray(basis.energy()),
-        displacement_energy=np.asarray(basis.displacement_energy()),
-        training=np.asarray(basis.residual_mse()),
-        held_out=reconstruction_curve(paths, basis),
+        np.asarray(basis.energy()),
+        np.asarray(basis.displacement_energy()),
+        np.asarray(basis.residual_mse()),
+        reconstruction_curve(paths, basis),
     )
 
 
 def reconstruction_curve(paths: Sequence[Path], basis: Basis) -> np.ndarray:
-    """Reduction MSE of runs for every number of modes, in one pass.
+    """Reduction MSE of runs in one pass: mean over frames, particles and axes [m²] for r = 0 … R, shape (R + 1,); NaN
+    without runs.
 
-    Orthonormal modes take away their share one after the other: the residual with r modes is
-    ‖S − S̄‖² less the squared first r coordinates.
-
-    Returns:
-        Mean over frames, particles and axes [m²] for r = 0 … R, shape (R + 1,); NaN without runs.
+    Orthonormal modes take away their share one after the other: the residual with r modes is ‖S − S̄‖² less the squared
+    first r coordinates.
     """
     total, taken, count = 0.0, np.zeros(basis.num_modes), 0
     for path in paths:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,17 +31,14 @@ _MIN_BLOCK_FRAMES = 32
 _LARGEST = 1e100
 
 
-@dataclass(frozen=True, eq=False)
-class _Moments:
+class _Moments(NamedTuple):
     """What is remembered of the frames absorbed so far, relative to the reference frame."""
 
-    count: int  # frames
+    frames: int
     mean: Tensor  # (3, n) [m]
-    # Orthogonal rows, (k, n) [m]: sketch^T sketch is the scatter, centred per particle and axis.
-    sketch: Tensor
+    sketch: Tensor  # (k, n) [m], orthogonal rows: sketch^T sketch is the scatter per particle and axis
     scatter: float  # trace of that scatter [m^2], dropped directions included
-    # Its part in dropped directions [m^2]; the difference of the two would be round-off if small.
-    dropped: float
+    dropped: float  # its part in dropped directions [m^2]; as a difference it would be round-off if small
 
 
 class _Spectrum(NamedTuple):
@@ -52,10 +48,8 @@ class _Spectrum(NamedTuple):
     mean: Tensor  # (n, 3) [m]
     modes: Tensor  # (n, k)
     scatter: Tensor  # (k,) [m^2]: along each mode
-    dropped: float  # [m^2]: in directions the stream dropped
-    total: float  # [m^2]: along all modes and dropped
-    displacement: float  # [m^2]: the same when centred per particle and axis
-    rows: int  # (frame, axis) pairs
+    total: float  # [m^2]: along all modes and what the stream dropped
+    moments: _Moments
 
 
 class IncrementalPCA:
@@ -85,9 +79,19 @@ class IncrementalPCA:
             ones are dropped. None: an eighth of the modes, at least 16.
         device: Torch device of the work; it must know float64.
 
+    Attributes:
+        frame_count: Frames seen so far.
+
     Raises:
         UserError: If an argument is out of range.
     """
+
+    # Made at the first frame. Letters: m frames of a block.
+    _reference: Tensor  # (3, n) [m]: the first frame, taken off all, so that a huge offset costs no digits
+    _moments: _Moments
+    _pending: Tensor  # (m + 1, 3, n) [m]: frames waiting for a full block, and room for the move of the mean
+    _queue: Tensor  # (3 (m + 1), n) [m]: rows of thinned blocks, not in the sketch yet
+    _rooms: list[Tensor]  # twice (k, n) [m]: where the sketch is and where the next one goes
 
     def __init__(
         self, num_modes: int, oversampling: int | None = None, device: str | torch.device = "cpu"
@@ -100,25 +104,13 @@ class IncrementalPCA:
             raise UserError(f"oversampling is {oversampling}; it must be at least 0")
         self.device = checked_device(device)
         self.num_modes = num_modes
-        self.oversampling = oversampling
+        self.frame_count = 0
         self._tracked = num_modes + oversampling
-        # The first frame (3, n) [m], subtracted from all so that a huge offset costs no digits.
-        self._reference: Tensor | None = None
-        self._pending: Tensor | None = None  # (m + 1, 3, n) [m]: frames waiting for a full block
-        self._pending_count = 0
-        self._moments: _Moments | None = None
-        self._rooms: list[Tensor] = []  # twice (k, n) [m]: where the sketch is and where the next one goes
-        self._queue: Tensor | None = None  # (3 (m + 1), n) [m]: rows of thinned blocks, not in the sketch yet
-        self._queued = 0
+        self._queued = 0  # rows in the queue
         # Scatter along the weakest tracked direction [m^2]; 0 while nothing had to be dropped.
         self._weakest = 0.0
         # Squared Frobenius norm of the largest error that rounding to the input type can have made [m^2].
         self._input_noise = 0.0
-
-    @property
-    def frame_count(self) -> int:
-        """Frames seen so far."""
-        return self._pending_count + (self._moments.count if self._moments else 0)
 
     def partial_fit(self, positions: Tensor | np.ndarray) -> IncrementalPCA:
         """Add frames to the stream; returns this object.
@@ -131,19 +123,18 @@ class IncrementalPCA:
             UserError: If shape or type is wrong or a value is not finite; the stream is then as it was.
         """
         x, norm = self._checked(positions)
-        if self._reference is None and len(x):
+        if self.frame_count == 0 and len(x):
             self._begin(x[0])
         self._input_noise += (torch.finfo(x.dtype).eps / 2 * norm) ** 2
-        start = 0
-        while start < len(x):
-            # The last frame of the block is room for the move of the mean.
-            stop = min(len(x), start + len(self._pending) - 1 - self._pending_count)
-            frames = self._pending[self._pending_count : self._pending_count + stop - start]
-            frames.copy_(x[start:stop].to(self.device).permute(0, 2, 1)).sub_(self._reference)
-            self._pending_count += stop - start
-            if self._pending_count == len(self._pending) - 1:
+        while len(x):
+            waiting = self.frame_count - self._moments.frames
+            taken = x[: len(self._pending) - 1 - waiting]
+            frames = self._pending[waiting : waiting + len(taken)]
+            frames.copy_(taken.to(self.device).permute(0, 2, 1)).sub_(self._reference)
+            self.frame_count += len(taken)
+            if waiting + len(taken) == len(self._pending) - 1:
                 self._absorb()
-            start = stop
+            x = x[len(taken) :]
         return self
 
     def _begin(self, frame: Tensor) -> None:
@@ -176,12 +167,10 @@ class IncrementalPCA:
         Args:
             centring: One of `CENTRINGS`.
             num_modes: Modes wanted; None: the number given at construction.
-            arrangement_hash: Kept in the basis.
-            fitted_on: Names of the runs, kept in the basis.
+            arrangement_hash: Kept in the basis, as `fitted_on`, names of the runs.
 
         Raises:
-            UserError: If no frame was seen, the centring is unknown or more modes are asked for
-            than the data has.
+            UserError: No frame was seen, the centring is unknown, or the data has fewer modes.
         """
         wanted = self.num_modes if num_modes is None else num_modes
         if not 1 <= wanted <= self.num_modes:
@@ -195,7 +184,7 @@ class IncrementalPCA:
                 f"num_modes is {wanted} but the data has rank {found.rank} ({self.frame_count} frames of "
                 f"{len(found.mean)} particles, centring {centring}); {cure} runs that move differently"
             )
-        modes = found.modes[:, :wanted]
+        rows, modes = 3 * found.moments.frames, found.modes[:, :wanted]
         # The first of the (nearly) largest entries, so that a tie is not decided by round-off.
         magnitude = modes.abs()
         first = (magnitude >= (1.0 - 1e-6) * magnitude.amax(0)).to(torch.uint8).argmax(0)
@@ -203,13 +192,14 @@ class IncrementalPCA:
         return Basis(
             mean=found.mean.cpu(),
             modes=modes.cpu().contiguous(),
-            eigenvalues=(found.scatter[:wanted] / found.rows).cpu(),
-            total_variance=found.total / found.rows,
-            displacement_variance=found.displacement / found.rows,
+            eigenvalues=(found.scatter[:wanted] / rows).cpu(),
+            total_variance=found.total / rows,
+            displacement_variance=found.moments.scatter / rows,
             centring=centring,
             arrangement_hash=arrangement_hash,
             fitted_on=list(fitted_on),
-            residual_variance=(float(found.scatter[wanted:].sum()) + found.dropped) / found.rows,
+            # Only the stream drops directions, so what is missing there is missing whatever the centring.
+            residual_variance=(float(found.scatter[wanted:].sum()) + found.moments.dropped) / rows,
         )
 
     def _solved(self, centring: str) -> _Spectrum:
@@ -218,16 +208,14 @@ class IncrementalPCA:
         if self.frame_count == 0:
             raise UserError("no basis without frames; call partial_fit with at least one frame first")
         moments = self._absorbed()
-        sketch = moments.sketch
-        mean = self._reference + moments.mean
-        centre = mean
+        sketch, total = moments.sketch, moments.scatter
+        mean = centre = self._reference + moments.mean
         if centring == "particle":
             centre = mean.mean(0, keepdim=True).expand(3, -1)
         elif centring == "scalar":
             centre = mean.mean().expand_as(mean)
-        total = moments.scatter
         if centring != "particle_axis":
-            layout = math.sqrt(moments.count) * (mean - centre)
+            layout = math.sqrt(moments.frames) * (mean - centre)
             total += float(layout.square().sum())
             # The largest rows first: QR then keeps the accuracy of the small ones.
             sketch = torch.cat([layout, sketch])
@@ -237,24 +225,21 @@ class IncrementalPCA:
         error = orthonormality_error(modes)
         if error > 1e-9:
             raise ArithmeticError(f"modes are orthonormal to {error:.1e} only")
-        rows = 3 * moments.count
+        rows = 3 * moments.frames
         largest = float(singular[0]) if len(singular) else 0.0
         # Rounding moves no singular value by more than the Frobenius norm of all rounding errors
         # (Weyl): input, then arithmetic.
         floor = math.sqrt(self._input_noise) + _EPS * math.sqrt(max(rows, len(modes))) * largest
         rank = min(int((singular > floor).sum()), self.num_modes)
-        mean = centre.T.contiguous()
-        # Only the stream drops directions, so what is missing there is missing whatever the centring.
-        return _Spectrum(rank, mean, modes, singular.square(), moments.dropped, total, moments.scatter, rows)
+        return _Spectrum(rank, centre.T.contiguous(), modes, singular.square(), total, moments)
 
     def _absorb(self) -> None:
         """Take the full block of pending frames into the moments."""
-        before = self._moments.count
+        before = self._moments.frames
         rows, self._moments = _centred(self._pending, self._moments)
-        self._pending_count = 0
         gram = _gram(rows)
         values, vectors = torch.linalg.eigh(gram)
-        limit = self._weakest * (1.0 - before / self._moments.count)
+        limit = self._weakest * (1.0 - before / self._moments.frames)
         # Round-off may hide that a weak direction holds more than its eigenvalue says.
         first = int((values.clamp_min(_RESOLVED * float(values[-1])) <= limit).sum())
         kept = len(rows) - first
@@ -265,7 +250,7 @@ class IncrementalPCA:
             self._merge(self._queue[: self._queued])
             self._queued = 0
         left_out = self._moments.dropped + float(values[:first].clamp_min(0.0).sum())
-        self._moments = replace(self._moments, dropped=left_out)
+        self._moments = self._moments._replace(dropped=left_out)
         torch.mm(vectors[:, first:].T, rows, out=self._queue[self._queued : self._queued + kept])
         self._queued += kept
 
@@ -278,8 +263,8 @@ class IncrementalPCA:
         """The moments with everything that waits merged in; changes nothing."""
         found = self._moments
         waiting = [self._queue[: self._queued]]
-        if self._pending_count:
-            rows, found = _centred(self._pending[: self._pending_count + 1].clone(), found)
+        if pending := self.frame_count - found.frames:
+            rows, found = _centred(self._pending[: pending + 1].clone(), found)
             waiting.append(rows)
         room = self._rooms[1]  # empty between merges
         for rows in waiting:
@@ -290,24 +275,20 @@ class IncrementalPCA:
 
     def _checked(self, positions: Tensor | np.ndarray) -> tuple[Tensor, float]:
         """`positions` as a tensor in its own precision, after every check, and its norm [m]."""
-        if isinstance(positions, Tensor):
-            x = positions.detach()
-            floating = x.is_floating_point()
-        else:
-            array = np.asarray(positions)
-            floating = array.dtype.kind == "f"
-            if floating:
-                # torch takes neither foreign byte order nor read-only arrays nor more than 8 bytes.
-                array = np.require(array, dtype=f"=f{min(array.dtype.itemsize, 8)}", requirements="CAW")
-                x = torch.from_numpy(array)
-        if not floating:
-            found = positions.dtype if isinstance(positions, Tensor) else array.dtype
+        found = positions.detach() if isinstance(positions, Tensor) else np.asarray(positions)
+        if not (found.is_floating_point() if isinstance(found, Tensor) else found.dtype.kind == "f"):
             raise UserError(
-                f"positions are of type {found}; they must be real floating-point numbers, float32 or float64"
+                f"positions are of type {found.dtype}; they must be real floating-point numbers, float32 or float64"
             )
+        if isinstance(found, Tensor):
+            x = found
+        else:
+            # torch takes neither foreign byte order nor read-only arrays nor more than 8 bytes.
+            native = np.dtype(f"=f{min(found.dtype.itemsize, 8)}")
+            x = torch.from_numpy(np.require(found, native, ["C", "A", "W"]))
         if x.dim() != 3 or x.shape[2] != 3 or x.shape[1] == 0:
             raise UserError(f"positions have shape {tuple(x.shape)}; they must be (frames, particles, 3)")
-        if self._reference is not None and x.shape[1] != self._reference.shape[1]:
+        if self.frame_count and x.shape[1] != self._reference.shape[1]:
             raise UserError(
                 f"positions have {x.shape[1]} particles but the frames before had "
                 f"{self._reference.shape[1]}; one basis serves one particle arrangement"
@@ -342,34 +323,27 @@ def checked_device(device: str | torch.device) -> torch.device:
 def _centred(frames: Tensor, old: _Moments) -> tuple[Tensor, _Moments]:
     """Rows of a block for the sketch, and the moments with its frames in all but the sketch.
 
-    Args:
-        frames: (m + 1, 3, n) [m], relative to the reference; the last is not one but room for the move of the mean.
-            Overwritten: the rows whose scatter is to be added, (3 m or 3 (m + 1), n), are a view of it.
-        old: Moments so far.
+    `frames` (m + 1, 3, n) [m] are overwritten; the rows, (3 m or 3 (m + 1), n), are a view of them. The last is room
+    for the move of the mean.
     """
     m = len(frames) - 1
     mean = frames[:m].mean(0)
     move = mean - old.mean
     frames[:m] -= mean
-    count = old.count + m
-    if old.count:
-        torch.mul(move, math.sqrt(old.count * m / count), out=frames[m])
-    rows = frames[: m + (old.count > 0)].flatten(0, 1)
+    count = old.frames + m
+    if old.frames:
+        torch.mul(move, math.sqrt(old.frames * m / count), out=frames[m])
+    rows = frames[: m + (old.frames > 0)].flatten(0, 1)
     scatter = old.scatter + float(torch.linalg.vector_norm(rows)) ** 2
-    return rows, replace(old, count=count, mean=old.mean + move * (m / count), scatter=scatter)
+    return rows, old._replace(frames=count, mean=old.mean + move * (m / count), scatter=scatter)
 
 
 def _merged(old: _Moments, rows: Tensor, room: Tensor, gram: Tensor | None = None) -> tuple[_Moments, float]:
-    """The moments with rows in the sketch: of both, the strongest orthogonal directions.
+    """The moments with rows (b, n) in the sketch, which holds the strongest orthogonal directions of both.
 
-    Args:
-        old: Moments so far, which count these rows already in all but the sketch.
-        rows: Any rows, (b, n).
-        room: Where the new sketch goes, (largest number of rows wanted, n).
-        gram: rows rows^T, if it is known.
-
-    Returns:
-        The moments; scatter along the weakest row of the new sketch, 0 if only round-off was dropped.
+    `old` counts the rows already in all but the sketch; the new sketch goes to `room` (most rows wanted, n); `gram` is
+    rows rows^T, if it is known. Also returned: the scatter along the weakest row of the new sketch, 0 if only round-off
+    was dropped.
     """
     sketch = old.sketch
     # The sketch's rows are orthogonal already, so its own Gram matrix is known.
@@ -401,7 +375,7 @@ def _merged(old: _Moments, rows: Tensor, room: Tensor, gram: Tensor | None = Non
             done += len(rows)
             break
         gram = _gram(rows)
-    return replace(old, sketch=room[:done], dropped=dropped), weakest
+    return old._replace(sketch=room[:done], dropped=dropped), weakest
 
 
 def _rotated(vectors: Tensor, sketch: Tensor, rows: Tensor, out: Tensor | None = None) -> Tensor:

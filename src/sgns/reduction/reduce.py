@@ -6,7 +6,6 @@ import hashlib
 import json
 import logging
 import math
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -65,16 +64,13 @@ MEASURES = ("position", "energy", "displacement_energy")
 
 
 def choose_modes(basis: Basis, settings: Mapping[str, Any], validation: Sequence[Path]) -> tuple[int, str]:
-    """The fewest modes that are good enough, and why.
+    """The fewest modes that are good enough, and why, as part of a sentence.
 
     Args:
         basis: With all its modes.
         settings: `conf/reduction`; used are choose, tolerance and share.
         validation: Run files that the basis was not fitted on, for `position`; without any, the error on
             the runs that it was fitted on counts.
-
-    Returns:
-        Number of modes; the reason as part of a sentence.
 
     Raises:
         UserError: All modes together are not good enough; the line says what they reach.
@@ -84,27 +80,24 @@ def choose_modes(basis: Basis, settings: Mapping[str, Any], validation: Sequence
             reconstruction_curve(validation, basis)[1:] if validation else np.asarray(basis.residual_mse())
         )
         values = 1e3 * np.sqrt(curve)
-        limit, key, unit, sign = settings["tolerance"], "tolerance", " mm", "≤"
+        key, unit, sign, change = "tolerance", " mm", "≤", "raise"
         what = f"RMSE on {len(validation)} validation runs" if validation else "RMSE on the training runs"
-        enough = values <= limit
     else:
         values = np.asarray(getattr(basis, settings["choose"])())
-        limit, key, unit, sign = settings["share"], "share", "", "≥"
+        key, unit, sign, change = "share", "", "≥", "lower"
         what = f"{settings['choose'].replace('_', ' ')} of the training runs"
-        enough = values >= limit
+    limit = settings[key]
+    enough = values <= limit if key == "tolerance" else values >= limit
+    asked = f"{sign} reduction.{key}={limit:g}{unit}"
     if not enough.any():
         # With fewer modes than were asked for there are no more to be had.
         more = "" if basis.num_modes < settings["max_modes"] else ", or raise reduction.max_modes"
         raise UserError(
-            f"reduction.num_modes=auto: {what} must be {sign} reduction.{key}={limit:g}{unit} but all "
-            f"{basis.num_modes} modes reach {_shown(values[-1], limit)}{unit}; "
-            f"{'raise' if key == 'tolerance' else 'lower'} reduction.{key}{more}"
+            f"reduction.num_modes=auto: {what} must be {asked} but all {basis.num_modes} modes reach "
+            f"{_shown(values[-1], limit)}{unit}; {change} reduction.{key}{more}"
         )
     first = int(enough.argmax())
-    return (
-        first + 1,
-        f"{what} is {_shown(values[first], limit)}{unit}, {sign} reduction.{key}={limit:g}{unit}",
-    )
+    return first + 1, f"{what} is {_shown(values[first], limit)}{unit}, {asked}"
 
 
 def _shown(value: float, limit: float) -> str:
@@ -139,47 +132,27 @@ _SERIES: dict[str, tuple[int | str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class ReducedRun:
-    """A run whose soil is a few modes.
+    """A run whose soil is a few modes."""
 
-    Attributes:
-        name: File name of the run without its ending.
-        latent: Modes [m], shape (T, r, 3).
-        time: [s], shape (T,).
-        pose: Centre of mass [m] and quaternion x, y, z, w, shape (T, 7).
-        body_points: World frame [m], shape (T, M, 3).
-        force: By the soil on the body [N], shape (T, 3).
-        torque: About the centre of mass [N m], shape (T, 3).
-        scene: The complete scene as plain data.
-    """
-
-    name: str
-    latent: np.ndarray
-    time: np.ndarray
-    pose: np.ndarray
-    body_points: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
-    scene: dict[str, Any]
+    name: str  # file name of the run without its ending
+    latent: np.ndarray  # modes [m], shape (T, r, 3)
+    time: np.ndarray  # [s], shape (T,)
+    pose: np.ndarray  # centre of mass [m] and quaternion x, y, z, w, shape (T, 7)
+    body_points: np.ndarray  # world frame [m], shape (T, M, 3)
+    force: np.ndarray  # by the soil on the body [N], shape (T, 3)
+    torque: np.ndarray  # about the centre of mass [N m], shape (T, 3)
+    scene: dict[str, Any]  # the complete scene as plain data
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedDataset:
-    """A dataset in the basis of its training split.
+    """A dataset in the basis of its training split."""
 
-    Attributes:
-        basis: The basis with all `max_modes` modes; `basis.sliced(r)` keeps the first r, `latent[:, :r]`
-            likewise.
-        num_modes: r, the modes to use: `reduction.num_modes`, or what `auto` chose.
-        folder: Where it is cached.
-        frame_rate: [Hz].
-        start_positions: Common start of the soil [m], shape (n, 3), float64.
-    """
-
-    basis: Basis
-    num_modes: int
-    folder: Path
-    frame_rate: float
-    start_positions: np.ndarray
+    basis: Basis  # with all `max_modes` modes; `basis.sliced(r)` keeps the first r, `latent[:, :r]` likewise
+    num_modes: int  # r, the modes to use: `reduction.num_modes`, or what `auto` chose
+    folder: Path  # where it is cached
+    frame_rate: float  # [Hz]
+    start_positions: np.ndarray  # common start of the soil [m], shape (n, 3), float64
     _runs: Mapping[str, Sequence[ReducedRun]] = field(repr=False)
 
     @property
@@ -220,7 +193,7 @@ def reduce_dataset(
         )
     content, frame_rate = check_one_bed(everything)
     folder = dataset.path / "reduced" / cache_key([content[path] for path in paths["train"]], settings)
-    bar = {"disable": not (progress and sys.stderr.isatty()), "unit": "run", "leave": False}
+    bar = {"disable": None if progress else True, "unit": "run", "leave": False}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         cached = [folder / "basis.h5", *(folder / f"{one}.h5" for one in content.values())]

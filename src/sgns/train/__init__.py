@@ -15,64 +15,38 @@ if TYPE_CHECKING:
 
     from sgns.model.checkpoint import Surrogate
     from sgns.reduction.reduce import ReducedDataset, ReducedRun
-    from sgns.train.callbacks import RolloutScore
+    from sgns.train.validation import RolloutScore
 
 
 class Task(NamedTuple):
-    """What is to be fitted, to what, and where the result goes.
+    """What is to be fitted, to what, and where the result goes."""
 
-    Attributes:
-        reduced: The dataset in its basis.
-        validation_runs: What the result is chosen by.
-        num_modes: r, modes used of the basis.
-        model: Settings of the model.
-        settings: Of the training.
-        output: Folder, there, in which `best.ckpt` is to be written.
-        seed: Of weights, noise and order.
-        device: "cpu" or "cuda".
-        start_from: Checkpoint to start from.
-        resumed: Whether `last.ckpt` is there to go on from.
-        card: Plain values for the checkpoint.
-        logger: For what is to be seen on the way.
-    """
-
-    reduced: ReducedDataset
-    validation_runs: list[ReducedRun]
-    num_modes: int
-    model: Any
-    settings: Any
-    output: Path
-    seed: int
-    device: str
-    start_from: str | Path | None
-    resumed: bool
-    card: dict[str, Any]
-    logger: TensorBoardLogger
+    reduced: ReducedDataset  # the dataset in its basis
+    validation_runs: list[ReducedRun]  # what the result is chosen by
+    num_modes: int  # r, modes used of the basis
+    model: Any  # settings of the model
+    settings: Any  # of the training
+    output: Path  # folder, there, in which `best.ckpt` is to be written
+    seed: int  # of weights, noise and order
+    device: str  # cpu or cuda
+    start_from: str | Path | None  # checkpoint to start from
+    resumed: bool  # whether `last.ckpt` is there to go on from
+    card: dict[str, Any]  # plain values for the checkpoint
+    logger: TensorBoardLogger  # for what is to be seen on the way
 
 
 class Fitted(NamedTuple):
-    """A fit whose checkpoint is written.
-
-    Attributes:
-        surrogate: The result.
-        score: On the validation runs.
-        seconds: Wall time [s].
-        about: What training.json says of it besides.
-    """
+    """A fit whose checkpoint is written."""
 
     surrogate: Surrogate
-    score: RolloutScore
-    seconds: float
-    about: dict[str, Any]
+    score: RolloutScore  # on the validation runs
+    seconds: float  # wall time [s]
+    about: dict[str, Any]  # what training.json says of it besides
 
 
 class Fit(NamedTuple):
-    """How one kind of model is fitted.
+    """How one kind of model is fitted."""
 
-    Attributes:
-        stand_ins: Training runs that do what validation runs would.
-        run: Fits; raises a UserError for bad settings and losses that are not finite.
-    """
-
-    stand_ins: Callable[[list[ReducedRun]], list[ReducedRun]]
-    run: Callable[[Task], Fitted]
+    stand_ins: slice  # training runs that do what validation runs would, where there are none
+    stand_ins_do: str  # what these then do, in words
+    run: Callable[[Task], Fitted]  # fits; raises a UserError for bad settings and losses that are not finite

@@ -46,7 +46,7 @@ def main(cfg: DictConfig) -> float:
     from sgns.data.dataset import Dataset
     from sgns.data.published import published_dataset
 
-    plain = OmegaConf.to_container(cfg, resolve=True)
+    plain: Any = OmegaConf.to_container(cfg, resolve=True)
     settings = training_settings(plain["model"], plain["training"])
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)  # for the reduction, too
@@ -84,7 +84,8 @@ def train(
     start_from: str | Path | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> float:
-    """Train, or go on training, or take what is complete.
+    """Train, or go on training, or take what is complete; returns the skill of the best checkpoint's rollouts on the
+    validation runs.
 
     Args:
         reduced: The dataset in its basis.
@@ -97,9 +98,6 @@ def train(
         start_from: Checkpoint whose weights and normalisation a network starts from.
         provenance: More plain values for the checkpoint.
 
-    Returns:
-        Skill of the best checkpoint's rollouts on the validation runs.
-
     Raises:
         UserError: Bad settings, a loss that is not finite, or an `output` of another training, there or under way.
     """
@@ -107,24 +105,28 @@ def train(
     if how.threads is not None:
         torch.set_num_threads(how.threads)
     fit = FITS[settings.kind]
-    validation_runs = reduced.runs("validation") or fit.stand_ins(reduced.runs("train"))
+    validation_runs = reduced.runs("validation")
+    if not validation_runs:
+        log.warning("the validation split is empty; %s", fit.stand_ins_do)
+        validation_runs = reduced.runs("train")[fit.stand_ins]
+    asked = {
+        "num_modes": num_modes,
+        "model": settings.to_dict(),
+        "training": {k: v for k, v in how.to_dict().items() if k not in _NO_MATTER},
+        "seed": seed,
+        "basis": reduced.folder.name,
+        "validation_runs": [run.name for run in validation_runs],
+        "start_from": None if start_from is None else str(start_from),
+        **(provenance or {}),
+    }
     card = {
-        "settings": {
-            "num_modes": num_modes,
-            "model": settings.to_dict(),
-            "training": {k: v for k, v in how.to_dict().items() if k not in _NO_MATTER},
-            "seed": seed,
-            "basis": reduced.folder.name,
-            "validation_runs": [run.name for run in validation_runs],
-            "start_from": None if start_from is None else str(start_from),
-            **(provenance or {}),
-        },
+        "settings": asked,
         "frame_rate": float(reduced.frame_rate),
         "scene": reduced.runs("train")[0].scene,
         "package_version": sgns.__version__,
     }
     with only_here(output / "best.ckpt"):
-        resumed = what_is_there(output, card["settings"], how.resume)
+        resumed = what_is_there(output, asked, how.resume)
         if resumed == "complete":
             summary = read_summary(output)
             log.info("%s is complete: validation skill %.3f", output, summary["skill"])
@@ -150,37 +152,24 @@ def train(
             )
         )
         score = fitted.score
-        metrics = {
-            "skill": score.skill,
-            "skill_at_rest": score.skill_at_rest,
-            "force_nrmse": score.force_nrmse,
-        }
+        metrics = {key: getattr(score, key) for key in ("skill", "skill_at_rest", "force_nrmse")}
         if fitted.surrogate.dynamics.predicts_body:
             metrics["body_rmse"] = score.body_rmse
-        logger.log_hyperparams(
-            hyperparameters(card["settings"]), {f"final/{key}": value for key, value in metrics.items()}
-        )
+        # TensorBoard's HParams tab takes one level, scalars or text.
+        hyperparameters = {
+            key: value if isinstance(value, (bool, int, float, str)) else str(value)
+            for key, value in flattened(asked).items()
+        }
+        logger.log_hyperparams(hyperparameters, {f"final/{key}": value for key, value in metrics.items()})
         logger.finalize("success")
         summary = {**fitted.about, **metrics, "seconds": round(fitted.seconds, 1)}
         write_whole(output / SUMMARY, json.dumps(summary, indent=2) + "\n")
         log.info(
             "trained in %.0f s; %d validation runs: skill %.3f (from rest %.3f), force NRMSE %.3f; %s",
-            fitted.seconds,
-            len(validation_runs),
-            score.skill,
-            score.skill_at_rest,
-            score.force_nrmse,
+            fitted.seconds, len(validation_runs), score.skill, score.skill_at_rest, score.force_nrmse,
             output / "best.ckpt",
-        )
+        )  # fmt: skip
         return score.skill
-
-
-def hyperparameters(settings: Mapping[str, Any]) -> dict[str, bool | int | float | str]:
-    """Settings as TensorBoard's HParams tab takes them: one level, scalars or text."""
-    return {
-        key: value if isinstance(value, (bool, int, float, str)) else str(value)
-        for key, value in flattened(settings).items()
-    }
 
 
 def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> str:

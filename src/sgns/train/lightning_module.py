@@ -20,7 +20,9 @@ import lightning as L
 import numpy as np
 import torch
 from lightning.pytorch.plugins import TorchCheckpointIO
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
+from tqdm import tqdm
 
 from sgns.clock import elapsed
 from sgns.config import UserError
@@ -29,7 +31,8 @@ from sgns.model.features import BodyTrack, moves_freely, varying_context
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.settings import ModelSettings, TrainingSettings
 from sgns.train import Fit, Fitted, Task
-from sgns.train.callbacks import RolloutValidation, StepProgress, ValidationRollouts
+from sgns.train.callbacks import RolloutValidation, StepProgress
+from sgns.train.validation import ValidationRollouts
 from sgns.train.windows import (
     Batch,
     TrainingWindows,
@@ -38,9 +41,7 @@ from sgns.train.windows import (
 )
 
 if TYPE_CHECKING:
-    from sgns.reduction.reduce import ReducedDataset, ReducedRun
-
-log = logging.getLogger(__name__)
+    from sgns.reduction.reduce import ReducedDataset
 
 # A training whose loss is this many times that of its first step learns no more.
 _DIVERGED = 1e4
@@ -65,13 +66,9 @@ class SurrogateTraining(L.LightningModule):
         After one step the error of a position is the error of its predicted change. After k steps with the same error
         it has grown k (k + 1) / 2 times, by which it is divided, or k times for predicted velocities.
         """
-        dynamics = self.dynamics_of(batch)
-        modes = dynamics.num_modes
-        latent, track, following = (
-            batch.history[:, :, :modes],
-            batch.shown_body,
-            batch.following[:, :, :modes],
-        )
+        dynamics = self.drawn_dynamics()
+        modes, track = dynamics.num_modes, batch.shown_body
+        latent, following = batch.history[:, :, :modes], batch.following[:, :, :modes]
         seen = track.frames(slice(0, dynamics.history))
         found: dict[str, list[Tensor]] = {name: [] for name in ("change", "force", "torque")}
         for k in range(batch.horizon):
@@ -100,9 +97,10 @@ class SurrogateTraining(L.LightningModule):
                 )
         return {name: torch.stack(values).mean() for name, values in found.items()}
 
-    def dynamics_of(self, batch: Batch) -> LatentDynamics:
+    def drawn_dynamics(self) -> LatentDynamics:
         """The network, in some steps with a part of its modes only, so that it learns to do without the last ones."""
         dynamics = self.surrogate.dynamics
+        assert isinstance(dynamics, LatentDynamics)
         if self.settings.fewer_modes == 0 or not self.training:
             return dynamics
         draw = np.random.default_rng([self.global_step, dynamics.num_modes])
@@ -113,8 +111,8 @@ class SurrogateTraining(L.LightningModule):
     def training_step(self, batch: Batch, _: int) -> Tensor:
         """The weighted loss; stops the training when it is not finite or has grown beyond measure."""
         losses = self.losses(batch)
-        loss = sum(getattr(self.settings.loss, name) * value for name, value in losses.items())
-        assert isinstance(loss, Tensor)
+        weight = self.settings.loss
+        loss = sum((getattr(weight, name) * value for name, value in losses.items()), torch.zeros(()))
         total = float(loss.detach())
         if self.first_loss is None:
             self.first_loss = total
@@ -130,12 +128,10 @@ class SurrogateTraining(L.LightningModule):
                 f"the training diverges: the loss is {total:.3g} at step {self.global_step} and was "
                 f"{self.first_loss:.3g} in the first; {cure}"
             )
-        for name, value in losses.items():
-            self.log(f"loss/{name}", value.detach())
-        self.log("loss/total", loss.detach())
+        self.log_dict({f"loss/{name}": value.detach() for name, value in (losses | {"total": loss}).items()})
         return loss
 
-    def configure_optimizers(self) -> dict[str, Any]:
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """AdamW and a schedule by steps."""
         optimizer = torch.optim.AdamW(
             self.surrogate.parameters(),
@@ -145,15 +141,6 @@ class SurrogateTraining(L.LightningModule):
         )
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self.settings.rate)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
-
-    def require_finite_weights(self) -> None:
-        """For before a checkpoint is written: the one of before is worth more than one that is not finite."""
-        for name, weight in self.surrogate.named_parameters():
-            if not bool(torch.isfinite(weight).all()):
-                raise UserError(
-                    f"the weights {name} are not finite after step {self.global_step}; likely the learning rate is too "
-                    f"high: lower training.learning_rate (now {self.settings.learning_rate:g})"
-                )
 
     def on_train_start(self) -> None:
         """What there was to go on from has been taken."""
@@ -174,23 +161,23 @@ class SurrogateTraining(L.LightningModule):
 
 def fit_network(task: Task) -> Fitted:
     """Train a network; best.ckpt, last.ckpt and the log appear on the way."""
-    settings, output = task.settings, task.output
+    settings, model, output = task.settings, task.model, task.output
     surrogate, data = prepared(
-        task.reduced, task.num_modes, task.model, settings, task.seed, task.card, task.start_from
+        task.reduced, task.num_modes, model, settings, task.seed, task.card, task.start_from
     )
     rollouts = ValidationRollouts(
         task.validation_runs,
         task.num_modes,
-        task.model.history,
-        task.model.body_nodes,
+        model.history,
+        model.body_nodes,
         surrogate.dynamics.context_keys,
     )
     module = SurrogateTraining(surrogate, settings)
     last = output / "last.ckpt" if task.resumed else None
-    with quiet_lightning():
-        trainer = make_trainer(
-            task, [RolloutValidation(rollouts, output, settings), StepProgress(settings.max_steps)]
-        )
+    bar = tqdm(total=settings.max_steps, desc="training", unit="step", leave=False, disable=None)
+    with bar, quiet_lightning():
+        validation = RolloutValidation(surrogate, rollouts, output, settings)
+        trainer = make_trainer(task, [validation, StepProgress(bar)])
         began = time.perf_counter()
         if last is not None:
             require_resumable(last, trainer, module, settings)
@@ -231,7 +218,8 @@ def prepared(
         given = load_surrogate(start_from)
         other = given.dynamics
         known = (other.settings, other.context_keys, other.predicts_body, given.basis.arrangement_hash)
-        if known != (model, context, dynamics.predicts_body, reduced.arrangement_hash):
+        wanted = (model, context, dynamics.predicts_body, reduced.arrangement_hash)
+        if not isinstance(other, LatentDynamics) or known != wanted:
             raise UserError(
                 f"{start_from} has another model or another bed; use the same model.* and "
                 "dataset, or checkpoint=null"
@@ -241,7 +229,7 @@ def prepared(
                 f"{start_from} belongs to another basis; use the dataset it was trained on, or "
                 "checkpoint=null"
             )
-        dynamics = given.dynamics.requires_grad_(True).train()
+        dynamics = other.requires_grad_(True).train()
     surrogate = Surrogate.of(dynamics, reduced, card)
     return surrogate, WindowLoader(windows, settings.batch_size, noise)
 
@@ -249,14 +237,10 @@ def prepared(
 def require_resumable(
     last: Path, trainer: L.Trainer, module: SurrogateTraining, settings: TrainingSettings
 ) -> None:
-    """Refuses a checkpoint that lacks, or has in odd shape, what a training goes on from.
-
-    Raises:
-        UserError: It does.
-    """
+    """Refuses a checkpoint that lacks, or has in odd shape, what a training goes on from."""
     load_surrogate(last)
     content = read_checkpoint(last)
-    fresh = module.configure_optimizers()
+    fresh: Any = module.configure_optimizers()
     weights = fresh["optimizer"].param_groups[0]["params"]
     try:
         (optimizer,), (schedule,) = content["optimizer_states"], content["lr_schedulers"]
@@ -287,11 +271,7 @@ def require_resumable(
 
 
 def require_alike(given: Any, fresh: Any, where: str) -> None:
-    """Refuses plain values that lack keys of fresh ones, or hold another kind of value there.
-
-    Raises:
-        ValueError: Which.
-    """
+    """Refuses plain values of another kind than fresh ones, by a ValueError that says where."""
     if isinstance(fresh, (float, int)) and not isinstance(fresh, bool):
         if isinstance(given, bool) or not isinstance(given, (float, int)) or not math.isfinite(given):
             raise ValueError(f"{where} is {given!r:.40}, not a finite number")
@@ -345,12 +325,19 @@ def make_trainer(task: Task, callbacks: list[L.Callback]) -> L.Trainer:
 
 @contextmanager
 def quiet_lightning() -> Iterator[None]:
-    """Lightning's log without its information: which devices there are, tips, that it stopped when it should."""
+    """Hides what Lightning tells of itself (devices, tips, that it stopped when it should) and warnings that do not
+    concern us."""
     logger = logging.getLogger("lightning.pytorch")
     before = logger.level
     logger.setLevel(logging.WARNING)
     try:
-        yield
+        with warnings.catch_warnings():
+            # Everything is in memory: there is nothing for worker processes to do.
+            warnings.filterwarnings("ignore", ".*does not have many workers.*")
+            warnings.filterwarnings("ignore", ".*GPU available but not used.*")
+            # Lightning's own use of torch, not ours.
+            warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.*")
+            yield
     finally:
         logger.setLevel(before)
 
@@ -359,35 +346,22 @@ def run_trainer(trainer: L.Trainer, module: SurrogateTraining, data: WindowLoade
     """Run the trainer; an interruption stays one."""
     in_main_thread = threading.current_thread() is threading.main_thread()
     handler = signal.getsignal(signal.SIGINT) if in_main_thread else None
-    with warnings.catch_warnings():
-        # Everything is in memory: there is nothing for worker processes to do.
-        warnings.filterwarnings("ignore", ".*does not have many workers.*")
-        warnings.filterwarnings("ignore", ".*GPU available but not used.*")
-        # Lightning's own use of torch, not ours.
-        warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.*")
-        path = None if last is None else str(last)
-        data.trainer = trainer
-        try:
-            trainer.fit(module, data, ckpt_path=path, weights_only=True)
-        except SystemExit as error:
-            # Lightning turns Ctrl-C into an exit of its own.
-            raise KeyboardInterrupt from error
-        except UserError:
+    data.trainer = trainer
+    try:
+        trainer.fit(module, data, ckpt_path=None if last is None else str(last), weights_only=True)
+    except SystemExit as error:
+        # Lightning turns Ctrl-C into an exit of its own.
+        raise KeyboardInterrupt from error
+    except UserError:
+        raise
+    except Exception as error:
+        if last is None or module.begun:
             raise
-        except Exception as error:
-            if last is None or module.begun:
-                raise
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise UserError(f"{last} cannot be gone on from ({reason:.200}); {_ANEW}") from error
-        finally:
-            if in_main_thread and handler is not None:
-                signal.signal(signal.SIGINT, handler)
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"{last} cannot be gone on from ({reason:.200}); {_ANEW}") from error
+    finally:
+        if handler is not None:
+            signal.signal(signal.SIGINT, handler)
 
 
-def stand_ins(runs: list[ReducedRun]) -> list[ReducedRun]:
-    """See `Fit.stand_ins`."""
-    log.warning("the validation split is empty; the checkpoint is chosen by rollouts of training runs")
-    return runs[:4]
-
-
-NETWORK = Fit(stand_ins, fit_network)
+NETWORK = Fit(slice(4), "the checkpoint is chosen by rollouts of training runs", fit_network)

@@ -1,8 +1,7 @@
 """Coefficients of `PolynomialDynamics`: ridge regression (dynamic mode decomposition with control: Proctor, Brunton,
-Kutz 2016, doi:10.1137/15M1013857) and sequentially thresholded least squares (SINDy: Brunton, Proctor, Kutz 2016,
-doi:10.1073/pnas.1517384113).
+Kutz 2016, doi:10.1137/15M1013857).
 
-Both need only the moments of monomials and outputs, summed once over all windows and noise draws. What one step
+It needs only the moments of monomials and outputs, summed once over all windows and noise draws. What one step
 cannot tell, the noise and the penalty, is selected by rollouts of validation runs.
 
 Letters: B batch, r modes, p inputs, m monomials, f free axes of the body, o = 3r + f + 6 outputs.
@@ -26,7 +25,7 @@ from sgns.model.network import Standardiser
 from sgns.model.polynomial import PolynomialDynamics, normalised
 from sgns.settings import FitSettings, PolynomialSettings
 from sgns.train import Fit, Fitted, Task
-from sgns.train.callbacks import RolloutScore, ValidationRollouts
+from sgns.train.validation import RolloutScore, ValidationRollouts
 from sgns.train.windows import Batch, TrainingWindows, generator, random_walk
 
 if TYPE_CHECKING:
@@ -42,47 +41,27 @@ _STILL = 0.01
 
 
 class Setting(NamedTuple):
-    """How coefficients are found.
+    """How coefficients are found."""
 
-    Attributes:
-        noise: Deviation of the velocity noise on the history, share of each mode's velocity scale [1].
-        penalty: Of the squares of the coefficients, beside the mean square of the normalised outputs [1].
-        threshold: Smallest RMS of a term in a normalised output [1]; 0 keeps all terms.
-        linear: Whether products of inputs are left out.
-    """
-
-    noise: float
-    penalty: float
-    threshold: float = 0.0
-    linear: bool = False
+    noise: float  # deviation of the velocity noise on the history, share of each mode's velocity scale [1]
+    penalty: float  # of the squares of the coefficients, beside the mean square of the normalised outputs [1]
+    linear: bool = False  # whether products of inputs are left out
 
 
 class Selection(NamedTuple):
-    """How the coefficients of each group of outputs are found.
+    """How the coefficients of each group of outputs are found."""
 
-    Attributes:
-        motion: Of the modes.
-        body: Of a body's free axes.
-        force: Of force and torque.
-    """
-
-    motion: Setting
-    body: Setting
-    force: Setting
+    motion: Setting  # of the modes
+    body: Setting  # of a body's free axes
+    force: Setting  # of force and torque
 
 
 class Moments(NamedTuple):
-    """Means over windows.
+    """Means over windows."""
 
-    Attributes:
-        gram: Products of monomials [1], shape (m, m).
-        target: Products of monomials and normalised outputs [1], shape (m, o).
-        linear: How many monomials, the first ones, are no products of inputs: p + 1.
-    """
-
-    gram: Tensor
-    target: Tensor
-    linear: int
+    gram: Tensor  # products of monomials [1], shape (m, m)
+    target: Tensor  # products of monomials and normalised outputs [1], shape (m, o)
+    linear: int  # how many monomials, the first ones, are no products of inputs: p + 1
 
 
 def unfitted(
@@ -169,45 +148,22 @@ def solved(gram: Tensor, target: Tensor) -> Tensor:
     return torch.cholesky_solve(target, factor)
 
 
-def sparse(known: Moments, penalty: float, threshold: float, rounds: int = 10) -> Tensor:
-    """Ridge regression of each output, repeated without the terms that add little until none does; shape (m, o), most
-    of them zero. Penalty and threshold as in `Setting`."""
-    size = known.gram.diagonal().sqrt()
-    weight = torch.full_like(size, penalty)
-    weight[0] = 0.0
-    full = ridge(known, penalty)
-    found = torch.zeros_like(full)
-    for column, values in enumerate(full.unbind(1)):
-        kept = torch.arange(len(full))
-        for _ in range(rounds):
-            large = values.abs() * size[kept] > threshold
-            if bool(large.all()):
-                break
-            kept = kept[large]
-            gram = known.gram[kept][:, kept] + weight[kept].diag()
-            values = solved(gram, known.target[kept, column, None])[:, 0]
-        found[kept, column] = values
+def coefficients(known: Moments, setting: Setting) -> Tensor:
+    """`ridge` with a setting's penalty, zero for the products that it leaves out; shape (m, o)."""
+    if not setting.linear:
+        return ridge(known, setting.penalty)
+    n = known.linear
+    found = torch.zeros_like(known.target)
+    found[:n] = ridge(Moments(known.gram[:n, :n], known.target[:n], n), setting.penalty)
     return found
 
 
-def coefficients(known: Moments, setting: Setting) -> Tensor:
-    """`sparse` where the setting has a threshold, else `ridge`, shape (m, o)."""
-    if setting.linear:
-        n = known.linear
-        found = torch.zeros_like(known.target)
-        found[:n] = ridge(Moments(known.gram[:n, :n], known.target[:n], n), setting.penalty)
-        return found
-    if setting.threshold:
-        return sparse(known, setting.penalty, setting.threshold)
-    return ridge(known, setting.penalty)
-
-
 def candidates(
-    known: Mapping[float, Moments], penalties: Sequence[float], threshold: float = 0.0, linear: bool = False
+    known: Mapping[float, Moments], penalties: Sequence[float], linear: bool = False
 ) -> dict[Setting, Tensor]:
     """Coefficients for every penalty and every noise that the moments of a model are known for; with `linear`
     also those without products of inputs."""
-    settings = [Setting(noise, penalty, threshold) for noise in known for penalty in penalties]
+    settings = [Setting(noise, penalty) for noise in known for penalty in penalties]
     if linear:
         settings += [setting._replace(linear=True) for setting in settings]
     return {setting: coefficients(known[setting.noise], setting) for setting in settings}
@@ -249,26 +205,19 @@ def refitted(
 
 
 class FittedPolynomial(NamedTuple):
-    """Fitted polynomials.
-
-    Attributes:
-        dynamics: The polynomials.
-        selection: Noise and penalty of each group of outputs.
-        score: On the runs that chose these.
-    """
+    """Fitted polynomials, and what chose noise and penalty of each group of outputs."""
 
     dynamics: PolynomialDynamics
     selection: Selection
-    score: RolloutScore
+    score: RolloutScore  # on the runs that chose these
 
     def about(self) -> dict[str, Any]:
         """What training.json says of it beside the score."""
-        groups = ("motion", "body", "force") if self.dynamics.predicts_body else ("motion", "force")
         found: dict[str, Any] = {"coefficients": self.dynamics.num_terms}
-        for group in groups:
-            setting = getattr(self.selection, group)
+        for group, setting in self.selection._asdict().items():
             degree = 1 if setting.linear else self.dynamics.settings.degree
-            found[group] = {"degree": degree, "noise": setting.noise, "penalty": setting.penalty}
+            if group != "body" or self.dynamics.predicts_body:
+                found[group] = {"degree": degree, "noise": setting.noise, "penalty": setting.penalty}
         return found
 
 
@@ -278,44 +227,31 @@ def best_polynomial(
     num_modes: int,
     model: PolynomialSettings,
     settings: FitSettings,
-    predicts_body: bool,
     seed: int = 0,
 ) -> FittedPolynomial:
     """Fit polynomials for every noise and penalty and take what follows some runs best.
 
-    Args:
-        runs: For training.
-        choosing: Runs whose rollouts choose noise and penalty. Where they are among those for training, they are first
-            left out of the fit; the score is that of the fit without them, the result that of the fit with them.
-        num_modes: r.
-        model: What to fit.
-        settings: How.
-        predicts_body: Whether the body's height is predicted.
-        seed: Of the noise.
+    The rollouts of the runs in `choosing` choose. Where they are among those for training, they are first left out of
+    the fit; the score is that of the fit without them, the result that of the fit with them. `seed` is of the noise.
     """
-    context = tuple(varying_context(runs, model.context))
+    context, free = tuple(varying_context(runs, model.context)), moves_freely(runs)
 
-    def windows_of(some: Sequence[ReducedRun]) -> TrainingWindows:
-        return TrainingWindows(some, num_modes, model.history, model.body_nodes, seed, context=context)
-
-    def blank(windows: TrainingWindows) -> PolynomialDynamics:
-        return unfitted(windows, model, context, predicts_body, settings.normalisation_floor)
+    def begun(some: Sequence[ReducedRun]) -> tuple[TrainingWindows, PolynomialDynamics]:
+        windows = TrainingWindows(some, num_modes, model.history, model.body_nodes, seed, context=context)
+        return windows, unfitted(windows, model, context, free, settings.normalisation_floor)
 
     names = {run.name for run in choosing}
     # A single run has to do for both.
     fitting = [run for run in runs if run.name not in names] or list(runs)
-    windows = windows_of(fitting)
-    dynamics = blank(windows)
+    windows, dynamics = begun(fitting)
     known = {noise: moments(dynamics, windows, noise, settings.draws) for noise in settings.noises}
     log.info("%d windows, %d monomials of %d inputs", len(windows), len(dynamics.terms), len(dynamics.used))
     rollouts = ValidationRollouts(choosing, num_modes, model.history, model.body_nodes, context)
-    linear = settings.linear and model.degree > 1
-    found = candidates(known, settings.penalties, linear=linear)
+    found = candidates(known, settings.penalties, settings.linear and model.degree > 1)
     selection = select(dynamics, found, rollouts)
     score = rollouts.measure(dynamics)
     if len(fitting) < len(runs):
-        windows = windows_of(runs)
-        dynamics = blank(windows)
+        windows, dynamics = begun(runs)
         refitted(dynamics, windows, selection, settings.draws)
     return FittedPolynomial(dynamics, selection, score)
 
@@ -328,10 +264,14 @@ def fit_polynomial(task: Task) -> Fitted:
         )
     if task.device != "cpu":
         raise UserError(f"device is {task.device}, but polynomials are fitted on the CPU; use device=cpu")
-    runs = task.reduced.runs("train")
     began = time.perf_counter()
     best = best_polynomial(
-        runs, task.validation_runs, task.num_modes, task.model, task.settings, moves_freely(runs), task.seed
+        task.reduced.runs("train"),
+        task.validation_runs,
+        task.num_modes,
+        task.model,
+        task.settings,
+        task.seed,
     )
     seconds = elapsed(began, time.perf_counter())
     surrogate = Surrogate.of(best.dynamics, task.reduced, task.card)
@@ -339,10 +279,4 @@ def fit_polynomial(task: Task) -> Fitted:
     return Fitted(surrogate, best.score, seconds, best.about())
 
 
-def stand_ins(runs: list[ReducedRun]) -> list[ReducedRun]:
-    """See `Fit.stand_ins`."""
-    log.warning("the validation split is empty; every third training run chooses noise and penalty")
-    return runs[::3]
-
-
-POLYNOMIAL = Fit(stand_ins, fit_polynomial)
+POLYNOMIAL = Fit(slice(None, None, 3), "every third training run chooses noise and penalty", fit_polynomial)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import lightning as L
@@ -29,37 +29,22 @@ _SAMPLING, _NOISE, _BODY_NOISE = 0, 1, 2
 
 
 class NoiseScales(NamedTuple):
-    """Deviations of the newest velocity's noise.
+    """Deviations of the newest velocity's noise."""
 
-    Attributes:
-        latent: Of the modes [m], shape (r, 3).
-        body: Of the body nodes [m], shape (3,); zero along axes that are prescribed.
-    """
-
-    latent: Tensor
-    body: Tensor
+    latent: Tensor  # of the modes [m], shape (r, 3)
+    body: Tensor  # of the body nodes [m], shape (3,); zero along axes that are prescribed
 
 
 class Batch(NamedTuple):
-    """Windows of one optimisation step.
+    """Windows of one optimisation step; [m] in float64."""
 
-    Attributes:
-        latent: Clean latent positions, the targets last [m], float64, shape (B, d + h, r, 3).
-        noise: Offset added to the history [m], float64, shape (B, d, r, 3).
-        body: The d - 1 + h frames that end with the last target's, clean, (B, d - 1 + h, N, ...).
-        body_noise: Offset added to the body in the history [m], float64, shape (B, d, N, 3).
-        force: At the target frames [N], shape (B, h, 3).
-        torque: At the target frames [N m], shape (B, h, 3).
-        context: Of the runs, shape (B, K).
-    """
-
-    latent: Tensor
-    noise: Tensor
-    body: BodyTrack
-    body_noise: Tensor
-    force: Tensor
-    torque: Tensor
-    context: Tensor
+    latent: Tensor  # clean latent positions, the targets last [m], shape (B, d + h, r, 3)
+    noise: Tensor  # offset added to the history [m], shape (B, d, r, 3)
+    body: BodyTrack  # the d - 1 + h frames that end with the last target's, clean, (B, d - 1 + h, N, ...)
+    body_noise: Tensor  # offset added to the body in the history [m], shape (B, d, N, 3)
+    force: Tensor  # at the target frames [N], shape (B, h, 3)
+    torque: Tensor  # at the target frames [N m], shape (B, h, 3)
+    context: Tensor  # of the runs, shape (B, K)
 
     @property
     def horizon(self) -> int:
@@ -88,19 +73,10 @@ class Batch(NamedTuple):
 
 
 class TrainingWindows:
-    """Every window of a set of runs.
+    """Every window of a set of runs, which may have more than the `num_modes` modes that are used.
 
     Each run is preceded by d - 1 copies of its frame 0, so that starts at rest are among the windows and
-    every frame but the first is a target.
-
-    Args:
-        runs: Reduced runs; their latent positions may have more modes than are used.
-        num_modes: r.
-        history: d.
-        body_nodes: "pose" or "points".
-        seed: Of sampling and noise.
-        horizon: h, targets of a window.
-        context: Keys of the scene whose numbers go with every window.
+    every frame but the first is a target. `context` are keys of the scene whose numbers go with every window.
     """
 
     def __init__(
@@ -117,29 +93,24 @@ class TrainingWindows:
             raise UserError(
                 "the training split has no runs; simulate the dataset first: sgns simulate dataset=<name>"
             )
-        self.history = history
-        self.horizon = horizon
-        self.seed = seed
-        latent, tracks, force, torque, targets, of_run = [], [], [], [], [], []
-        offset, pad = 0, history - 1
-        for number, run in enumerate(runs):
+        self.history, self.horizon, self.seed = history, horizon, seed
+        for run in runs:
             require_finite(run)
-            latent.append(pad_start(torch.as_tensor(run.latent[:, :num_modes]), pad))
-            track = body_track(run.pose, run.body_points, body_nodes)
-            tracks.append(BodyTrack(*(pad_start(part, pad) for part in track)))
-            force.append(pad_start(torch.as_tensor(run.force), pad))
-            torque.append(pad_start(torch.as_tensor(run.torque), pad))
-            first, end = offset + history, offset + pad + len(run.latent) - (horizon - 1)
-            targets.append(torch.arange(first, max(first, end)))  # none of a run shorter than the horizon
-            of_run.append(torch.full((pad + len(run.latent),), number))
-            offset += pad + len(run.latent)
-        self.latent = torch.cat(latent)
-        self.body = BodyTrack(*(torch.cat(filled(parts)) for parts in zip(*tracks, strict=True)))
-        self.body_nodes = torch.tensor([len(track.position[0]) for track in tracks])
-        self.force = torch.cat(force)
-        self.torque = torch.cat(torque)
-        self.targets = torch.cat(targets)
-        self.of_run = torch.cat(of_run)
+
+        def stacked(parts: Iterable[np.ndarray | Tensor]) -> Tensor:
+            return torch.cat([pad_start(torch.as_tensor(part), history - 1) for part in parts])
+
+        self.latent = stacked(run.latent[:, :num_modes] for run in runs)
+        self.force = stacked(run.force for run in runs)
+        self.torque = stacked(run.torque for run in runs)
+        tracks = [body_track(run.pose, run.body_points, body_nodes) for run in runs]
+        self.body = BodyTrack(*(stacked(filled(parts)) for parts in zip(*tracks, strict=True)))
+        self.body_nodes = torch.tensor([track.position.shape[1] for track in tracks])
+        lengths = [history - 1 + len(run.latent) for run in runs]
+        self.of_run = torch.arange(len(runs)).repeat_interleave(torch.tensor(lengths))
+        # Frames of a run with a whole history before them and the rest of the horizon after them.
+        whole = [torch.arange(length) for length in lengths]
+        self.targets = torch.cat([(f >= history) & (f <= len(f) - horizon) for f in whole]).nonzero()[:, 0]
         self.context = torch.as_tensor(np.stack([context_of(run.scene, context) for run in runs]))
         if len(self.targets) == 0:
             raise UserError(
@@ -165,15 +136,8 @@ class TrainingWindows:
             shown = len(targets), self.history
             noise = latent.new_zeros(*shown, *latent.shape[2:]), latent.new_zeros(*shown, nodes, 3)
         last = frames[:, self.history :]
-        return Batch(
-            latent,
-            noise[0],
-            body,
-            noise[1],
-            self.force[last],
-            self.torque[last],
-            self.context[self.of_run[targets]],
-        )
+        context = self.context[self.of_run[targets]]
+        return Batch(latent, noise[0], body, noise[1], self.force[last], self.torque[last], context)
 
     def batch(self, step: int, size: int, noise: NoiseScales) -> Batch:
         """The batch of an optimisation step from 0: a function of (seed, step) and nothing else, so that resuming
@@ -227,15 +191,10 @@ def generator(seed: int, index: int, stream: int) -> torch.Generator:
 
 
 def random_walk(scale: Tensor, shape: tuple[int, int], source: torch.Generator) -> Tensor:
-    """Noise on a history whose velocity errors add up, as those of a rollout do.
+    """Noise on histories of `shape` (B, d) whose velocity errors add up, as those of a rollout do.
 
-    Args:
-        scale: Deviation of the newest velocity's noise [m], shape (r, 3), or (N, 3).
-        shape: (B, d).
-        source: Generator.
-
-    Returns:
-        Offsets [m], float64, shape (B, d, r, 3), or (B, d, N, 3); zero at the oldest position.
+    `scale` (r or N, 3) is the deviation of the newest velocity's noise [m]. Returns offsets [m], float64, shape
+    (B, d, r or N, 3); zero at the oldest position.
     """
     batch, d = shape
     steps = torch.randn((batch, d - 1, *scale.shape), generator=source, dtype=torch.float64)
@@ -279,20 +238,14 @@ def fit_normalisation(
     their changes keep their zero, which means rest. "pooled" has a mean and a scale for each axis, over all modes and
     points of the body together, as the paper does.
 
-    Args:
-        dynamics: Filled in place.
-        windows: The training windows.
-        noise: Deviation of the velocity noise; the deviations of modes and body are returned.
-        noise_unit: "velocity": as a share of the velocity scale of each mode and axis; "metre": [m].
-        scales: "per_mode" or "pooled".
-        floor: Smallest scale as a share of the quantity's largest.
+    `noise` is the deviation of the velocity noise, by `noise_unit` a share of the velocity scale of each mode and axis
+    or in metres; the deviations of modes and body are returned. No scale is below the share `floor` of the quantity's
+    largest.
     """
     targets = windows.targets
     position, velocity, change = motions(windows.latent, targets)
     body_position, body_velocity, body_change = map(nodes, motions(windows.body.position, targets))
-    free = free_axes(dynamics.predicts_body, dynamics.settings.body_nodes)
     motion = nodes(windows.body.motion[targets])
-
     if scales == "pooled":
         # Rigid points and modes together; the pose node's rotation has a scale of its own.
         pose = dynamics.settings.body_nodes == "pose"
@@ -315,6 +268,7 @@ def fit_normalisation(
         body_clean = Standardiser.fit(body_change, centred=False)
         moved = Standardiser.fit(body_velocity, centred=False)
 
+    free = free_axes(dynamics.predicts_body, dynamics.settings.body_nodes)
     if noise_unit == "metre":
         scale = NoiseScales(torch.full_like(dynamics.velocity.scale, noise), noise * free)
     else:

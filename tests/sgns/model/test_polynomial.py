@@ -12,7 +12,6 @@ from sgns.config import UserError
 from sgns.model.features import BodyTrack
 from sgns.model.polynomial import PolynomialDynamics, normalised, polynomial_terms
 from sgns.settings import PolynomialSettings
-from sgns.train.callbacks import ValidationRollouts
 from sgns.train.polynomial import (
     Selection,
     Setting,
@@ -22,10 +21,10 @@ from sgns.train.polynomial import (
     refitted,
     ridge,
     select,
-    sparse,
     take,
     unfitted,
 )
+from sgns.train.validation import ValidationRollouts
 from sgns.train.windows import TrainingWindows
 
 HISTORY = 3
@@ -82,12 +81,6 @@ def linear_law(shown, step):
     velocity = shown[-1] - shown[-2]
     move = 0.3 * velocity[::-1] - 0.05 * shown[-1] + np.outer([1.0, -0.5], step)
     return move, 100.0 * step + shown[-1, 0], 7.0 + shown[-1, 1] - 20.0 * step
-
-
-def sparse_law(shown, step):
-    """Two terms in each velocity, one of them a product."""
-    move = 0.5 * np.outer([1.0, -2.0], step) + 0.5 * shown[-1] * step[0]
-    return move, 100.0 * step, 50.0 * step
 
 
 def check_rollouts(model, runs) -> None:
@@ -167,41 +160,6 @@ def test_penalty_draws_towards_the_mean(data) -> None:
     assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 1e-6
     # The constant is free.
     torch.testing.assert_close(ridge(known, 1e9)[0], known.target[0], rtol=1e-6, atol=1e-6)
-
-
-def test_sparse_finds_the_true_terms(data) -> None:
-    runs = with_known_law(data, sparse_law)
-    windows = windows_of(runs[:-20], 2)
-    model = blank(windows, 2)
-    known = moments(model, windows, draws=1)
-    model.weights.copy_(sparse(known, 0.0, 1e-4))
-    check_rollouts(model, runs[-20:])
-    # Inputs are the newest positions (6), velocities (12), the body's place (3) and its three displacements.
-    place = {int(raw): i + 1 for i, raw in enumerate(model.used)}
-    newest = 3 * 2 + 3 * 2 * 2 + 3 + 6 + 6
-    step = [place[newest + axis] for axis in range(3)]
-    terms = [tuple(pair) for pair in model.terms.tolist()]
-    for output in range(3):  # force: its own displacement and the mean, which is not zero
-        kept = {terms[i] for i in model.weights[:, 6 + output].nonzero().flatten()}
-        assert kept == {(0, 0), (0, step[output])}
-    for mode in range(2):
-        for axis in range(3):
-            kept = {terms[i] for i in model.weights[:, 3 * mode + axis].nonzero().flatten()}
-            # The product's positions have a mean, which the term of the step alone takes.
-            product = tuple(sorted((place[3 * mode + axis], step[0])))
-            assert kept == {(0, step[axis]), (0, step[0]), product}
-
-
-def test_a_threshold_above_everything_leaves_nothing(data) -> None:
-    windows = windows_of(data.runs("train"))
-    model = blank(windows, 1)
-    known = moments(model, windows)
-    assert not sparse(known, 1e-3, 1e3).any()
-    counts = [int(sparse(known, 1e-3, t).count_nonzero()) for t in (1e-12, 1e-2, 1e-1)]
-    assert counts == sorted(counts, reverse=True) and counts[0] > counts[-1] > 0
-    model.weights.copy_(sparse(known, 1e-3, 1e-1))
-    assert model.num_terms == counts[-1]
-    assert torch.equal(coefficients(known, Setting(0.0, 1e-3)), ridge(known, 1e-3))
 
 
 def test_unrolling_is_stepping(data) -> None:

@@ -1,4 +1,4 @@
-"""Basis: projection, energies, and the file."""
+"""Basis: projection, energies, the file, and the error of projecting runs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.reduction.basis import CENTRINGS, Basis, reconstruction_curve
 from sgns.reduction.pca import IncrementalPCA
-from sgns_testing.runs import make_run
 from sgns_testing.surrogates import fitted, small_dataset
-
-# --- Basis: projection, energies, and the file ----------------------------------------------------------
 
 
 @pytest.fixture
@@ -55,12 +52,6 @@ def test_transform_is_the_papers_projection(basis, positions):
     several = basis.transform(torch.from_numpy(positions.reshape(5, 6, 20, 3)))
     np.testing.assert_allclose(several[0, 3], expected.T, atol=1e-14)
     assert basis.inverse(several).shape == (5, 6, 20, 3)
-
-
-def test_latent_error_is_full_space_error(basis):
-    a, b = torch.randn(2, 4, 6, 3, dtype=torch.float64)
-    full = (basis.inverse(a) - basis.inverse(b)).square().mean()
-    np.testing.assert_allclose((a - b).square().sum((1, 2)).mean() / (3 * 20), full, rtol=1e-12)
 
 
 def test_gradients_reach_the_latent(basis):
@@ -143,14 +134,9 @@ def test_a_wrong_state_is_named(basis, change, message):
         Basis.from_state({})
 
 
-@pytest.fixture
-def saved(positions, tmp_path):
-    path = tmp_path / "basis.h5"
-    IncrementalPCA(6).partial_fit(positions).basis().save(path)
-    return path
-
-
-def test_damaged_files_are_refused(saved):
+def test_damaged_files_are_refused(basis, tmp_path):
+    saved = tmp_path / "basis.h5"
+    basis.save(saved)
     whole = saved.read_bytes()
     with h5py.File(saved) as file:
         where = file["modes"].id.get_chunk_info(0).byte_offset
@@ -163,7 +149,9 @@ def test_damaged_files_are_refused(saved):
         assert "\n" not in str(caught.value)
 
 
-def test_missing_and_foreign_files_are_refused(saved, tmp_path):
+def test_missing_and_foreign_files_are_refused(basis, tmp_path):
+    saved = tmp_path / "basis.h5"
+    basis.save(saved)
     with pytest.raises(UserError, match="no basis file at"):
         Basis.load(tmp_path / "none.h5")
     with h5py.File(saved, "a") as file:
@@ -191,9 +179,6 @@ def test_a_failed_save_leaves_nothing_behind(basis, tmp_path, monkeypatch):
     assert (tmp_path / "basis.h5").read_text() == "old"
 
 
-# ---  ---------------------------------------------------------------------------------------------------
-
-
 def test_reconstruction_curve_is_the_error_of_projecting(tmp_path):
     dataset = small_dataset(tmp_path)
     basis = fitted(dataset.runs("train"), modes=6)
@@ -206,15 +191,6 @@ def test_reconstruction_curve_is_the_error_of_projecting(tmp_path):
             direct = float((part.inverse(part.transform(true)) - true).square().mean())
             assert curve[r] == pytest.approx(direct, rel=1e-6)
     assert (np.diff(curve) <= 0.0).all()
-
-
-def test_reconstruction_curve_of_the_training_runs_is_the_basis_own(tmp_path):
-    paths = [make_run(tmp_path / f"{i}.h5", frames=10, n=40, seed=i) for i in range(3)]
-    basis = fitted(paths, modes=8)
-    curve = reconstruction_curve(paths, basis)
-    assert curve[1:] == pytest.approx(np.asarray(basis.residual_mse()), rel=1e-4, abs=1e-14)
-
-
-def test_no_runs_give_no_curve(tmp_path):
-    basis = fitted(small_dataset(tmp_path).runs("train"), modes=3)
+    own = reconstruction_curve(dataset.runs("train"), basis)
+    assert own[1:] == pytest.approx(np.asarray(basis.residual_mse()), rel=1e-4, abs=1e-14)
     assert np.isnan(reconstruction_curve([], basis)).all()

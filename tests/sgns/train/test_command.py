@@ -14,32 +14,42 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sgns.config import UserError
+from sgns.model.checkpoint import load_surrogate
 from sgns.model.network_dynamics import Path
+from sgns.reduction.reduce import reduce_dataset
 from sgns.settings import TrainingSettings
 from sgns.simulator import Simulator
 from sgns.train import lightning_module as module
-from sgns.train.callbacks import ValidationRollouts
 from sgns.train.command import main, train
-from sgns_testing.tiny import MODEL, REDUCTION, TRAINING, make_dataset
+from sgns.train.validation import ValidationRollouts
+from sgns_testing.tiny import BRIEF, MODEL, REDUCTION, TRAINING, make_dataset
 
 
-def run(data, output, **changes) -> float:
-    return train(data, num_modes=4, model=MODEL, training=TRAINING | changes, output=output, seed=3)
+def run(data, output, start_from=None, model=MODEL, **changes) -> float:
+    training = TRAINING | changes
+    return train(
+        data, num_modes=4, model=model, training=training, output=output, seed=3, start_from=start_from
+    )
 
 
-def weights(path) -> dict[str, torch.Tensor]:
-    return torch.load(path, weights_only=True)["state_dict"]
+def content(path):
+    return torch.load(path, weights_only=True)
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory):
+    """Folder and skill of a complete training, only to be read."""
+    folder = tmp_path_factory.mktemp("trained")
+    return folder, run(data, folder)
 
 
 def test_it_learns(data, tmp_path) -> None:
     before = run(data, tmp_path / "short", max_steps=1, validate_every=1)
-    after = run(data, tmp_path / "long", max_steps=300, validate_every=100, learning_rate=5e-3, noise=0.3)
+    after = run(data, tmp_path / "long", max_steps=200, validate_every=100, learning_rate=5e-3, noise=0.3)
     assert after > max(before, 0.5)
 
 
-def test_resuming_equals_not_stopping(data, tmp_path, monkeypatch) -> None:
-    whole = run(data, tmp_path / "whole")
-
+def test_resuming_equals_not_stopping(data, trained, tmp_path, monkeypatch) -> None:
     class Interrupted(Exception):
         pass
 
@@ -49,40 +59,43 @@ def test_resuming_equals_not_stopping(data, tmp_path, monkeypatch) -> None:
 
     with monkeypatch.context() as patch, pytest.raises(Interrupted):
         patch.setattr(module.StepProgress, "on_train_batch_end", stop)
-        run(data, tmp_path / "parts")
-    assert not (tmp_path / "parts" / "training.json").exists()
-    assert run(data, tmp_path / "parts") == whole
-    a, b = (weights(tmp_path / name / "last.ckpt") for name in ("whole", "parts"))
-    assert a.keys() == b.keys()
-    for name in a:
-        assert torch.equal(a[name], b[name]), name
+        run(data, tmp_path)
+    assert not (tmp_path / "training.json").exists()
+    assert run(data, tmp_path) == trained[1]
+    a, b = (content(folder / "last.ckpt") for folder in (trained[0], tmp_path))
+    assert a["state_dict"].keys() == b["state_dict"].keys() and a["first_loss"] == b["first_loss"] > 0
+    for name, value in a["state_dict"].items():
+        assert torch.equal(value, b["state_dict"][name]), name
 
 
 def test_lightning_says_nothing(data, tmp_path, capfd) -> None:
-    run(data, tmp_path)
+    run(data, tmp_path, max_steps=2)
     (tmp_path / "training.json").unlink()
-    run(data, tmp_path)  # resumed
+    run(data, tmp_path, max_steps=2)  # resumed
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_complete_training_is_not_repeated(data, tmp_path, monkeypatch) -> None:
-    first = run(data, tmp_path)
+def test_a_complete_training_is_not_repeated(data, trained, monkeypatch) -> None:
+    folder, skill = trained
     monkeypatch.setattr(module, "run_trainer", None)
-    assert run(data, tmp_path) == first
+    assert run(data, folder) == skill
     # Speed and reporting do not make it another training.
-    assert run(data, tmp_path, threads=1, log_every=7) == first
+    assert run(data, folder, threads=1, log_every=7) == skill
 
 
 def test_other_settings_do_not_mix(data, tmp_path) -> None:
-    run(data, tmp_path)
-    with pytest.raises(UserError, match=r"training\.learning_rate is 0\.001 there and 0\.002 here"):
-        run(data, tmp_path, learning_rate=2e-3)
-    run(data, tmp_path, learning_rate=2e-3, resume=False)
+    run(data, tmp_path, max_steps=1, validate_every=1)
+    with pytest.raises(UserError) as caught:
+        run(data, tmp_path, max_steps=2, validate_every=1, batch_size=4, noise=0.3)
+    for words in ("training.max_steps is 1 there and 2 here", "batch_size is 8 there", "noise is 0.1 there"):
+        assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+    run(data, tmp_path, max_steps=2, validate_every=1, resume=False)
 
 
 def test_the_last_step_is_judged_even_if_odd(data, tmp_path) -> None:
     run(data, tmp_path, max_steps=7, validate_every=5)
-    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == 7
+    assert content(tmp_path / "last.ckpt")["global_step"] == 7
 
 
 def test_a_loss_that_is_not_finite_stops_in_one_line(data, tmp_path) -> None:
@@ -92,9 +105,9 @@ def test_a_loss_that_is_not_finite_stops_in_one_line(data, tmp_path) -> None:
     assert not (tmp_path / "training.json").exists()
 
 
-def test_what_tensorboard_shows(data, tmp_path) -> None:
-    skill = run(data, tmp_path)
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
+def test_what_tensorboard_shows(trained) -> None:
+    folder, skill = trained
+    events = EventAccumulator(str(folder / "tensorboard"))
     events.Reload()
     scalars = set(events.Tags()["scalars"])
     assert {"loss/change", "loss/force", "loss/torque", "loss/total"} <= scalars
@@ -104,60 +117,37 @@ def test_what_tensorboard_shows(data, tmp_path) -> None:
     assert events.Scalars("final/skill")[0].value == pytest.approx(skill)
 
 
-def test_start_from_another_checkpoint(data, tmp_path) -> None:
-    run(data, tmp_path / "first")
-    train(
-        data,
-        num_modes=4,
-        model=MODEL,
-        training=TRAINING | {"max_steps": 1, "learning_rate": 1e-12, "final_learning_rate": 1e-12},
-        output=tmp_path / "second",
-        start_from=tmp_path / "first" / "last.ckpt",
-    )
-    a, b = (weights(tmp_path / name / "last.ckpt") for name in ("first", "second"))
+def test_start_from_another_checkpoint(data, trained, tmp_path) -> None:
+    first = trained[0] / "last.ckpt"
+    run(data, tmp_path, first, max_steps=1, learning_rate=1e-12, final_learning_rate=1e-12)
+    a, b = (content(path)["state_dict"] for path in (first, tmp_path / "last.ckpt"))
     for name in a:
         torch.testing.assert_close(a[name], b[name], rtol=0, atol=1e-9)
+
+
+def test_a_checkpoint_of_another_model_or_basis_is_refused(data, trained, tmp_path) -> None:
+    first = trained[0] / "last.ckpt"
     with pytest.raises(UserError, match="another model"):
-        train(
-            data,
-            num_modes=4,
-            model=MODEL | {"hidden_width": 8},
-            training=TRAINING,
-            output=tmp_path / "third",
-            start_from=tmp_path / "first" / "last.ckpt",
-        )
-
-
-def test_a_checkpoint_of_another_basis_is_refused(data, tmp_path) -> None:
-    run(data, tmp_path / "first")
+        run(data, tmp_path, first, MODEL | {"hidden_width": 8})
     other = replace(data, basis=replace(data.basis, modes=data.basis.modes.flip(1)))
     with pytest.raises(UserError, match="belongs to another basis"):
-        train(
-            other,
-            num_modes=4,
-            model=MODEL,
-            training=TRAINING,
-            output=tmp_path / "second",
-            start_from=tmp_path / "first" / "last.ckpt",
-        )
+        run(other, tmp_path, first)
 
 
 def test_skill_of_truth_and_of_a_frozen_bed(data) -> None:
     rollouts = ValidationRollouts(data.runs("validation"), 4, 3, "pose")
 
-    class Known(torch.nn.Module):
+    class Known(torch.nn.Linear):
         """Gives the answers instead of learning them."""
-
-        def __init__(self, latent, force) -> None:
-            super().__init__()
-            self.weight = torch.nn.Parameter(torch.zeros(1))
-            self.answers = latent, force
 
         predicts_body = False
 
+        def __init__(self, *answers) -> None:
+            super().__init__(1, 1)
+            self.answers = answers
+
         def unroll(self, latent, body, context):
-            frames = body.position.shape[1]
-            pad = frames - self.answers[0].shape[1]
+            pad = body.position.shape[1] - self.answers[0].shape[1]
             answers = [torch.cat([a[:, :1].expand(-1, pad, *a.shape[2:]), a], 1) for a in self.answers]
             return Path(*answers, None, body)
 
@@ -180,25 +170,25 @@ def test_schedule() -> None:
         assert rates[50] == pytest.approx(1e-2)
 
 
-def test_the_command(tmp_path) -> None:
-    make_dataset(tmp_path / "data")
-    cfg = OmegaConf.create(
-        {
-            "dataset": {"name": "tiny", "path": str(tmp_path / "data")},
-            "reduction": REDUCTION,
-            "model": MODEL,
-            "training": TRAINING | {"max_steps": 5, "validate_every": 5},
-            "preset": {"name": "default"},
-            "output": str(tmp_path / "out"),
-            "checkpoint": None,
-            "seed": 0,
-            "device": "cpu",
-        }
-    )
-    skill = main(cfg)
+def test_the_command_trains_with_the_number_of_modes_that_was_chosen(tmp_path) -> None:
+    three = reduce_dataset(make_dataset(tmp_path / "data"), REDUCTION).basis.energy(3)
+    cfg = {
+        "dataset": {"name": "tiny", "path": str(tmp_path / "data")},
+        "reduction": REDUCTION | {"num_modes": "auto", "choose": "energy", "share": three},
+        "model": MODEL,
+        "training": BRIEF,
+        "preset": {"name": "default"},
+        "output": str(tmp_path / "out"),
+        "checkpoint": None,
+        "seed": 0,
+        "device": "cpu",
+    }
+    skill = main(OmegaConf.create(cfg))
     assert json.loads((tmp_path / "out" / "training.json").read_text())["skill"] == skill
-    card = torch.load(tmp_path / "out" / "best.ckpt", weights_only=True)["hyper_parameters"]
-    assert card["settings"]["preset"] == "default" and card["settings"]["dataset"] == "tiny"
+    surrogate = load_surrogate(tmp_path / "out" / "best.ckpt")
+    assert surrogate.dynamics.num_modes == 3
+    settings = surrogate.card["settings"]
+    assert settings["preset"] == "default" and settings["dataset"] == "tiny"
 
 
 def poisoned(data, split: str, what: str):
@@ -230,7 +220,7 @@ def test_a_training_that_diverges_stops_and_keeps_its_best(data, tmp_path, monke
     ) as caught:
         run(data, tmp_path / "ill", max_steps=60, validate_every=10)
     assert "\n" not in str(caught.value)
-    assert torch.load(tmp_path / "ill" / "best.ckpt", weights_only=True)["global_step"] == 10
+    assert content(tmp_path / "ill" / "best.ckpt")["global_step"] == 10
     assert np.isfinite(Simulator.load(tmp_path / "ill" / "best.ckpt").mean_force).all()
     assert not (tmp_path / "ill" / "training.json").exists()
 
@@ -248,23 +238,9 @@ def test_weights_that_are_not_finite_are_not_saved(data, tmp_path, monkeypatch) 
     with pytest.raises(UserError, match=r"the weights .* are not finite after step 20; .*best\.ckpt"):
         run(data, tmp_path, max_steps=30)
     for name in ("best.ckpt", "last.ckpt"):
-        content = torch.load(tmp_path / name, weights_only=True)
-        assert content["global_step"] == 10
-        assert all(value.isfinite().all() for value in content["state_dict"].values())
-
-
-def test_a_resumed_training_knows_its_first_loss(data, tmp_path) -> None:
-    run(data, tmp_path)
-    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["first_loss"] > 0
-
-
-def test_all_settings_that_differ_are_named(data, tmp_path) -> None:
-    run(data, tmp_path, max_steps=1, validate_every=1)
-    with pytest.raises(UserError) as caught:
-        run(data, tmp_path, max_steps=2, batch_size=4, noise=0.3)
-    for words in ("max_steps is 1 there and 2 here", "batch_size is 8 there", "noise is 0.1 there"):
-        assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
+        kept = content(tmp_path / name)
+        assert kept["global_step"] == 10
+        assert all(value.isfinite().all() for value in kept["state_dict"].values())
 
 
 def test_one_training_at_a_time_in_a_folder(data, tmp_path, monkeypatch) -> None:

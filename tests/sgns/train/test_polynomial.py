@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,9 +14,10 @@ from sgns.model.checkpoint import load_surrogate
 from sgns.model.polynomial import PolynomialDynamics
 from sgns.settings import FitSettings, PolynomialSettings
 from sgns.train import command as module
-from sgns.train.callbacks import ValidationRollouts
 from sgns.train.command import train
 from sgns.train.polynomial import best_polynomial
+from sgns.train.validation import ValidationRollouts
+from sgns_testing.commands import refusal, sgns
 from sgns_testing.tiny import FIT, MODEL, POLYNOMIAL, TRAINING, make_dataset
 
 
@@ -32,22 +30,14 @@ def without_validation(data, count: int):
     return replace(data, _runs={"train": data.runs("train")[:count], "validation": [], "test": []})
 
 
-def fitted(data, **changes):
-    runs = data.runs("train")
-    return best_polynomial(
-        runs,
-        data.runs("validation"),
-        4,
-        PolynomialSettings(**POLYNOMIAL),
-        FitSettings.from_dict(FIT | changes),
-        predicts_body=False,
-        seed=3,
-    )
+def fitted(runs, choosing, **changes):
+    settings = PolynomialSettings(**POLYNOMIAL), FitSettings.from_dict(FIT | changes)
+    return best_polynomial(runs, choosing, 4, *settings, seed=3)
 
 
 def test_what_is_written_is_what_was_fitted(data, tmp_path) -> None:
     skill = run(data, tmp_path)
-    model = fitted(data).dynamics
+    model = fitted(data.runs("train"), data.runs("validation")).dynamics
     loaded = load_surrogate(tmp_path / "best.ckpt").dynamics
     assert isinstance(loaded, PolynomialDynamics)
     state = loaded.state_dict()
@@ -79,25 +69,16 @@ def test_a_complete_fit_is_not_repeated(data, tmp_path, monkeypatch) -> None:
 
 
 def test_without_validation_runs_a_third_chooses_and_all_are_fitted(data, tmp_path, caplog) -> None:
-    quadratic = FIT | {"linear": False}
-    skill = run(without_validation(data, 4), tmp_path, training=quadratic)
+    quadratic = {"linear": False}
+    skill = run(without_validation(data, 4), tmp_path, training=FIT | quadratic)
     assert "every third training run" in caplog.text
     runs = data.runs("train")
-    settings = PolynomialSettings(**POLYNOMIAL), FitSettings.from_dict(quadratic)
-    without = best_polynomial(runs[1:3], runs[::3], 4, *settings, predicts_body=False, seed=3)
+    without = fitted(runs[1:3], runs[::3], **quadratic)
     assert without.score.skill == skill
     # The same noise and penalty for all runs.
     motion = without.selection.motion
     chosen = {"noises": [motion.noise], "penalties": [motion.penalty]}
-    everything = best_polynomial(
-        runs,
-        data.runs("test"),
-        4,
-        settings[0],
-        FitSettings.from_dict(quadratic | chosen),
-        predicts_body=False,
-        seed=3,
-    )
+    everything = fitted(runs, data.runs("test"), **quadratic, **chosen)
     loaded = load_surrogate(tmp_path / "best.ckpt").dynamics
     assert torch.equal(loaded.weights[:, :-6], everything.dynamics.weights[:, :-6])
 
@@ -107,10 +88,11 @@ def test_one_run_alone_can_be_fitted(data, tmp_path) -> None:
 
 
 def test_what_chooses_is_the_best_there_is(data) -> None:
-    best = fitted(data)
+    runs, choosing = data.runs("train"), data.runs("validation")
+    best = fitted(runs, choosing)
     for noise in FIT["noises"]:
         for penalty in FIT["penalties"]:
-            other = fitted(data, noises=[noise], penalties=[penalty])
+            other = fitted(runs, choosing, noises=[noise], penalties=[penalty])
             assert other.score.skill <= best.score.skill
 
 
@@ -140,26 +122,13 @@ def test_what_polynomials_have_no_use_for(data, tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_the_commands(tmp_path: Path, monkeypatch) -> None:
-    make_dataset(tmp_path / "data", frames=20, n=300)
-    monkeypatch.chdir(tmp_path)
+def test_the_commands(tmp_path) -> None:
+    make_dataset(tmp_path / "data", n=300)
     dataset = ["dataset=quick", "dataset.path=data"]
-
-    def call(*arguments: str) -> tuple[int, str]:
-        command = [sys.executable, "-m", "sgns", *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
-        return done.returncode, done.stderr
-
     train_it = ["train", *dataset, "model=polynomial", "reduction.num_modes=4", "training.threads=1"]
-    assert call(*train_it, "output=out")[0] == 0
-    assert {path.name for path in Path("out").iterdir()} == {
-        ".hydra",
-        "best.ckpt",
-        "tensorboard",
-        "training.json",
-    }
-    assert call("evaluate", *dataset, "checkpoint=out/best.ckpt", "output=report")[0] == 0
-    assert Path("report/report.html").exists()
-    status, line = call(*train_it, "output=other", "preset=paper")
-    assert status == 2 and "model has no key 'body_nodes'" in line
-    assert not Path("other").exists()
+    assert sgns(tmp_path, *train_it, "output=out").returncode == 0
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {".hydra", "best.ckpt", "tensorboard", "training.json"}
+    assert sgns(tmp_path, "evaluate", *dataset, "checkpoint=out/best.ckpt", "output=report").returncode == 0
+    assert (tmp_path / "report" / "report.html").exists()
+    assert "model has no key 'body_nodes'" in refusal(tmp_path, *train_it, "output=other", "preset=paper")
