@@ -28,7 +28,7 @@ def test_a_mesh_is_about_its_centre_of_mass(tmp_path, form):
 
 def test_an_uneven_mesh_has_its_volumes_centre():
     """A pyramid's centre of mass lies a quarter of its height above its base."""
-    from mpm_warp.mesh import closed_mesh
+    from mpm_warp.bodies import closed_mesh
 
     vertices = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 2]]) + 7.0
     faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])

@@ -9,7 +9,7 @@ import hypothesis.strategies as st
 import numpy as np
 from hypothesis import given
 
-from mpm_warp.mesh import closed_mesh, read_mesh
+from mpm_warp.bodies import closed_mesh, read_mesh
 from sgns_testing.fuzzing import OUTCOMES, cases, damaged, refused_or_read
 
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
