@@ -178,9 +178,9 @@ class Cylinder(Settings, Tool):
     def reach(self) -> float:
         return math.hypot(self.tip_radius, 0.5 * self.width)
 
-    def points(self) -> np.ndarray:
-        """Body nodes: 8 on each of the two rims, shape (16, 3)."""
-        return self._rims(0.5 * self.diameter, 8)
+    def points(self, count: int = 8) -> np.ndarray:
+        """Body nodes: `count` on each of the two rims, shape (2 count, 3)."""
+        return self._rims(0.5 * self.diameter, count)
 
     def outline(self) -> np.ndarray:
         return self._rims(self.tip_radius, 64)
@@ -207,6 +207,7 @@ class MeshBody(Settings, Tool):
 
     group: ClassVar[str] = "tool"
     surface: ClassVar[str] = "mesh"
+    node_count: ClassVar[int] = 16
 
     shape: Literal["mesh"] = setting("mesh", "of the body")
     file: str = setting("", "STL (text or binary) or OBJ")
@@ -271,7 +272,7 @@ class MeshBody(Settings, Tool):
         vertices = self.mesh[0]
         chosen = [int(np.argmax(np.linalg.norm(vertices, axis=1)))]
         distance = np.full(len(vertices), np.inf)
-        for _ in range(min(16, len(vertices)) - 1):
+        for _ in range(min(self.node_count, len(vertices)) - 1):
             distance = np.minimum(distance, np.linalg.norm(vertices - vertices[chosen[-1]], axis=1))
             chosen.append(int(np.argmax(distance)))
         return vertices[chosen]

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import field, replace
+from dataclasses import field, fields, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ import numpy as np
 from .bed import Bed, Walls
 from .bodies import Axle, Box, Cylinder, MeshBody, Plate, Tool
 from .material import Material
-from .poses import about_y, rotate, sampled_poses
+from .poses import about_y, rotate
 from .scene import Scene
 from .settings import same, setting, settings
 from .state import SceneError
@@ -95,35 +95,30 @@ class Excavation(Scene):
                 raise SceneError(
                     "scene.motion=path needs scene.path, a CSV file with columns t,x,y,z,qx,qy,qz,qw"
                 )
-            object.__setattr__(self, "path", tuple(tuple(float(v) for v in row) for row in self.path))
         elif self.path is not None:
             raise SceneError(
                 f"scene.path is given but scene.motion is {self.motion!r}; use scene.motion=path"
             )
-        self._check_thickness("blade.thickness")
-        self._check_inside("the plate", "change scene.depth, speed, start, duration or the path")
+        self._check_thickness(self.blade, "blade.thickness")
+        self._check_inside(self.blade, "the plate", "change scene.depth, speed, start, duration or the path")
 
     @property
     def body(self) -> Plate:
         return self.blade
 
     def poses_at(self, time: np.ndarray) -> np.ndarray:
-        time = np.atleast_1d(np.asarray(time, dtype=float))
         if self.motion == "path":
-            return sampled_poses(np.asarray(self.path), time)
+            return super().poses_at(time)
+        time = np.atleast_1d(np.asarray(time, dtype=float))
         rotation = about_y(-math.radians(self.rake))
         lx, ly, _ = self.bed.size
         start = np.array([self.start * lx, 0.5 * ly, self.clearance]) - rotate(rotation, self.blade.tip)
-        law = {"curved": curved, "ramp": ramp, "rest": lambda t, *_: np.zeros((len(t), 2))}[self.motion]
-        moved = law(time, self.depth, self.speed)
         poses = np.empty((len(time), 7))
         poses[:, :3] = start
-        poses[:, [0, 2]] += moved
+        if self.motion != "rest":
+            poses[:, [0, 2]] += (curved if self.motion == "curved" else ramp)(time, self.depth, self.speed)
         poses[:, 3:] = rotation
         return poses
-
-    def path_times(self) -> np.ndarray:
-        return np.array([row[0] for row in self.path or ()])
 
     def body_points(self) -> np.ndarray:
         return self.blade.points(*self.body_grid)
@@ -158,22 +153,12 @@ class Body(Scene):
         super().__post_init__()
         if self.path is None:
             raise SceneError("scene.path is missing: a CSV file with columns t,x,y,z,qx,qy,qz,qw")
-        object.__setattr__(self, "path", tuple(tuple(float(v) for v in row) for row in self.path))
-        self._check_thickness("a body")
-        self._check_inside("the body", "change scene.path or scene.duration")
+        self._check_thickness(self.tool, "a body")
+        self._check_inside(self.tool, "the body", "change scene.path or scene.duration")
 
     @property
     def body(self) -> Tool:
         return self.tool
-
-    def poses_at(self, time: np.ndarray) -> np.ndarray:
-        return sampled_poses(np.asarray(self.path), np.atleast_1d(np.asarray(time, dtype=float)))
-
-    def path_times(self) -> np.ndarray:
-        return np.array([row[0] for row in self.path])
-
-    def body_points(self) -> np.ndarray:
-        return self.tool.points()
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         x, y, z = force[1:].mean(axis=0)
@@ -231,7 +216,9 @@ class Wheel(Scene):
     friction_angle: float | None = setting(37.0, "of the soil; None: material.friction_angle", "degrees")
     settle: float = setting(1.0, "time at rest under the load before driving; recorded like the rest", "s")
     damping: float = setting(5.0, "force against the vertical velocity per mass of the wheel", "1/s", ge=0)
-    bilateral: bool = setting(False, "soil in contact may not leave the wheel along its normal")
+    bilateral: bool = setting(  # type: ignore[misc]  # a kind of scene makes it a setting
+        False, "soil in contact may not leave the wheel along its normal"
+    )
     start: float = setting(0.30, "where the axle starts" + _SHARE, ge=0, le=1, note=_SHARE)
     clearance: float = setting(0.0, "of the wheel's lowest point above the surface at the start", "m")
 
@@ -255,20 +242,13 @@ class Wheel(Scene):
         if self.friction_angle is not None:
             material = replace(self.material, friction_angle=self.friction_angle)
             object.__setattr__(self, "material", material)
-        self._check_thickness("a wheel's width")
+        self._check_thickness(self.body, "a wheel's width")
         self._check_fits()
 
     @cached_property
     def body(self) -> Cylinder:
         """The wheel; its axis is y and its centre of mass the middle of the axle."""
-        return Cylinder(
-            diameter=self.diameter,
-            width=self.width,
-            friction=self.friction,
-            grousers=self.grousers,
-            grouser_height=self.grouser_height,
-            grouser_thickness=self.grouser_thickness,
-        )
+        return Cylinder(**{f.name: getattr(self, f.name) for f in fields(Cylinder) if f.name != "shape"})
 
     @property
     def axle(self) -> Axle:
@@ -301,9 +281,6 @@ class Wheel(Scene):
     def sinkage(self, poses: np.ndarray) -> np.ndarray:
         """See `sinkage`."""
         return sinkage(vars(self), poses)
-
-    def body_points(self) -> np.ndarray:
-        return self.body.points()
 
     def warnings(self) -> list[str]:
         found = super().warnings()
