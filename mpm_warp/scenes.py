@@ -371,6 +371,14 @@ class Column(Scene):
 # --- A layer of soil on an endless rough slope ----------------------------------------------------------
 
 
+def bagnold_speed(scene: Scene, inertial_number: float, height: np.ndarray) -> np.ndarray:
+    """Speed [m/s] of a tilted bed that flows steadily, at heights above its base [m] (Bagnold's profile)."""
+    soil, thickness = scene.material, scene.bed.size[2]
+    fall = scene.gravity * math.cos(math.radians(scene.tilt))
+    scale = 2.0 * inertial_number / (3.0 * soil.grain_diameter) * math.sqrt(soil.packing * fall)
+    return scale * (thickness**1.5 - np.clip(thickness - height, 0.0, thickness) ** 1.5)
+
+
 @settings
 class Incline(Scene):
     """A layer as thick as the bed, tilted; meant for a bed that is periodic in x."""
@@ -406,8 +414,8 @@ class Incline(Scene):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.flowing and not self._flows:
-            low, high = self._flowing_angles
+        low, high = self._flowing_angles
+        if self.flowing and not low < self.tilt < high:
             raise SceneError(
                 f"scene.tilt is {self.tilt} degrees; this soil flows steadily between {low:.2f} and {high:.2f} "
                 "degrees: choose such a tilt or start at rest with scene.flowing=false"
@@ -415,29 +423,21 @@ class Incline(Scene):
 
     @property
     def _flowing_angles(self) -> tuple[float, float]:
-        """Slopes at which the soil flows without stopping or accelerating for ever [degrees]."""
-        friction = (self.material.static_friction, self.material.limit_friction)
-        return tuple(math.degrees(math.atan(mu)) for mu in friction)
-
-    @property
-    def _flows(self) -> bool:
-        low, high = self._flowing_angles
-        return low < self.tilt < high
+        """Slopes between which the soil flows without stopping or accelerating for ever [degrees]."""
+        soil = self.material
+        return math.degrees(math.atan(soil.static_friction)), math.degrees(math.atan(soil.limit_friction))
 
     @property
     def inertial_number(self) -> float:
         """I of the steady flow, the same at every depth [-]."""
-        if not self._flows:
+        low, high = self._flowing_angles
+        if not low < self.tilt < high:
             return 0.0
-        soil, slope = self.material, math.tan(math.radians(self.tilt))
-        return soil.reference_inertial_number * (slope - soil.static_friction) / (soil.limit_friction - slope)
+        return self.material.inertial_number(math.tan(math.radians(self.tilt)))
 
     def steady_velocity(self, height: np.ndarray) -> np.ndarray:
-        """Speed down the slope of the steady flow at heights above the base [m], in [m/s] (Bagnold's profile)."""
-        soil, thickness = self.material, self.bed.size[2]
-        fall = self.gravity * math.cos(math.radians(self.tilt))
-        scale = 2.0 * self.inertial_number / (3.0 * soil.grain_diameter) * math.sqrt(soil.packing * fall)
-        return scale * (thickness**1.5 - np.clip(thickness - height, 0.0, thickness) ** 1.5)
+        """Speed down the slope of the steady flow at heights above the base [m], in [m/s]."""
+        return bagnold_speed(self, self.inertial_number, height)
 
     def initial_velocities(self) -> np.ndarray:
         velocities = super().initial_velocities()
