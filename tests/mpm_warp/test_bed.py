@@ -115,31 +115,6 @@ def test_momentum_along_periodic_axes_is_conserved():
     np.testing.assert_allclose(after[:2], kick.sum(axis=0)[:2], atol=1e-12 * np.abs(kick).sum())
 
 
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ({"x": "sticky"}, "bed.walls.x is 'sticky'; allowed: no_slip, slip, periodic or a friction"),
-        ({"floor": "periodic"}, "bed.walls.floor is 'periodic'; allowed: no_slip, slip or a friction"),
-        ({"y": -0.1}, "bed.walls.y is -0.1; allowed"),
-        ({"y": True}, "bed.walls.y is True; allowed"),
-    ],
-)
-def test_what_walls_refuse(values, words):
-    with pytest.raises(SceneError, match=words):
-        Walls(**values)
-
-
-def test_a_period_is_a_whole_number_of_cells():
-    with pytest.raises(SceneError, match=r"bed.walls.x is periodic but .* 7.500 grid spacings"):
-        Bed(size=(0.15, 0.2, 0.1), spacing=0.02, walls=Walls(x="periodic"))
-
-
-def test_walls_survive_plain_data():
-    scene = cut(bed=Bed(size=(0.48, 0.4, 0.16), spacing=0.02, walls=Walls("slip", 0.3, 0.5)))
-    assert Scene.from_dict(scene.to_dict()) == scene
-    assert scene.bed.walls.conditions == ("slip", "friction", "friction")
-
-
 def test_no_two_kinds_of_walls_share_a_kernel():
     """Warp takes kernels for the same, here and in its cache, whose text and functions are the same, whatever the names
     under which the text calls the functions."""

@@ -413,27 +413,6 @@ def test_grousers_raise_the_wheel_and_warn_when_thin():
     assert any("0.20 grid spacings thick" in w for w in scene.warnings())
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"load": 0.0}, "scene.load is 0.0 N; a wheel needs more than 0"),
-        ({"gravity": 0.0}, "scene.gravity"),
-        ({"slip": 1.5}, "scene.slip is 1.5; allowed: -1 to 1"),
-        ({"settle": -1.0, "duration": 1.0}, "scene.settle"),
-        ({"damping": -1.0}, "scene.damping"),
-        ({"diameter": 0.0}, "scene.diameter"),
-        ({"grousers": 4}, "scene.grouser_height"),
-        ({"width": 0.3}, "only 0.16 m wide"),
-        ({"friction_angle": 95.0}, "friction_angle is 95.0"),
-        ({"start": 0.9, "duration": 9.0}, "the axle moves from"),
-        ({"clearance": float("nan")}, "scene.clearance"),
-    ],
-)
-def test_what_a_wheel_refuses(change, words):
-    with pytest.raises(SceneError, match=words):
-        wheel(**change)
-
-
 def test_a_wheels_summary_leaves_the_settling_out():
     scene = wheel(settle=0.1, duration=0.2)
     poses = scene.body_poses()
