@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from mpm_warp import (
     Bed,
@@ -24,7 +25,6 @@ from mpm_warp import (
 )
 from mpm_warp.auto_effects import expected_flow
 from mpm_warp.limits import Guard, top_body_speed
-from mpm_warp.material import static_friction
 from mpm_warp.poses import about_y, rotate, sampled_poses
 from mpm_warp.rigid_body import stable_step
 from mpm_warp.scenes import curved, ramp
@@ -64,11 +64,8 @@ def test_sampled_path_interpolates_and_rests_at_its_ends():
     np.testing.assert_allclose(poses[2, 3:], about_y(np.pi / 4), atol=1e-12)
     np.testing.assert_allclose(poses[0], path[0][1:])
     np.testing.assert_allclose(poses[4], path[1][1:], atol=1e-12)
-
-
-def test_a_path_of_one_pose_rests():
-    poses = sampled_poses(np.array([[0.0, 1, 2, 3, 0, 0, 0, 1]]), np.array([0.0, 5.0]))
-    np.testing.assert_allclose(poses, [[1, 2, 3, 0, 0, 0, 1]] * 2)
+    alone = sampled_poses(np.array(path[:1]), np.array([0.0, 5.0]))
+    np.testing.assert_allclose(alone, [path[0][1:]] * 2)
 
 
 @pytest.mark.parametrize(
@@ -85,18 +82,14 @@ def test_bad_paths(rows, words):
         sampled_poses(np.array(rows), np.array([0.0]))
 
 
-def test_quaternions_agree_with_scipy():
-    a, b = (
-        Rotation.random(20, rng=np.random.default_rng(0)),
-        Rotation.random(20, rng=np.random.default_rng(1)),
-    )
+def test_turns_along_a_path_are_scipys():
+    a = Rotation.random(20, rng=np.random.default_rng(0))
     v = np.random.default_rng(2).normal(size=(20, 3))
     np.testing.assert_allclose(rotate(a.as_quat(), v), a.apply(v), atol=1e-12)
-    for first, last, vector, turn in zip(b, a * b, v, a, strict=True):
-        samples = np.array([[t, 0.0, 0.0, 0.0, *q.as_quat()] for t, q in ((0.0, first), (1.0, last))])
-        half = sampled_poses(samples, np.array([0.5]))[0, 3:]
-        turned = (Rotation.from_rotvec(0.5 * turn.as_rotvec()) * first).apply(vector)
-        np.testing.assert_allclose(rotate(half, vector), turned, atol=1e-9)
+    path = np.column_stack([np.arange(20.0), np.zeros((20, 3)), a.as_quat()])
+    time = np.linspace(0.0, 19.0, 100)
+    turned = Rotation.from_quat(sampled_poses(path, time)[:, 3:])
+    assert (turned * Slerp(path[:, 0], a)(time).inv()).magnitude().max() < 1e-9
 
 
 def turning(*rows: tuple[float, float], **kw) -> Body:
@@ -212,6 +205,7 @@ def test_slip_kinematics():
     angle = np.arctan2(-spun[:, 0], -spun[:, 2])
     np.testing.assert_allclose(angle, [0, 0, 0.1 / 0.06 * 0.5, 0.1 / 0.06], atol=1e-12)
     assert 1.0 - scene.speed / (scene.angular_speed * 0.06) == pytest.approx(0.25)
+    assert wheel(gravity=1.62).axle.mass * 1.62 == pytest.approx(scene.load)
 
 
 @pytest.mark.parametrize(("slip", "speed"), [(0.2, 15.60), (0.3846153846, 12.00), (0.7, 5.85)])
@@ -220,12 +214,6 @@ def test_published_speeds(slip, speed, diameter, spin):
     scene = Wheel(slip=slip, diameter=diameter)
     assert 1e3 * scene.speed == pytest.approx(speed, abs=1e-6)
     assert scene.angular_speed == pytest.approx(spin)
-
-
-def test_weight_is_the_load_in_any_gravity():
-    for gravity in (1.62, 9.81):
-        scene = wheel(gravity=gravity)
-        assert scene.axle.mass * gravity == pytest.approx(scene.load)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -381,28 +369,19 @@ def test_a_wheel_that_reaches_the_floor_stops_the_run():
 def test_all_published_combinations_are_valid_scenes(gravity, friction_angle):
     """3 x 3 of these times 27: 243."""
     bed = Bed(size=(0.40, 0.19, 0.0583))
-    for diameter, width, share in ((0.30, 0.125, 1), (0.15, 0.0833, 1), (0.05, 0.0833, 9)):
-        for load in (100.0, 164.0, 225.0):
-            for slip in (0.2, 0.3846153846, 0.7):
-                scene = Wheel(
-                    bed=bed, gravity=gravity, friction_angle=friction_angle, diameter=diameter,
-                    width=width, load=load / share, slip=slip,
-                )  # fmt: skip
-                assert scene.arrangement_hash == bed.arrangement_hash
-                assert Scene.from_dict(json.loads(json.dumps(scene.to_dict()))) == scene
-                assert scene.body_points().shape == (16, 3)
+    sizes = ((0.30, 0.125, 1), (0.15, 0.0833, 1), (0.05, 0.0833, 9))
+    for (diameter, width, share), load, slip in product(
+        sizes, (100.0, 164.0, 225.0), (0.2, 0.3846153846, 0.7)
+    ):
+        values = {"diameter": diameter, "width": width, "load": load / share, "slip": slip}
+        scene = Wheel(bed=bed, gravity=gravity, friction_angle=friction_angle, **values)
+        assert scene.arrangement_hash == bed.arrangement_hash
+        assert Scene.from_dict(json.loads(json.dumps(scene.to_dict()))) == scene
+        assert scene.body_points().shape == (16, 3)
 
 
-def test_friction_angles():
-    assert static_friction(37.0) == pytest.approx(math.tan(math.radians(37.0)))
-    mild = wheel(friction_angle=43.0)  # 0.9325: below the limit friction, which stays
-    assert mild.material.static_friction == pytest.approx(0.932515, abs=1e-6)
-    assert mild.material.limit_friction == 0.9616
-    assert mild.warnings() == []
-    steep = wheel(friction_angle=45.0)
-    assert steep.material.static_friction == pytest.approx(1.0)
-    assert steep.material.limit_friction == pytest.approx(1.2016)  # 0.2016 above, as before
-    assert "is raised to 1.2016" in steep.warnings()[0]
+def test_a_wheels_friction_angle_is_its_soils():
+    assert wheel(friction_angle=45.0).material == Material(friction_angle=45.0)
     own = Material(static_friction=0.5, limit_friction=0.6)
     assert wheel(material=own).material == own
 
