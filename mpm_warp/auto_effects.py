@@ -116,13 +116,9 @@ class Tolerances:
     """Nonlocality: the cooperativity length, as a share of the thickness of the flowing layer [-]."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not (number and math.isfinite(value) and value >= 0.0):
-                raise SceneError(
-                    f"effects.tolerance.{field.name} is {value!r}; it must be a number, 0 or more"
-                )
+        for name, value in vars(self).items():
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 <= value < math.inf:
+                raise SceneError(f"effects.tolerance.{name} is {value!r}; it must be a number, 0 or more")
 
 
 class Decision(NamedTuple):

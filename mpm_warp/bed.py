@@ -278,23 +278,28 @@ class Bed(Settings):
         return self._arranged
 
     @property
+    def _arranged(self) -> tuple[np.ndarray, float]:
+        return arrange(self.arrangement, self.size, self.particle_spacing, self.seed, self.mirrored)
+
+    @property
     def filling(self) -> float:
         """Share of the bin below the surface that its particles fill [-]: 1, but for random points that keep apart."""
         positions, volume = self._arranged
         return len(positions) * volume / float(np.prod(self.size))
 
     @property
-    def _arranged(self) -> tuple[np.ndarray, float]:
-        return arrange(self.arrangement, self.size, self.particle_spacing, self.seed, self.mirrored)
-
-    @property
     def arrangement_hash(self) -> str:
         """Same for every run whose recorded particles start at the same places in the same order."""
-        key = [self.size, self.spacing, self.particles_per_cell, self.arrangement]
+        key: list[Any] = [self.size, self.spacing, self.particles_per_cell, self.arrangement]
         if self.arrangement != "lattice":
             key.append(self.seed)
             if self.mirrored:
                 key.append("mirrored")
         if self.store_every != 1:
             key.append(f"one of {self.store_every}")
-        return hashlib.blake2b(json.dumps(key).encode(), digest_size=8).hexdigest()
+        return digest(key)
+
+
+def digest(key: list[Any]) -> str:
+    """A short name of plain data, the same for the same data."""
+    return hashlib.blake2b(json.dumps(key).encode(), digest_size=8).hexdigest()

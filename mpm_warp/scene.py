@@ -73,12 +73,13 @@ class Scene(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.duration * self.frame_rate >= 1.0:
+        frames = self.duration * self.frame_rate
+        if not frames >= 1.0:
             raise SceneError(f"scene.duration is {self.duration} s; it must last at least one frame")
-        if not self.duration * self.frame_rate <= MOST_FRAMES:
+        if not frames <= MOST_FRAMES:
             raise SceneError(
-                f"scene.duration is {self.duration} s at scene.frame_rate {self.frame_rate} Hz: "
-                f"{self.duration * self.frame_rate:.2g} frames; at most {MOST_FRAMES:g} are allowed: lower one of them"
+                f"scene.duration is {self.duration} s at scene.frame_rate {self.frame_rate} Hz: {frames:.2g} frames; "
+                f"at most {MOST_FRAMES:g} are allowed: lower one of them"
             )
         if self._path is not None:
             object.__setattr__(self, "path", tuple(tuple(float(v) for v in row) for row in self._path))
@@ -211,13 +212,8 @@ class Scene(Settings):
         return self.material.warnings() + (self.body.warnings() if self.body is not None else [])
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
-        """What came out, in a few words; empty without a body.
-
-        Args:
-            force: by the soil on the body at the frames [N], shape (T, 3).
-            torque: about its centre of mass [N m], shape (T, 3).
-            poses: of the body, shape (T, 7).
-        """
+        """What came out, in a few words, of the soil's force on the body [N] and its torque about the centre of mass
+        [N m], shape (T, 3), and the body's poses (T, 7); empty without a body."""
         return ""
 
     def to_dict(self) -> dict[str, Any]:

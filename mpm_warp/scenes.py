@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import field, fields, replace
@@ -12,15 +10,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .bed import Bed, Walls
+from .bed import Bed, Walls, digest
 from .bodies import Axle, Box, Cylinder, MeshBody, Plate, Tool
 from .material import Material
 from .poses import about_y, rotate
 from .scene import Scene
 from .settings import same, setting, settings
 from .state import SceneError
-
-# --- Prescribed paths of a blade's tip and of a body given by samples -----------------------------------
 
 CUT_LENGTH = 0.4
 """Horizontal travel of the published cuts [m]."""
@@ -58,8 +54,6 @@ def ramp(time: np.ndarray, depth: float, speed: float) -> np.ndarray:
     third = np.clip(time - down - across, 0.0, down)
     return np.stack([RAMP_SPEED * (first + third) + speed * second, RAMP_SPEED * (third - first)], axis=-1)
 
-
-# --- A plate cuts through a bed -------------------------------------------------------------------------
 
 _PATH = "rows t [s], x, y, z [m], qx, qy, qz, qw of the body's centre of mass"
 _SHARE = ", a share of the bin's length"
@@ -112,9 +106,10 @@ class Excavation(Scene):
         time = np.atleast_1d(np.asarray(time, dtype=float))
         rotation = about_y(-math.radians(self.rake))
         lx, ly, _ = self.bed.size
-        start = np.array([self.start * lx, 0.5 * ly, self.clearance]) - rotate(rotation, self.blade.tip)
         poses = np.empty((len(time), 7))
-        poses[:, :3] = start
+        poses[:, :3] = np.array([self.start * lx, 0.5 * ly, self.clearance]) - rotate(
+            rotation, self.blade.tip
+        )
         if self.motion != "rest":
             poses[:, [0, 2]] += (curved if self.motion == "curved" else ramp)(time, self.depth, self.speed)
         poses[:, 3:] = rotation
@@ -134,9 +129,6 @@ class Excavation(Scene):
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         return f"mean draft {-np.mean(force[1:, 0]):.1f} N, vertical force {np.mean(force[1:, 2]):.1f} N"
-
-
-# --- Any body along a path ------------------------------------------------------------------------------
 
 
 @settings
@@ -165,18 +157,14 @@ class Body(Scene):
         return f"mean force ({x:.1f}, {y:.1f}, {z:.1f}) N"
 
 
-# --- A wheel drives over a bed under a load -------------------------------------------------------------
-
 LEAST_MASS, MOST_MASS = 1.0e-9, 1.0e9
 """Of a body whose height is free [kg]."""
 
 
 def sinkage(scene: Mapping[str, Any], poses: np.ndarray) -> np.ndarray:
-    """Depth of a wheel's lowest point below the undisturbed surface [m], shape (T,) for poses (T, 7).
+    """Depth of a wheel's lowest point below the undisturbed surface [m], shape (T,) for its poses (T, 7).
 
-    Args:
-        scene: the wheel's as plain data, such as a run file's; published ones say nothing of grousers.
-        poses: of the wheel.
+    Its `scene` is plain data, such as a run file's; published ones say nothing of grousers.
     """
     return 0.5 * scene["diameter"] + scene.get("grouser_height", 0.0) - poses[:, 2]
 
@@ -318,9 +306,6 @@ class Wheel(Scene):
             )
 
 
-# --- A column of soil that is let go and collapses under its own weight ---------------------------------
-
-
 @settings
 class Column(Scene):
     """Soil stands in the middle of the floor and is let go at time 0; the bed's Lz is its height."""
@@ -364,11 +349,7 @@ class Column(Scene):
 
     @property
     def arrangement_hash(self) -> str:
-        key = [self.bed.arrangement_hash, self.shape, self.radius]
-        return hashlib.blake2b(json.dumps(key).encode(), digest_size=8).hexdigest()
-
-
-# --- A layer of soil on an endless rough slope ----------------------------------------------------------
+        return digest([self.bed.arrangement_hash, self.shape, self.radius])
 
 
 def bagnold_speed(scene: Scene, inertial_number: float, height: np.ndarray) -> np.ndarray:
