@@ -113,6 +113,12 @@ def test_a_cut_in_the_papers_sand():
     assert not decisions["free_body"].on
 
 
+def test_a_cut_that_rests():
+    _, decisions = effects_for(cut(motion="rest"))
+    assert not any(decisions[name].on for name in ("rate_dependence", "fluidity", "nonlocality"))
+    assert decisions["nonlocality"] == (False, "nothing drives a flow", 0.0)
+
+
 def test_scenes_that_call_for_more():
     effects, decisions = effects_for(slope())
     assert effects.rate_dependence and effects.nonlocality and not effects.symmetry and not effects.torque
@@ -136,8 +142,7 @@ def test_tolerances_decide():
 
 
 def test_what_needs_another_brings_it_or_goes_with_it():
-    asked = {"nonlocality": True}
-    effects, decisions = effects_for(cut(duration=0.5), asked)
+    effects, decisions = effects_for(cut(duration=0.5), {"nonlocality": True})
     assert effects.rate_dependence
     assert decisions["rate_dependence"].reason.startswith("effects.nonlocality needs it")
     effects, decisions = effects_for(slope(), {"rate_dependence": False})
@@ -166,11 +171,7 @@ def test_what_is_asked_for_is_done_and_says_what_auto_would_do():
             "effects.free_body needs a body whose height is free, as in scene=wheel",
         ),
         (WHEEL, {"free_body": False}, "kind wheel is always free"),
-        (
-            cut(),
-            {"rate_dependence": False, "fluidity": True},
-            "effects.fluidity needs effects.rate_dependence",
-        ),
+        (cut(), {"rate_dependence": False, "fluidity": True}, "fluidity needs effects.rate_dependence"),
         (cut(), {"gravity": True}, "effects has no key 'gravity'; allowed: yielding, "),
         (cut(), {"symmetry": "yes"}, "effects.symmetry is 'yes'; allowed: auto, true, false"),
         (cut(), {"symmetry": 1}, "effects.symmetry is 1; allowed: auto, true, false"),

@@ -125,53 +125,51 @@ def test_motion_without_rotation_counts_as_before():
     assert top_body_speed(Scene()) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("rows", "words"),
-    [
-        ([(0.0, 0.0), (0.02, 0.0), (0.020000001, 90.0)], "turns by 90 degrees within substep"),
-        (
-            [(0.0, 0.0), *((0.02 + 1e-10 * k, 90.0 * k) for k in range(5))],
-            "turns by 360 degrees within substep",
-        ),
-    ],
-    ids=["quarter", "whole"],
+def sampled(*rows: tuple[float, float, float], **kw) -> Scene:
+    """The blade of `cut` along x and z [m] at times [s]."""
+    return cut(motion="path", path=tuple((t, x, 0.2, z, 0, 0, 0, 1) for t, x, z in rows), **kw)
+
+
+SPINNING = Wheel(bed=cut().bed, duration=0.05, settle=0.0, slip=1.0, rim_speed=3000.0, **UNDAMPED)
+TURNING = (
+    r"the body .* turns by {} degrees within substep .* of frame 2, .* at 0\.0(19|20).* allowed: 0\.01 m"
 )
-def test_a_body_that_turns_at_once_stops_the_solver(rows, words):
-    """Also when it is back where it was before the substep ends."""
-    frames = Solver(turning(*rows)).frames()
-    assert [next(frames).index, next(frames).index] == [0, 1]
-    with pytest.raises(
-        SolverStopped, match=words + r" .* of frame 2, .* at 0\.0(19|20).* allowed: 0\.01 m"
-    ) as caught:
-        next(frames)
+
+
+@pytest.mark.parametrize(
+    ("scene", "frames", "words"),
+    [
+        (turning((0.0, 0.0), (0.02, 0.0), (0.020000001, 90.0)), 2, TURNING.format(90)),
+        # Back where they were before the substep ends.
+        (turning((0, 0), *((0.02 + 1e-10 * k, 90.0 * k) for k in range(5))), 2, TURNING.format(360)),
+        (
+            sampled((0, 0.2, 0.2), (1e-5, 0.2, 0.2), (1.1e-5, 0.22, 0.2), (1.2e-5, 0.2, 0.2), duration=0.05),
+            1,
+            r"the body jumps by 0.04 m .* at 0.00000 s",
+        ),
+        # So fast that no step is short enough; a wheel's poses show no whole turns.
+        (SPINNING, 1, r"the body jumps by 0 m .* half a grid spacing"),
+    ],
+    ids=["quarter", "whole turn", "there and back", "wheel"],
+)
+def test_a_body_that_jumps_stops_the_solver(scene, frames, words):
+    good = []
+    with pytest.raises(SolverStopped, match=words) as caught:
+        good.extend(frame.index for frame in Solver(scene).frames())
+    assert good == list(range(frames))
     assert "\n" not in str(caught.value)
 
 
-def test_a_body_that_comes_back_within_a_substep_stops_the_solver():
-    path = tuple(
-        (t, x, 0.2, 0.2, 0, 0, 0, 1) for t, x in [(0, 0.2), (1e-5, 0.2), (1.1e-5, 0.22), (1.2e-5, 0.2)]
-    )
-    with pytest.raises(SolverStopped, match=r"the body jumps by 0.04 m .* at 0.00000 s"):
-        list(Solver(cut(motion="path", path=path, duration=0.05)).frames())
-
-
-def test_a_wheel_that_turns_too_fast_stops_the_solver():
-    """On the spot, so fast that no step is short enough; a wheel's poses show no whole turns."""
-    wheel = Wheel(bed=cut().bed, duration=0.05, settle=0.0, slip=1.0, rim_speed=3000.0, **UNDAMPED)
-    with pytest.raises(SolverStopped, match=r"the body jumps by 0 m .* half a grid spacing"):
-        list(Solver(wheel).frames())
+def test_a_wheels_rim_counts():
     slow = Wheel(bed=cut().bed, **UNDAMPED)
     assert top_body_speed(slow) == pytest.approx(slow.speed + slow.angular_speed * slow.body.reach)
 
 
 def test_a_path_that_leaves_the_bin_between_frames():
-    path = tuple(
-        (t, 0.24, 0.2, z, 0, 0, 0, 1) for t, z in [(0.0, 0.2), (0.04, 0.2), (0.042, -0.1), (0.044, 0.2)]
-    )
+    heights = [(0.0, 0.2), (0.04, 0.2), (0.042, -0.1), (0.044, 0.2)]
     with pytest.raises(SceneError, match=r"the plate leaves the bin at 0\.042 s"):
-        cut(motion="path", path=path)
-    later = tuple((t + 0.5, *rest) for t, *rest in path)
-    cut(motion="path", path=later)  # the scene ends before
+        sampled(*((t, 0.24, z) for t, z in heights))
+    sampled(*((t + 0.5, 0.24, z) for t, z in heights))  # the scene ends before
 
 
 # --- The wheel: its motion, its load, and what the soil does to it --------------------------------------
