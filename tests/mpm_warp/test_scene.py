@@ -16,7 +16,6 @@ import mpm_warp
 from mpm_warp import (
     Bed,
     Body,
-    Box,
     Column,
     Cylinder,
     Excavation,
@@ -51,13 +50,6 @@ def test_a_scene_survives_json(scene):
     again = Scene.from_dict(json.loads(json.dumps(scene.to_dict())))
     assert again == scene
     assert again.to_dict() == scene.to_dict()
-
-
-def test_frames_include_the_initial_state():
-    scene = cut(duration=1.0, frame_rate=60.0)
-    assert scene.frame_count == 61
-    np.testing.assert_allclose(scene.times()[[0, -1]], [0.0, 1.0])
-    assert scene.body_poses().shape == (61, 7)
 
 
 def test_blade_starts_above_the_surface_with_its_tip_leading():
@@ -104,31 +96,34 @@ def test_recorded_particles_are_one_of_every_few():
     assert len(share) == 8
 
 
-def beyond_the_limits() -> Iterator[tuple[type, str, float]]:
-    """Class, setting and the numbers next to its range, by the page of the documentation that lists them."""
+def wrong_values() -> Iterator[tuple[type, str, object]]:
+    """Class, setting and what it may not be, by the page of the documentation that lists what is allowed."""
     for line in (Path(__file__).parents[2] / "docs" / "settings.md").read_text().splitlines():
         if line.startswith("## "):
             cls = getattr(mpm_warp, line[3:])
         elif line.startswith("| `"):
             name, _, allowed, _ = line.strip("| ").split(" | ", 3)
-            for words in allowed.strip().split(", "):
-                for number in re.findall(r"(?:above|below) (\S+)", words):
-                    yield cls, name.strip("`"), float(number)
-                for number in re.findall(r"(\S+) (?:or more|to \S+)", words):
-                    yield cls, name.strip("`"), np.nextafter(float(number), -np.inf)
-                for number in re.findall(r"(?:at most|to) (\S+)", words):
-                    yield cls, name.strip("`"), np.nextafter(float(number), np.inf)
+            name, default, wrong = name.strip("`"), getattr(cls, name.strip("`"), None), []
+            if isinstance(default, bool):
+                wrong = [1]
+            elif isinstance(default, float):
+                wrong = [math.nan]
+            elif isinstance(default, str) and allowed.strip():
+                wrong = ["other"]
+            for part in allowed.strip().split(", "):
+                wrong += map(float, re.findall(r"(?:above|below) (\S+)", part))
+                wrong += [np.nextafter(float(x), -np.inf) for x in re.findall(r"(\S+) (?:or more|to )", part)]
+                wrong += [np.nextafter(float(x), np.inf) for x in re.findall(r"(?:at most|to) (\S+)", part)]
+            several = len(default) if isinstance(default, tuple) else 0
+            yield from ((cls, name, (value,) * several if several else value) for value in wrong)
 
 
-def test_limits_are_as_the_page_says():
-    checked = set()
-    for cls, name, value in beyond_the_limits():
-        default = getattr(cls, name)
-        wrong = (value,) * len(default) if isinstance(default, tuple) else value
+def test_what_is_allowed_is_as_the_page_says():
+    wrong = list(wrong_values())
+    for cls, name, value in wrong:
         with pytest.raises(SceneError, match=rf"{name}(\[0\])? is "):
-            cls(**{name: wrong})
-        checked.add((cls, name))
-    assert len(checked) > 50
+            cls(**{name: value})
+    assert len(wrong) > 150
 
 
 def from_data(**data) -> Scene:
@@ -139,14 +134,11 @@ REFUSED = {
     cut: [
         ({"depth": 0.3}, r"leaves the bin at .* z = .*; change scene.depth"),
         ({"speed": 3.0, "duration": 1.0}, "leaves the bin"),
-        ({"depth": float("nan")}, "scene.depth is nan"),
         ({"speed": 0.0}, "scene.speed is 0.0 m/s; it must be above 0"),
-        ({"motion": "zigzag"}, "allowed: curved, ramp, rest, path"),
         ({"motion": "path"}, "needs scene.path"),
         ({"path": ((0.0,) * 8,)}, "use scene.motion=path"),
         ({"gravity": 1e300}, r"scene.gravity is 1e\+300 m/s\^2; allowed: 0 to 100000"),
         ({"duration": 0.0}, "scene.duration is 0.0 s; it must last at least one frame"),
-        ({"duration": 1e300}, r"scene.duration is 1e\+300 s; allowed: at most 1e\+06"),
         ({"duration": 1e5}, r"duration is 100000.0 s at .* 60.0 Hz: 6e\+06 frames; at most 1e\+06"),
         ({"courant": 1.0}, "scene.courant is 1.0; allowed: 0.0001 to 0.8: with longer steps elastic waves"),
         ({"remap_time": -1.0}, r"scene.remap_time is -1.0 s; it must be 0 \(every step\) or more"),
@@ -160,17 +152,14 @@ REFUSED = {
         ({"load": 0.0}, "scene.load is 0.0 N; a wheel needs more than 0"),
         ({"load": 1e-12}, r"a wheel of 1.02e-13 kg; allowed: 1e-09 to 1e\+09 kg"),
         ({"gravity": 0.0}, "scene.gravity is 0.0 m/s.* a wheel needs more than 0"),
-        ({"slip": 1.5}, "scene.slip is 1.5; allowed: -1 to 1"),
         ({"settle": -1.0, "duration": 1.0}, "scene.settle"),
         ({"grousers": 4}, "scene.grouser_height is 0.0; it must be above 0 m"),
         ({"width": 0.3}, "only 0.19 m wide"),
         ({"friction_angle": 95.0}, "friction_angle is 95.0"),
         ({"start": 0.9, "duration": 9.0}, "the axle moves from"),
-        ({"clearance": float("nan")}, "scene.clearance"),
         ({"clearance": 0.2}, "below bed.headroom"),
     ],
     Column: [
-        ({"shape": "cone"}, "scene.shape is 'cone'; allowed: cylinder, slab"),
         ({"radius": 0.4}, "scene.radius is 0.4 m; allowed: .* half the bin"),
     ],
     Incline: [
@@ -188,9 +177,7 @@ REFUSED = {
         ({"headroom": 1e300}, r"bed.headroom is 1e\+300 m .* at most 2e\+08 are allowed: lower bed.headroom"),
         ({"headroom": math.inf}, "bed.headroom is inf m"),
         ({"spacing": 2e-4, "particles_per_cell": 1e-4}, "nodes; .* larger bed.spacing"),
-        ({"arrangement": "heap"}, "allowed: lattice, jittered, poisson"),
         ({"store_every": 2.5}, "bed.store_every is 2.5; it must be a whole number"),
-        ({"initial_stress": "some"}, "allowed: geostatic, k0, none"),
         (
             {"size": (0.15, 0.2, 0.1), "spacing": 0.02, "walls": Walls(x="periodic")},
             "bed.walls.x is periodic but .* 7.500 grid spacings",
@@ -202,7 +189,6 @@ REFUSED = {
         ({"y": True}, "bed.walls.y is True; allowed"),
     ],
     Plate: [({"width": float("nan")}, "blade.width is nan; it must be above 0 m")],
-    Box: [({"size": (0.1, 0.1)}, "three lengths")],
     Cylinder: [
         ({"grousers": 3}, "tool.grouser_height"),
         ({"grouser_height": 0.01}, "need tool.grousers above 0"),
@@ -210,12 +196,9 @@ REFUSED = {
     ],
     Material: [
         ({"poissons_ratio": 0.5}, "poissons_ratio is 0.5; allowed: 0 to 0.499: soil that keeps"),
-        ({"youngs_modulus": float("inf")}, "youngs_modulus"),
         ({"limit_friction": 0.5}, "must be above material.static_friction"),
-        ({"friction_map": "cos"}, "friction_map is 'cos'; allowed: sin, tan, triaxial"),
         ({"friction_angle": 0.0}, "friction_angle is 0.0; allowed: above 0 and below 90 degrees"),
         ({"rate_law": "cubic"}, "rate_law is 'cubic'; allowed: saturating, linear"),
-        ({"fluidity_at_walls": "some"}, "fluidity_at_walls is 'some'; allowed: zero, free"),
     ],
     from_data: [
         ({"kind": "cube"}, "scene.kind is 'cube'; allowed: bed, "),

@@ -118,13 +118,6 @@ def test_a_guard_knows_how_fast_a_path_is_between_frames():
         assert top_body_speed(scene, step) == pytest.approx(fastest)
 
 
-def test_motion_without_rotation_counts_as_before():
-    scene = cut()
-    step = np.linalg.norm(np.diff(scene.body_poses()[:, :3], axis=0), axis=1)
-    assert top_body_speed(scene) == step.max() * scene.frame_rate
-    assert top_body_speed(Scene()) == 0.0
-
-
 def sampled(*rows: tuple[float, float, float], **kw) -> Scene:
     """The blade of `cut` along x and z [m] at times [s]."""
     return cut(motion="path", path=tuple((t, x, 0.2, z, 0, 0, 0, 1) for t, x, z in rows), **kw)
@@ -160,9 +153,12 @@ def test_a_body_that_jumps_stops_the_solver(scene, frames, words):
     assert "\n" not in str(caught.value)
 
 
-def test_a_wheels_rim_counts():
-    slow = Wheel(bed=cut().bed, **UNDAMPED)
+def test_top_speeds():
+    slow, straight = Wheel(bed=cut().bed, **UNDAMPED), cut()
     assert top_body_speed(slow) == pytest.approx(slow.speed + slow.angular_speed * slow.body.reach)
+    step = np.linalg.norm(np.diff(straight.body_poses()[:, :3], axis=0), axis=1)
+    assert top_body_speed(straight) == step.max() * straight.frame_rate
+    assert top_body_speed(Scene()) == 0.0
 
 
 def test_a_path_that_leaves_the_bin_between_frames():
