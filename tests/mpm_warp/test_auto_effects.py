@@ -119,6 +119,11 @@ def test_a_cut_that_rests():
     assert decisions["nonlocality"] == (False, "nothing drives a flow", 0.0)
 
 
+def test_grains_so_fine_that_the_rate_adds_nothing():
+    _, decisions = effects_for(cut(material=Material(grain_diameter=1e-30)))
+    assert (decisions["rate_dependence"].number, decisions["fluidity"].number) == (0.0, np.inf)
+
+
 def test_scenes_that_call_for_more():
     effects, decisions = effects_for(slope())
     assert effects.rate_dependence and effects.nonlocality and not effects.symmetry and not effects.torque
