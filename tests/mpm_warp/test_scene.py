@@ -18,6 +18,7 @@ from mpm_warp import (
     Body,
     Column,
     Cylinder,
+    Effects,
     Excavation,
     Incline,
     Material,
@@ -199,6 +200,10 @@ REFUSED = {
         ({"limit_friction": 0.5}, "must be above material.static_friction"),
         ({"friction_angle": 0.0}, "friction_angle is 0.0; allowed: above 0 and below 90 degrees"),
         ({"rate_law": "cubic"}, "rate_law is 'cubic'; allowed: saturating, linear"),
+    ],
+    Effects: [
+        ({"yielding": False}, "effects.rate_dependence needs effects.yielding"),
+        ({"rate_dependence": False, "nonlocality": True}, "nonlocality needs effects.rate_dependence"),
     ],
     from_data: [
         ({"kind": "cube"}, "scene.kind is 'cube'; allowed: bed, "),
