@@ -12,12 +12,13 @@ import numpy as np
 from .discretisation import asymmetry, require_symmetry
 from .effects import Effects
 from .limits import scene_size
+from .poses import rotation_matrices
 from .scene import Scene
-from .scenes import Column
+from .scenes import Column, bagnold_speed
 from .settings import Settings, setting, settings
 from .state import SceneError
 
-# --- How soil is expected to flow in a scene: an estimate from the scene alone, before anything is computed
+# --- How soil is expected to flow: an estimate from the scene alone -------------------------------------
 
 _TOP_SHARE = 5.0  # a body's speed is the one it exceeds in this share of its time in the soil [%]
 
@@ -34,11 +35,6 @@ class Flow:
     """l: over which the speed falls to zero [m]."""
     inertial_number: float
     """I [-]; infinite where nothing limits the speed."""
-
-    @property
-    def rate(self) -> float:
-        """Of deformation, V / l [1/s]."""
-        return self.speed / self.thickness
 
 
 def expected_flow(scene: Scene) -> Flow | None:
@@ -58,8 +54,7 @@ def _sheared(scene: Scene, cause: str, speed: float, thickness: float) -> Flow:
     pressure = material.bulk_density * scene.gravity * thickness
     inertial = math.inf
     if pressure > 0.0:
-        rate = speed / thickness
-        inertial = rate * material.grain_diameter * math.sqrt(material.grain_density / pressure)
+        inertial = speed / thickness * material.grain_diameter * math.sqrt(material.grain_density / pressure)
     return Flow(cause, speed, thickness, inertial)
 
 
@@ -69,7 +64,8 @@ def _of_body(scene: Scene) -> Flow | None:
     if body is None:
         return None
     poses = scene.body_poses()
-    depth = -(poses[:, 2] + (_heights(poses[:, 3:]) @ body.outline().T).min(axis=1))
+    heights = rotation_matrices(poses[:, 3:])[:, 2] @ body.outline().T
+    depth = -(poses[:, 2] + heights.min(axis=1))
     way, angle = scene.displacement(scene.times())
     speed = np.maximum(way, angle * body.reach) * scene.frame_rate
     if scene.axle is None:
@@ -80,12 +76,6 @@ def _of_body(scene: Scene) -> Flow | None:
     if not len(moving):
         return None
     return _sheared(scene, "the body", float(np.percentile(moving, 100.0 - _TOP_SHARE)), thickness)
-
-
-def _heights(q: np.ndarray) -> np.ndarray:
-    """What points in the body's frame are multiplied with for their height in the world, shape (T, 3)."""
-    x, y, z, w = q.T
-    return np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
 
 
 def _of_column(scene: Scene) -> Flow | None:
@@ -102,17 +92,14 @@ def _of_slope(scene: Scene) -> Flow | None:
     if slope <= material.static_friction or scene.gravity == 0.0:
         return None
     inertial = material.inertial_number(slope)
-    fall = scene.gravity * math.cos(math.radians(scene.tilt))
-    # At the surface; what accelerates for ever is taken as fast as free fall through the layer.
-    speed = (
-        2.0 * inertial / (3.0 * material.grain_diameter) * math.sqrt(material.packing * fall) * thickness**1.5
-    )
-    if math.isinf(inertial):
+    if math.isinf(inertial):  # what accelerates for ever is taken as fast as free fall through the layer
         speed = math.sqrt(2.0 * scene.gravity * thickness)
+    else:
+        speed = float(bagnold_speed(scene, inertial, np.asarray(thickness)))
     return Flow("the slope", speed, thickness, inertial)
 
 
-# --- Which effects a scene calls for, decided from the scene alone by named dimensionless numbers -------
+# --- Which effects a scene calls for, by named dimensionless numbers ------------------------------------
 
 EFFECTS = (*(f.name for f in fields(Effects)), "free_body")
 """What can be asked for: the switches of `Effects`, and whether the body's height is free."""
@@ -138,6 +125,14 @@ class Decision(NamedTuple):
     number: float | None = None
 
 
+def _settled(auto: Decision, asked: bool | str) -> Decision:
+    """The decision that stands: auto's own, or what was asked for."""
+    if isinstance(asked, str):
+        return auto
+    would = "so would auto" if asked == auto.on else f"auto would turn it {'on' if auto.on else 'off'}"
+    return Decision(asked, f"asked for; {would}: {auto.reason}", auto.number)
+
+
 def effects_for(
     scene: Scene,
     asked: Mapping[str, bool | str] | None = None,
@@ -159,41 +154,37 @@ def effects_for(
     asked = _checked(asked or {})
     scene_size(scene)  # what follows looks at all particles
     tolerances = tolerances or Tolerances()
-    flow = expected_flow(scene)
-    found: dict[str, Decision] = {}
-
-    def settle(name: str, auto: Decision) -> None:
-        wanted = asked[name]
-        if wanted == "auto":
-            found[name] = auto
-        elif wanted == auto.on:
-            found[name] = Decision(wanted, f"asked for; so would auto: {auto.reason}", auto.number)
-        else:
-            against = f"asked for; auto would turn it {'on' if auto.on else 'off'}: {auto.reason}"
-            found[name] = Decision(wanted, against, auto.number)
-
-    settle("yielding", Decision(True, "granular soil flows when shear exceeds friction"))
-    rate = _rate_dependence(scene, flow, tolerances)
+    flow, asymmetric = expected_flow(scene), asymmetry(scene)
+    auto = {
+        "yielding": Decision(True, "granular soil flows when shear exceeds friction"),
+        "rate_dependence": _rate_dependence(scene, flow, tolerances),
+        "fluidity": _fluidity(scene, flow),
+        "nonlocality": _nonlocality(scene, flow, tolerances),
+        "separation": Decision(True, "the surface is free: soil near it can come apart"),
+        "symmetry": Decision(
+            asymmetric is None,
+            asymmetric or "bed, body and motion are their own mirror image about mid-width",
+        ),
+        "torque": Decision(
+            scene.body is not None, "the body turns soil" if scene.body else "there is no body"
+        ),
+        "free_body": _free_body(scene),
+    }
     missing = "yielding" if asked["yielding"] is False else "rate_dependence"
     if asked[missing] is False:
         without = Decision(False, f"it needs effects.{missing}, which is off")
-        for name in ("fluidity", "nonlocality"):
-            settle(name, without)
-        settle("rate_dependence", without if missing == "yielding" else rate)
+        auto |= {"fluidity": without, "nonlocality": without}
+        if missing == "yielding":
+            auto["rate_dependence"] = without
     else:
-        settle("fluidity", _fluidity(scene, flow))
-        settle("nonlocality", _nonlocality(scene, flow, tolerances))
-        needing = [name for name in ("fluidity", "nonlocality") if found[name].on]
+        rate = auto["rate_dependence"]
+        needing = [n for n in ("fluidity", "nonlocality") if (auto[n].on if asked[n] == "auto" else asked[n])]
         if needing and not rate.on:
-            rate = Decision(True, f"effects.{needing[0]} needs it; by itself: {rate.reason}", rate.number)
-        settle("rate_dependence", rate)
-    settle("separation", Decision(True, "the surface is free: soil near it can come apart"))
-    settle("symmetry", _symmetry(scene))
-    settle("torque", _torque(scene))
-    settle("free_body", _free_body(scene))
+            reason = f"effects.{needing[0]} needs it; by itself: {rate.reason}"
+            auto["rate_dependence"] = Decision(True, reason, rate.number)
     _require_possible(scene, asked)
-    effects = Effects(**{f.name: found[f.name].on for f in fields(Effects)})
-    return effects, {name: found[name] for name in EFFECTS}
+    found = {name: _settled(auto[name], asked[name]) for name in EFFECTS}
+    return Effects(**{f.name: found[f.name].on for f in fields(Effects)}), found
 
 
 def _rate_dependence(scene: Scene, flow: Flow | None, tolerances: Tolerances) -> Decision:
@@ -202,7 +193,10 @@ def _rate_dependence(scene: Scene, flow: Flow | None, tolerances: Tolerances) ->
         return Decision(False, "nothing drives a flow", 0.0)
     material = scene.material
     added = material.friction_at(flow.inertial_number) / material.static_friction - 1.0
-    words = f"{_moves(flow)}, inertial number {flow.inertial_number:.2g}: it adds {_percent(added)} to mu_s"
+    words = (
+        f"{flow.cause} moves soil at {flow.speed:.2g} m/s over {1e3 * flow.thickness:.2g} mm, "
+        f"inertial number {flow.inertial_number:.2g}: it adds {_percent(added)} to mu_s"
+    )
     return _against("tolerance.friction", added, tolerances.friction, words)
 
 
@@ -213,7 +207,8 @@ def _fluidity(scene: Scene, flow: Flow | None) -> Decision:
         return Decision(False, always)
     material = scene.material
     above = material.friction_at(flow.inertial_number) - material.static_friction
-    ratio = material.fluidity_time / above * flow.rate
+    rate = flow.speed / flow.thickness
+    ratio = material.fluidity_time / above * rate if above > 0.0 else math.inf
     return Decision(False, f"{always}; its relaxation time is {ratio:.2g} of the time of deformation", ratio)
 
 
@@ -233,17 +228,6 @@ def _nonlocality(scene: Scene, flow: Flow | None, tolerances: Tolerances) -> Dec
         f"{1e3 * flow.thickness:.2g} mm"
     )
     return _against("tolerance.reach", reach, tolerances.reach, words)
-
-
-def _symmetry(scene: Scene) -> Decision:
-    reason = asymmetry(scene)
-    if reason is None:
-        return Decision(True, "bed, body and motion are their own mirror image about mid-width")
-    return Decision(False, reason)
-
-
-def _torque(scene: Scene) -> Decision:
-    return Decision(True, "the body turns soil") if scene.body else Decision(False, "there is no body")
 
 
 def _free_body(scene: Scene) -> Decision:
@@ -282,10 +266,6 @@ def _checked(asked: Mapping[str, bool | str]) -> dict[str, bool | str]:
 def _against(name: str, number: float, tolerance: float, words: str) -> Decision:
     on = number >= tolerance
     return Decision(on, f"{words}, {'not below' if on else 'below'} {name} {_percent(tolerance)}", number)
-
-
-def _moves(flow: Flow) -> str:
-    return f"{flow.cause} moves soil at {flow.speed:.2g} m/s over {1e3 * flow.thickness:.2g} mm"
 
 
 def _percent(share: float) -> str:

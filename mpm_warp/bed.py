@@ -13,10 +13,8 @@ import numpy as np
 from .settings import Settings, lengths, setting, settings
 from .state import SceneError
 
-# --- What soil may do at the floor and the walls of its bin ---------------------------------------------
 
-
-def _wall(where: str, kinds: str) -> Any:
+def _wall(where: str, kinds: str = "no_slip, slip, periodic") -> Any:
     return setting("no_slip", where, ge=0, words=f"; allowed: {kinds} or a friction coefficient of 0 or more")
 
 
@@ -32,23 +30,21 @@ class Walls(Settings):
 
     group: ClassVar[str] = "bed.walls"
 
-    x: Literal["no_slip", "slip", "periodic"] | float = _wall(
-        "walls at x = 0, x = Lx", "no_slip, slip, periodic"
-    )
-    y: Literal["no_slip", "slip", "periodic"] | float = _wall(
-        "walls at y = 0, y = Ly", "no_slip, slip, periodic"
-    )
+    x: Literal["no_slip", "slip", "periodic"] | float = _wall("walls at x = 0, x = Lx")
+    y: Literal["no_slip", "slip", "periodic"] | float = _wall("walls at y = 0, y = Ly")
     floor: Literal["no_slip", "slip"] | float = _wall("the floor at z = -Lz", "no_slip, slip")
 
     @property
     def conditions(self) -> tuple[str, str, str]:
         """`no_slip`, `slip`, `friction` or `periodic` for x, y and the floor: what the kernels are compiled for."""
-        return tuple(v if isinstance(v, str) else "friction" for v in (self.x, self.y, self.floor))
+        x, y, floor = (v if isinstance(v, str) else "friction" for v in (self.x, self.y, self.floor))
+        return x, y, floor
 
     @property
     def friction(self) -> tuple[float, float, float]:
         """Coulomb coefficients for x, y and the floor, 0 where there is no friction [-]."""
-        return tuple(0.0 if isinstance(v, str) else v for v in (self.x, self.y, self.floor))
+        x, y, floor = (0.0 if isinstance(v, str) else v for v in (self.x, self.y, self.floor))
+        return x, y, floor
 
 
 # --- Where the particles of an undisturbed bed are ------------------------------------------------------
@@ -94,9 +90,9 @@ def arrange(
 
 def particle_volume(kind: str, size: tuple[float, float, float], spacing: float) -> float:
     """The volume that `arrange` gives with the particles [m^3], without making these."""
-    return (
-        spacing**3 if kind == "poisson" else float(np.prod(np.asarray(size) / _lattice_counts(size, spacing)))
-    )
+    if kind == "poisson":
+        return spacing**3
+    return float(np.prod(np.asarray(size) / _lattice_counts(size, spacing)))
 
 
 def _lattice_counts(size: tuple[float, float, float], spacing: float) -> np.ndarray:
@@ -134,14 +130,12 @@ def _random_points(size: tuple[float, float, float], radius: float, seed: int, m
         points = np.concatenate([points, off_plane * [1.0, -1.0, 1.0] + [0.0, ly, 0.0]])
         points = points[_reading_order(points, radius)]
     else:
-        points = poisson_disk(tuple(s + 2.0 * margin for s in size), radius, seed)
+        points = poisson_disk((lx + 2.0 * margin, ly + 2.0 * margin, lz + 2.0 * margin), radius, seed)
         points += [-margin, -margin, margin]
     return points[((points >= [0.0, 0.0, -lz]) & (points <= [lx, ly, 0.0])).all(axis=1)]
 
 
-def poisson_disk(
-    size: tuple[float, float, float], radius: float, seed: int, candidates: int = 30, snap: float = 0.0
-) -> np.ndarray:
+def poisson_disk(size: tuple[float, float, float], radius: float, seed: int, snap: float = 0.0) -> np.ndarray:
     """Random points no closer to each other than `radius` (Bridson 2007), shape (n, 3) [m].
 
     What would come closer than `snap` [m] to the side y = 0 is put on it.
@@ -168,9 +162,9 @@ def poisson_disk(
     count, active = 1, [0]
     while active:
         slot = int(rng.integers(len(active)))
-        direction = rng.normal(size=(candidates, 3))
+        direction = rng.normal(size=(30, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        distance = radius * (1.0 + 7.0 * rng.random((candidates, 1))) ** (1.0 / 3.0)
+        distance = radius * (1.0 + 7.0 * rng.random((30, 1))) ** (1.0 / 3.0)
         trial = points[active[slot]] + direction * distance
         trial[(trial[:, 1] >= 0.0) & (trial[:, 1] < snap), 1] = 0.0
         trial = trial[np.all((trial >= 0.0) & (trial < extent), axis=1)]
@@ -284,23 +278,28 @@ class Bed(Settings):
         return self._arranged
 
     @property
+    def _arranged(self) -> tuple[np.ndarray, float]:
+        return arrange(self.arrangement, self.size, self.particle_spacing, self.seed, self.mirrored)
+
+    @property
     def filling(self) -> float:
         """Share of the bin below the surface that its particles fill [-]: 1, but for random points that keep apart."""
         positions, volume = self._arranged
         return len(positions) * volume / float(np.prod(self.size))
 
     @property
-    def _arranged(self) -> tuple[np.ndarray, float]:
-        return arrange(self.arrangement, self.size, self.particle_spacing, self.seed, self.mirrored)
-
-    @property
     def arrangement_hash(self) -> str:
         """Same for every run whose recorded particles start at the same places in the same order."""
-        key = [self.size, self.spacing, self.particles_per_cell, self.arrangement]
+        key: list[Any] = [self.size, self.spacing, self.particles_per_cell, self.arrangement]
         if self.arrangement != "lattice":
             key.append(self.seed)
             if self.mirrored:
                 key.append("mirrored")
         if self.store_every != 1:
             key.append(f"one of {self.store_every}")
-        return hashlib.blake2b(json.dumps(key).encode(), digest_size=8).hexdigest()
+        return digest(key)
+
+
+def digest(key: list[Any]) -> str:
+    """A short name of plain data, the same for the same data."""
+    return hashlib.blake2b(json.dumps(key).encode(), digest_size=8).hexdigest()

@@ -109,8 +109,7 @@ def asymmetry(scene: Scene) -> str | None:
         return "the bed is periodic in y (bed.walls.y)"
     if scene.body is not None:
         # A path may turn off the plane between two frames.
-        path = getattr(scene, "path", None)
-        times = np.concatenate([scene.times(), [row[0] for row in path or ()]])
+        times = np.concatenate([scene.times(), scene.path_times()])
         poses = scene.poses_at(times)
         off = np.abs(poses[:, 1] - 0.5 * scene.bed.size[1]) > _SAME * scene.bed.spacing
         if off.any():

@@ -56,8 +56,8 @@ class Effects(Settings):
 
     def described(self) -> dict[str, dict[str, bool | str]]:
         """Each effect with its state and the reason, as stored in a run file."""
-        known = {f.name: (getattr(self, f.name), f.metadata["setting"]) for f in fields(self)}
-        return {
-            name: {"on": on, "reason": effect.help if on else effect.note}
-            for name, (on, effect) in known.items()
-        }
+        found: dict[str, dict[str, bool | str]] = {}
+        for one in fields(self):
+            on, known = getattr(self, one.name), one.metadata["setting"]
+            found[one.name] = {"on": on, "reason": known.help if on else known.note}
+        return found

@@ -15,10 +15,11 @@ def open_file(path: Path, most: int = MOST_BYTES) -> BinaryIO:
     """A file, open for reading.
 
     Raises:
-        OSError: It cannot be read.
-        ValueError: It is larger than `most` bytes, or a pipe or device, which may never end.
+        OSError: it cannot be read.
+        ValueError: it is larger than `most` bytes, or a pipe or device, which may never end.
     """
-    file = open(path, "rb", opener=_opened)
+    # Without this flag opening a pipe waits for somebody to write to it.
+    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0)))
     status = os.fstat(file.fileno())
     if stat.S_ISREG(status.st_mode) and status.st_size <= most:
         return file
@@ -40,8 +41,3 @@ def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
 def read_text(path: Path, most: int = MOST_BYTES) -> str:
     """Content of a text file in UTF-8, with or without a byte order mark; errors as `read_bytes`."""
     return read_bytes(path, most).decode("utf-8-sig")
-
-
-def _opened(path: str, flags: int) -> int:
-    # Without this flag opening a pipe waits for somebody to write to it.
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
 from .settings import Settings, setting, settings
 from .state import SceneError
 
-# --- From an angle of internal friction to the cone's static friction mu_s ------------------------------
-
-FRICTION_MAPS = {
-    "tan": lambda phi: math.tan(phi),
-    "sin": lambda phi: math.sin(phi),
+FRICTION_MAPS: dict[str, Callable[[float], float]] = {
+    "tan": math.tan,
+    "sin": math.sin,
     "triaxial": lambda phi: 2.0 * math.sqrt(3.0) * math.sin(phi) / (3.0 - math.sin(phi)),
 }
 """mu_s of an angle [rad] such that the cone and the Mohr-Coulomb criterion agree in one kind of loading: `tan` in
@@ -23,8 +22,6 @@ def static_friction(angle: float, friction_map: str = "tan") -> float:
     """mu_s [-] of soil with friction angle `angle` [degrees], between 0 and 90."""
     return FRICTION_MAPS[friction_map](math.radians(angle))
 
-
-# --- Soil parameters ------------------------------------------------------------------------------------
 
 FRICTION_RANGE = 0.2016
 """mu_2 - mu_s of the paper's sand: what the limit friction is set above a static friction that reaches it."""
@@ -43,6 +40,7 @@ class Material(Settings):
     """
 
     group: ClassVar[str] = "material"
+    _notes: ClassVar[tuple[str, ...]] = ()  # of a soil with a friction angle
 
     youngs_modulus: float = setting(1.0e6, "E; the cost grows with its square root", "Pa", ge=1e-9, le=1e12)
     poissons_ratio: float = setting(
@@ -77,19 +75,18 @@ class Material(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "_notes", tuple(self._apply_friction_angle()))
+        if self.friction_angle is not None:
+            self._apply_friction_angle(self.friction_angle)
         if not self.limit_friction > self.static_friction:
             raise SceneError(
                 f"material.limit_friction is {self.limit_friction}; it must be above material.static_friction "
                 f"({self.static_friction})"
             )
 
-    def _apply_friction_angle(self) -> list[str]:
-        """Set mu_s, and mu_2 where it must follow, from the angle if there is one; what to tell the user."""
-        if self.friction_angle is None:
-            return []
-        found = static_friction(self.friction_angle, self.friction_map)
-        source = f"material.friction_angle {self.friction_angle:g} degrees ({self.friction_map})"
+    def _apply_friction_angle(self, angle: float) -> None:
+        """Set mu_s, and mu_2 where it must follow, and keep what to tell the user."""
+        found = static_friction(angle, self.friction_map)
+        source = f"material.friction_angle {angle:g} degrees ({self.friction_map})"
         notes = []
         if self.static_friction not in (type(self).static_friction, found):
             notes.append(
@@ -104,7 +101,7 @@ class Material(Settings):
                 f"{self.limit_friction:g}; the limit is raised to {raised:.4f}"
             )
             object.__setattr__(self, "limit_friction", raised)
-        return notes
+        object.__setattr__(self, "_notes", tuple(notes))
 
     def warnings(self) -> list[str]:
         """What a user should know about this soil before it is used."""
@@ -148,12 +145,13 @@ class Material(Settings):
     def inertial_number(self, friction: float) -> float:
         """I of the steady flow with a ratio `friction` of shear stress to pressure [-]: 0 up to mu_s, infinite where
         the rate law has no such flow."""
-        above, most = friction - self.static_friction, self.limit_friction - self.static_friction
+        above = friction - self.static_friction
         if above <= 0.0:
             return 0.0
         if self.rate_law == "linear":
-            return self.reference_inertial_number * above / most
-        return self.reference_inertial_number * above / (most - above) if above < most else math.inf
+            return self.reference_inertial_number * above / (self.limit_friction - self.static_friction)
+        below = self.limit_friction - friction
+        return self.reference_inertial_number * above / below if below > 0.0 else math.inf
 
     def cooperativity_length(self, friction: float) -> float:
         """xi [m]: how far flow reaches at a ratio `friction` of shear stress to pressure."""

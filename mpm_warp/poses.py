@@ -78,6 +78,9 @@ def sampled_poses(samples: np.ndarray, time: np.ndarray) -> np.ndarray:
 
     Positions are interpolated linearly, rotations along the shortest way; the body rests before the first
     and after the last sample.
+
+    Raises:
+        SceneError: the samples are no such rows.
     """
     samples = np.asarray(samples, dtype=float)
     if samples.ndim != 2 or samples.shape[1] != 8 or len(samples) < 1:
@@ -89,22 +92,19 @@ def sampled_poses(samples: np.ndarray, time: np.ndarray) -> np.ndarray:
         raise SceneError(
             f"the path holds a value that is not finite in row {bad[0][0] + 1}, column {bad[0][1] + 1}"
         )
-    if np.any(np.diff(samples[:, 0]) <= 0.0):
-        row = int(np.argmax(np.diff(samples[:, 0]) <= 0.0)) + 2
+    t, quaternion = samples[:, 0], samples[:, 4:]
+    late = np.diff(t) <= 0.0
+    if late.any():
+        row = int(np.argmax(late)) + 2
         raise SceneError(f"the path's times must increase; row {row} does not come after the row before it")
-    norm = np.linalg.norm(samples[:, 4:], axis=1)
-    if np.any(np.abs(norm - 1.0) > 1e-3):
-        raise SceneError(
-            f"the path's quaternion in row {int(np.argmax(np.abs(norm - 1.0) > 1e-3)) + 1} is not of length 1"
-        )
-    t = samples[:, 0]
+    odd = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) > 1e-3
+    if odd.any():
+        raise SceneError(f"the path's quaternion in row {int(np.argmax(odd)) + 1} is not of length 1")
     time = np.clip(time, t[0], t[-1])
     position = np.stack([np.interp(time, t, samples[:, 1 + axis]) for axis in range(3)], axis=-1)
-    right = np.clip(np.searchsorted(t, time, side="right"), 1, max(1, len(t) - 1))
-    left = right - 1
-    right = np.minimum(right, len(t) - 1)
-    span = np.where(t[right] > t[left], t[right] - t[left], 1.0)
-    first, last = (Rotation.from_quat(samples[index, 4:]) for index in (left, right))
-    part = ((time - t[left]) / span)[:, None]
-    turned = Rotation.from_rotvec(part * (last * first.inv()).as_rotvec()) * first
+    left = np.clip(np.searchsorted(t, time, side="right") - 1, 0, max(0, len(t) - 2))
+    right = np.minimum(left + 1, len(t) - 1)
+    part = (time - t[left]) / np.where(right > left, t[right] - t[left], 1.0)
+    first, last = Rotation.from_quat(quaternion[left]), Rotation.from_quat(quaternion[right])
+    turned = Rotation.from_rotvec(part[:, None] * (last * first.inv()).as_rotvec()) * first
     return np.concatenate([position, turned.as_quat()], axis=-1)

@@ -13,7 +13,7 @@ import numpy as np
 from .bed import Bed
 from .bodies import Axle, MeshBody, Tool
 from .material import Material
-from .poses import rotate, rotation_vectors
+from .poses import rotate, rotation_vectors, sampled_poses
 from .settings import Settings, build, setting, settings
 from .state import SceneError
 
@@ -73,13 +73,21 @@ class Scene(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.duration * self.frame_rate >= 1.0:
+        frames = self.duration * self.frame_rate
+        if not frames >= 1.0:
             raise SceneError(f"scene.duration is {self.duration} s; it must last at least one frame")
-        if not self.duration * self.frame_rate <= MOST_FRAMES:
+        if not frames <= MOST_FRAMES:
             raise SceneError(
-                f"scene.duration is {self.duration} s at scene.frame_rate {self.frame_rate} Hz: "
-                f"{self.duration * self.frame_rate:.2g} frames; at most {MOST_FRAMES:g} are allowed: lower one of them"
+                f"scene.duration is {self.duration} s at scene.frame_rate {self.frame_rate} Hz: {frames:.2g} frames; "
+                f"at most {MOST_FRAMES:g} are allowed: lower one of them"
             )
+        if self._path is not None:
+            object.__setattr__(self, "path", tuple(tuple(float(v) for v in row) for row in self._path))
+
+    @property
+    def _path(self) -> tuple[tuple[float, ...], ...] | None:
+        """The setting `path` of the kinds of scenes that have it."""
+        return getattr(self, "path", None)
 
     # --- what a solver or a rollout asks of a scene -------------------------------------------------------
 
@@ -149,6 +157,8 @@ class Scene(Settings):
 
         Of a body with a free height the z of the start, which the solver replaces.
         """
+        if self._path is not None:
+            return sampled_poses(np.asarray(self._path), np.atleast_1d(np.asarray(time, dtype=float)))
         return np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(np.atleast_1d(time)), 1))
 
     def body_poses(self) -> np.ndarray:
@@ -157,7 +167,12 @@ class Scene(Settings):
 
     def path_times(self) -> np.ndarray:
         """Times at which a prescribed path may turn [s], increasing, shape (k,); none for a smooth motion."""
-        return np.zeros(0)
+        return np.array([row[0] for row in self._path or ()])
+
+    def _with_turns(self, time: np.ndarray) -> np.ndarray:
+        """Increasing times [s] with those between the first and the last at which a path may turn."""
+        rows = self.path_times()
+        return np.union1d(time, rows[(rows > time[0]) & (rows < time[-1])])
 
     def displacement(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What the body's centre travels [m] and by what angle the body turns [rad] from each of the increasing times
@@ -166,8 +181,7 @@ class Scene(Settings):
         A path counts row by row, whatever it comes back to; between rows, and without any, a body turns the shortest
         way.
         """
-        rows = self.path_times()
-        every = np.union1d(time, rows[(rows > time[0]) & (rows < time[-1])])
+        every = self._with_turns(time)
         poses = self.poses_at(every)
         way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
         angle = np.linalg.norm(rotation_vectors(poses[:-1, 3:], poses[1:, 3:]), axis=1)
@@ -178,11 +192,11 @@ class Scene(Settings):
         """The most that any point of the body travels from each of the increasing times (T,) [s] to the next [m],
         shape (T - 1,)."""
         way, angle = self.displacement(time)
-        return way + self.body.reach * angle
+        return way + angle * (self.body.reach if self.body is not None else 0.0)
 
     def body_points(self) -> np.ndarray:
         """Body nodes in the body frame [m], shape (M, 3)."""
-        return np.zeros((0, 3))
+        return self.body.points() if self.body is not None else np.zeros((0, 3))
 
     def initial_positions(self) -> np.ndarray:
         """Soil at time 0 [m], shape (n, 3), float64."""
@@ -198,13 +212,8 @@ class Scene(Settings):
         return self.material.warnings() + (self.body.warnings() if self.body is not None else [])
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
-        """What came out, in a few words; empty without a body.
-
-        Args:
-            force: by the soil on the body at the frames [N], shape (T, 3).
-            torque: about its centre of mass [N m], shape (T, 3).
-            poses: of the body, shape (T, 7).
-        """
+        """What came out, in a few words, of the soil's force on the body [N] and its torque about the centre of mass
+        [N m], shape (T, 3), and the body's poses (T, 7); empty without a body."""
         return ""
 
     def to_dict(self) -> dict[str, Any]:
@@ -217,57 +226,50 @@ class Scene(Settings):
 
         Args:
             data: as from `to_dict`, or less. A `tool.file` without `tool.digest` is read: it is a person's wish. One
-                with a digest has been read before, and `data` may come from any file, which must not make another
-                be read.
+                with a digest was read before, and is not read again: `data` may come from any file.
             mesh: of such a tool, see `mesh`.
         """
         kind = data.get("kind", "bed")
         if not isinstance(kind, str) or kind not in Scene.classes:
             raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(Scene.classes)}")
         tool = data.get("tool")
-        if mesh is None and isinstance(tool, dict) and tool.get("shape") == "mesh" and tool.get("digest"):
-            raise SceneError(
-                "scene.tool is a mesh that was read before and does not come with these data; give it, as in "
-                "Scene.from_dict(scene.to_dict(), scene.mesh), or leave out tool.digest to read tool.file again"
-            )
-        if mesh is not None and isinstance(tool, dict) and tool.get("shape") == "mesh":
-            made = build(MeshBody, tool, "scene.tool", partial(MeshBody.of_mesh, *mesh))
-            data = data | {"tool": made}
+        if isinstance(tool, dict) and tool.get("shape") == "mesh":
+            if mesh is not None:
+                data = data | {"tool": build(MeshBody, tool, "scene.tool", partial(MeshBody.of_mesh, *mesh))}
+            elif tool.get("digest"):
+                raise SceneError(
+                    "scene.tool is a mesh that was read before and does not come with these data; give it, as in "
+                    "Scene.from_dict(scene.to_dict(), scene.mesh), or leave out tool.digest to read tool.file again"
+                )
         return build(Scene.classes[kind], data, "scene")
 
     # --- checks for scenes with a body --------------------------------------------------------------------
 
-    def _check_thickness(self, what: str) -> None:
+    def _check_thickness(self, body: Tool, what: str) -> None:
         """A body must be thick enough for soil to be inside before it is pushed out."""
-        core = self.body.half_thickness + self.contact_distance
-        if core < 0.1 * self.bed.spacing:
+        if body.half_thickness + self.contact_distance < 0.1 * self.bed.spacing:
             raise SceneError(
-                f"{what} of {2.0 * self.body.half_thickness:g} m is too thin for a grid of {self.bed.spacing:g} m: "
+                f"{what} of {2.0 * body.half_thickness:g} m is too thin for a grid of {self.bed.spacing:g} m: "
                 "soil would pass through; use a smaller bed.spacing (at most half the thickness is good)"
             )
 
-    def _check_inside(self, what: str, remedy: str) -> None:
+    def _check_inside(self, body: Tool, what: str, remedy: str) -> None:
         """The part of the body that is below the surface must stay within the bin."""
         lx, ly, lz = self.bed.size
         # Nothing is in the way of a body at the sides of a channel, whose walls stand for more of the same soil.
         side = math.inf if self.bed.walls.conditions[1] in ("slip", "periodic") else 0.0
-        outline = self.body.outline()
-        rows, times = self.path_times(), self.times()
-        times = np.union1d(times, rows[(rows > 0.0) & (rows < times[-1])])
+        limits = (("x", 0.0, lx), ("y", -side, ly + side), ("z", -lz, math.inf))
+        outline, times = body.outline(), self._with_turns(self.times())
         for time, pose in zip(times, self.poses_at(times), strict=True):
             points = rotate(pose[3:], outline) + pose[:3]
             below = points[:, 2] < 0.0
-            for axis, low, high, name in (
-                (0, 0.0, lx, "x"),
-                (1, -side, ly + side, "y"),
-                (2, -lz, math.inf, "z"),
-            ):
-                outside = below & ((points[:, axis] < low) | (points[:, axis] > high))
+            for (name, low, high), place in zip(limits, points.T, strict=True):
+                outside = below & ((place < low) | (place > high))
                 if outside.any():
-                    limits = f"{low:g} to {high:g} m" if math.isfinite(high) else f"at least {low:g} m"
+                    allowed = f"{low:g} to {high:g} m" if math.isfinite(high) else f"at least {low:g} m"
                     raise SceneError(
-                        f"{what} leaves the bin at {time:.3f} s: {name} = {points[outside, axis][0]:.4f} m, "
-                        f"allowed {limits} below the surface; {remedy}"
+                        f"{what} leaves the bin at {time:.3f} s: {name} = {place[outside][0]:.4f} m, "
+                        f"allowed {allowed} below the surface; {remedy}"
                     )
 
 

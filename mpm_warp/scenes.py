@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import field, replace
+from dataclasses import field, fields, replace
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 
-from .bed import Bed, Walls
+from .bed import Bed, Walls, digest
 from .bodies import Axle, Box, Cylinder, MeshBody, Plate, Tool
 from .material import Material
-from .poses import about_y, rotate, sampled_poses
+from .poses import about_y, rotate
 from .scene import Scene
 from .settings import same, setting, settings
 from .state import SceneError
-
-# --- Prescribed paths of a blade's tip and of a body given by samples -----------------------------------
 
 CUT_LENGTH = 0.4
 """Horizontal travel of the published cuts [m]."""
@@ -59,8 +55,6 @@ def ramp(time: np.ndarray, depth: float, speed: float) -> np.ndarray:
     return np.stack([RAMP_SPEED * (first + third) + speed * second, RAMP_SPEED * (third - first)], axis=-1)
 
 
-# --- A plate cuts through a bed -------------------------------------------------------------------------
-
 _PATH = "rows t [s], x, y, z [m], qx, qy, qz, qw of the body's centre of mass"
 _SHARE = ", a share of the bin's length"
 
@@ -95,35 +89,31 @@ class Excavation(Scene):
                 raise SceneError(
                     "scene.motion=path needs scene.path, a CSV file with columns t,x,y,z,qx,qy,qz,qw"
                 )
-            object.__setattr__(self, "path", tuple(tuple(float(v) for v in row) for row in self.path))
         elif self.path is not None:
             raise SceneError(
                 f"scene.path is given but scene.motion is {self.motion!r}; use scene.motion=path"
             )
-        self._check_thickness("blade.thickness")
-        self._check_inside("the plate", "change scene.depth, speed, start, duration or the path")
+        self._check_thickness(self.blade, "blade.thickness")
+        self._check_inside(self.blade, "the plate", "change scene.depth, speed, start, duration or the path")
 
     @property
     def body(self) -> Plate:
         return self.blade
 
     def poses_at(self, time: np.ndarray) -> np.ndarray:
-        time = np.atleast_1d(np.asarray(time, dtype=float))
         if self.motion == "path":
-            return sampled_poses(np.asarray(self.path), time)
+            return super().poses_at(time)
+        time = np.atleast_1d(np.asarray(time, dtype=float))
         rotation = about_y(-math.radians(self.rake))
         lx, ly, _ = self.bed.size
-        start = np.array([self.start * lx, 0.5 * ly, self.clearance]) - rotate(rotation, self.blade.tip)
-        law = {"curved": curved, "ramp": ramp, "rest": lambda t, *_: np.zeros((len(t), 2))}[self.motion]
-        moved = law(time, self.depth, self.speed)
         poses = np.empty((len(time), 7))
-        poses[:, :3] = start
-        poses[:, [0, 2]] += moved
+        poses[:, :3] = np.array([self.start * lx, 0.5 * ly, self.clearance]) - rotate(
+            rotation, self.blade.tip
+        )
+        if self.motion != "rest":
+            poses[:, [0, 2]] += (curved if self.motion == "curved" else ramp)(time, self.depth, self.speed)
         poses[:, 3:] = rotation
         return poses
-
-    def path_times(self) -> np.ndarray:
-        return np.array([row[0] for row in self.path or ()])
 
     def body_points(self) -> np.ndarray:
         return self.blade.points(*self.body_grid)
@@ -141,9 +131,6 @@ class Excavation(Scene):
         return f"mean draft {-np.mean(force[1:, 0]):.1f} N, vertical force {np.mean(force[1:, 2]):.1f} N"
 
 
-# --- Any body along a path ------------------------------------------------------------------------------
-
-
 @settings
 class Body(Scene):
     """A box, a cylinder or a mesh moves through the bed along a path of its centre of mass."""
@@ -158,40 +145,26 @@ class Body(Scene):
         super().__post_init__()
         if self.path is None:
             raise SceneError("scene.path is missing: a CSV file with columns t,x,y,z,qx,qy,qz,qw")
-        object.__setattr__(self, "path", tuple(tuple(float(v) for v in row) for row in self.path))
-        self._check_thickness("a body")
-        self._check_inside("the body", "change scene.path or scene.duration")
+        self._check_thickness(self.tool, "a body")
+        self._check_inside(self.tool, "the body", "change scene.path or scene.duration")
 
     @property
     def body(self) -> Tool:
         return self.tool
-
-    def poses_at(self, time: np.ndarray) -> np.ndarray:
-        return sampled_poses(np.asarray(self.path), np.atleast_1d(np.asarray(time, dtype=float)))
-
-    def path_times(self) -> np.ndarray:
-        return np.array([row[0] for row in self.path])
-
-    def body_points(self) -> np.ndarray:
-        return self.tool.points()
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         x, y, z = force[1:].mean(axis=0)
         return f"mean force ({x:.1f}, {y:.1f}, {z:.1f}) N"
 
 
-# --- A wheel drives over a bed under a load -------------------------------------------------------------
-
 LEAST_MASS, MOST_MASS = 1.0e-9, 1.0e9
 """Of a body whose height is free [kg]."""
 
 
 def sinkage(scene: Mapping[str, Any], poses: np.ndarray) -> np.ndarray:
-    """Depth of a wheel's lowest point below the undisturbed surface [m], shape (T,) for poses (T, 7).
+    """Depth of a wheel's lowest point below the undisturbed surface [m], shape (T,) for its poses (T, 7).
 
-    Args:
-        scene: the wheel's as plain data, such as a run file's; published ones say nothing of grousers.
-        poses: of the wheel.
+    Its `scene` is plain data, such as a run file's; published ones say nothing of grousers.
     """
     return 0.5 * scene["diameter"] + scene.get("grouser_height", 0.0) - poses[:, 2]
 
@@ -231,7 +204,9 @@ class Wheel(Scene):
     friction_angle: float | None = setting(37.0, "of the soil; None: material.friction_angle", "degrees")
     settle: float = setting(1.0, "time at rest under the load before driving; recorded like the rest", "s")
     damping: float = setting(5.0, "force against the vertical velocity per mass of the wheel", "1/s", ge=0)
-    bilateral: bool = setting(False, "soil in contact may not leave the wheel along its normal")
+    bilateral: bool = setting(  # type: ignore[misc]  # a kind of scene makes it a setting
+        False, "soil in contact may not leave the wheel along its normal"
+    )
     start: float = setting(0.30, "where the axle starts" + _SHARE, ge=0, le=1, note=_SHARE)
     clearance: float = setting(0.0, "of the wheel's lowest point above the surface at the start", "m")
 
@@ -255,20 +230,13 @@ class Wheel(Scene):
         if self.friction_angle is not None:
             material = replace(self.material, friction_angle=self.friction_angle)
             object.__setattr__(self, "material", material)
-        self._check_thickness("a wheel's width")
+        self._check_thickness(self.body, "a wheel's width")
         self._check_fits()
 
     @cached_property
     def body(self) -> Cylinder:
         """The wheel; its axis is y and its centre of mass the middle of the axle."""
-        return Cylinder(
-            diameter=self.diameter,
-            width=self.width,
-            friction=self.friction,
-            grousers=self.grousers,
-            grouser_height=self.grouser_height,
-            grouser_thickness=self.grouser_thickness,
-        )
+        return Cylinder(**{f.name: getattr(self, f.name) for f in fields(Cylinder) if f.name != "shape"})
 
     @property
     def axle(self) -> Axle:
@@ -301,9 +269,6 @@ class Wheel(Scene):
     def sinkage(self, poses: np.ndarray) -> np.ndarray:
         """See `sinkage`."""
         return sinkage(vars(self), poses)
-
-    def body_points(self) -> np.ndarray:
-        return self.body.points()
 
     def warnings(self) -> list[str]:
         found = super().warnings()
@@ -339,9 +304,6 @@ class Wheel(Scene):
                 f"scene.clearance is {self.clearance} m; allowed: above the floor ({-self.bed.size[2]:g} m) and below "
                 f"bed.headroom ({self.bed.headroom:g} m)"
             )
-
-
-# --- A column of soil that is let go and collapses under its own weight ---------------------------------
 
 
 @settings
@@ -387,11 +349,15 @@ class Column(Scene):
 
     @property
     def arrangement_hash(self) -> str:
-        key = [self.bed.arrangement_hash, self.shape, self.radius]
-        return hashlib.blake2b(json.dumps(key).encode(), digest_size=8).hexdigest()
+        return digest([self.bed.arrangement_hash, self.shape, self.radius])
 
 
-# --- A layer of soil on an endless rough slope ----------------------------------------------------------
+def bagnold_speed(scene: Scene, inertial_number: float, height: np.ndarray) -> np.ndarray:
+    """Speed [m/s] of a tilted bed that flows steadily, at heights above its base [m] (Bagnold's profile)."""
+    soil, thickness = scene.material, scene.bed.size[2]
+    fall = scene.gravity * math.cos(math.radians(scene.tilt))
+    scale = 2.0 * inertial_number / (3.0 * soil.grain_diameter) * math.sqrt(soil.packing * fall)
+    return scale * (thickness**1.5 - np.clip(thickness - height, 0.0, thickness) ** 1.5)
 
 
 @settings
@@ -429,8 +395,8 @@ class Incline(Scene):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.flowing and not self._flows:
-            low, high = self._flowing_angles
+        low, high = self._flowing_angles
+        if self.flowing and not low < self.tilt < high:
             raise SceneError(
                 f"scene.tilt is {self.tilt} degrees; this soil flows steadily between {low:.2f} and {high:.2f} "
                 "degrees: choose such a tilt or start at rest with scene.flowing=false"
@@ -438,29 +404,21 @@ class Incline(Scene):
 
     @property
     def _flowing_angles(self) -> tuple[float, float]:
-        """Slopes at which the soil flows without stopping or accelerating for ever [degrees]."""
-        friction = (self.material.static_friction, self.material.limit_friction)
-        return tuple(math.degrees(math.atan(mu)) for mu in friction)
-
-    @property
-    def _flows(self) -> bool:
-        low, high = self._flowing_angles
-        return low < self.tilt < high
+        """Slopes between which the soil flows without stopping or accelerating for ever [degrees]."""
+        soil = self.material
+        return math.degrees(math.atan(soil.static_friction)), math.degrees(math.atan(soil.limit_friction))
 
     @property
     def inertial_number(self) -> float:
         """I of the steady flow, the same at every depth [-]."""
-        if not self._flows:
+        low, high = self._flowing_angles
+        if not low < self.tilt < high:
             return 0.0
-        soil, slope = self.material, math.tan(math.radians(self.tilt))
-        return soil.reference_inertial_number * (slope - soil.static_friction) / (soil.limit_friction - slope)
+        return self.material.inertial_number(math.tan(math.radians(self.tilt)))
 
     def steady_velocity(self, height: np.ndarray) -> np.ndarray:
-        """Speed down the slope of the steady flow at heights above the base [m], in [m/s] (Bagnold's profile)."""
-        soil, thickness = self.material, self.bed.size[2]
-        fall = self.gravity * math.cos(math.radians(self.tilt))
-        scale = 2.0 * self.inertial_number / (3.0 * soil.grain_diameter) * math.sqrt(soil.packing * fall)
-        return scale * (thickness**1.5 - np.clip(thickness - height, 0.0, thickness) ** 1.5)
+        """Speed down the slope of the steady flow at heights above the base [m], in [m/s]."""
+        return bagnold_speed(self, self.inertial_number, height)
 
     def initial_velocities(self) -> np.ndarray:
         velocities = super().initial_velocities()

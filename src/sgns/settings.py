@@ -11,7 +11,7 @@ from mpm_warp.settings import Settings, setting, settings
 from sgns.config import UserError
 
 Device = Literal["cpu", "cuda"]
-_MOST_SEED = 2**63 - 1
+_MOST_SEED = 10**18
 
 
 class Group(Settings):

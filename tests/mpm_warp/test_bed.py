@@ -35,28 +35,18 @@ def box_on_floor(walls: Walls, tilt: float = 0.0, duration: float = 0.1) -> Scen
     return Scene(bed=bed, tilt=tilt, duration=duration, frame_rate=100.0)
 
 
-def mean_speeds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Times and mean velocity of the soil at the frames."""
+@pytest.mark.parametrize(("floor", "friction"), [("slip", 0.0), (0.1, 0.1), (0.3, 0.3)])
+def test_soil_slides_down_a_slope(floor, friction):
+    """a = g (sin(tilt) - friction cos(tilt)) once it slides, and it stays on the floor."""
+    scene = box_on_floor(Walls(floor=floor), tilt=30.0, duration=0.2 if friction else 0.1)
     frames = list(Solver(scene, ELASTIC, precision="float64").frames())
-    return scene.times(), np.array([f.velocity.mean(axis=0) for f in frames])
-
-
-def test_soil_slides_down_a_slope_without_friction():
-    """a = g sin(tilt), and it stays on the floor."""
-    time, speed = mean_speeds(box_on_floor(Walls(floor="slip"), tilt=20.0))
-    np.testing.assert_allclose(speed[:, 0], 9.81 * math.sin(math.radians(20.0)) * time, rtol=1e-5, atol=1e-9)
-    assert np.abs(speed[:, 1]).max() < 1e-9
-    assert abs(speed[-5:, 2].mean()) < 0.01
-
-
-@pytest.mark.parametrize("friction", [0.1, 0.3])
-def test_soil_slides_against_friction(friction):
-    """a = g (sin(tilt) - friction cos(tilt)) once it slides."""
-    time, speed = mean_speeds(box_on_floor(Walls(floor=friction), tilt=30.0, duration=0.2))
+    time, speed = scene.times(), np.array([f.velocity.mean(axis=0) for f in frames])
     tilt = math.radians(30.0)
     expected = 9.81 * (math.sin(tilt) - friction * math.cos(tilt))
     slope = np.polyfit(time[5:], speed[5:, 0], 1)[0]
-    assert slope == pytest.approx(expected, rel=0.03)
+    assert slope == pytest.approx(expected, rel=0.03 if friction else 1e-5)
+    assert np.abs(speed[:, 1]).max() < 1e-9
+    assert abs(speed[-5:, 2].mean()) < 0.01
 
 
 @pytest.mark.parametrize("floor", ["no_slip", 0.5])
@@ -109,35 +99,9 @@ def test_momentum_along_periodic_axes_is_conserved():
     solver = Solver(Scene(bed=bed, duration=0.05, frame_rate=200.0), precision="float64")
     kick = np.random.default_rng(0).normal(size=(solver.particle_count, 3)) * 0.1
     solver.particles.velocity.assign(kick)
-    for _ in solver.frames():
-        pass
+    list(solver.frames())
     after = solver.particles.velocity.numpy().sum(axis=0)
     np.testing.assert_allclose(after[:2], kick.sum(axis=0)[:2], atol=1e-12 * np.abs(kick).sum())
-
-
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ({"x": "sticky"}, "bed.walls.x is 'sticky'; allowed: no_slip, slip, periodic or a friction"),
-        ({"floor": "periodic"}, "bed.walls.floor is 'periodic'; allowed: no_slip, slip or a friction"),
-        ({"y": -0.1}, "bed.walls.y is -0.1; allowed"),
-        ({"y": True}, "bed.walls.y is True; allowed"),
-    ],
-)
-def test_what_walls_refuse(values, words):
-    with pytest.raises(SceneError, match=words):
-        Walls(**values)
-
-
-def test_a_period_is_a_whole_number_of_cells():
-    with pytest.raises(SceneError, match=r"bed.walls.x is periodic but .* 7.500 grid spacings"):
-        Bed(size=(0.15, 0.2, 0.1), spacing=0.02, walls=Walls(x="periodic"))
-
-
-def test_walls_survive_plain_data():
-    scene = cut(bed=Bed(size=(0.48, 0.4, 0.16), spacing=0.02, walls=Walls("slip", 0.3, 0.5)))
-    assert Scene.from_dict(scene.to_dict()) == scene
-    assert scene.bed.walls.conditions == ("slip", "friction", "friction")
 
 
 def test_no_two_kinds_of_walls_share_a_kernel():
@@ -182,18 +146,13 @@ SIZE = (0.2, 0.15, 0.07)
 
 @pytest.mark.parametrize("kind", ["lattice", "jittered", "poisson"])
 def test_particles_are_in_the_bin_and_reproducible(kind):
-    points, volume = arrange(kind, SIZE, 0.01, seed=3)
+    points, volume = arrange(kind, SIZE, 0.014, seed=3)
     assert np.all(points >= [0, 0, -SIZE[2]])
     assert np.all(points <= [SIZE[0], SIZE[1], 0])
-    assert volume > 0
+    if kind != "poisson":
+        assert len(points) * volume == pytest.approx(np.prod(SIZE), rel=1e-12)  # the bed is full
     arrange.cache_clear()
-    np.testing.assert_array_equal(points, arrange(kind, SIZE, 0.01, seed=3)[0])
-
-
-@pytest.mark.parametrize("kind", ["lattice", "jittered"])
-def test_a_full_bed_has_the_bins_volume(kind):
-    points, volume = arrange(kind, SIZE, 0.013, seed=0)
-    assert len(points) * volume == pytest.approx(np.prod(SIZE), rel=1e-12)
+    np.testing.assert_array_equal(points, arrange(kind, SIZE, 0.014, seed=3)[0])
 
 
 def test_the_papers_bed_has_29700_particles():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpm_warp import Box, Cylinder, MeshBody, Plate, SceneError
+from mpm_warp import Box, Cylinder, MeshBody, SceneError
 from sgns_testing.meshes import BOX_FACES, box_corners, box_triangles, write_obj, write_stl, write_text_stl
 
 SIZE = (0.1, 0.2, 0.3)
@@ -28,7 +28,7 @@ def test_a_mesh_is_about_its_centre_of_mass(tmp_path, form):
 
 def test_an_uneven_mesh_has_its_volumes_centre():
     """A pyramid's centre of mass lies a quarter of its height above its base."""
-    from mpm_warp.mesh import closed_mesh
+    from mpm_warp.bodies import closed_mesh
 
     vertices = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 2]]) + 7.0
     faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
@@ -98,27 +98,6 @@ def test_nodes_lie_on_the_bodies(tmp_path):
     assert Box().points().shape == (8, 3)
     file = write_obj(tmp_path / "box.obj", CORNERS, BOX_FACES)
     assert np.unique(MeshBody(file=str(file)).points().round(9), axis=0).shape == (8, 3)
-
-
-@pytest.mark.parametrize(
-    ("cls", "values", "words"),
-    [
-        (Box, {"size": (0.1, 0.1)}, "three lengths"),
-        (Box, {"friction": -1.0}, "tool.friction"),
-        (Cylinder, {"diameter": 0.0}, "tool.diameter is 0.0; it must be above 0 m"),
-        (Cylinder, {"grousers": 3}, "tool.grouser_height"),
-        (Cylinder, {"grouser_height": 0.01}, "need tool.grousers above 0"),
-        (
-            Cylinder,
-            {"grousers": 30, "grouser_height": 0.01, "grouser_thickness": 0.02},
-            "make them thinner or fewer",
-        ),
-        (Plate, {"width": float("nan")}, "blade.width"),
-    ],
-)
-def test_what_bodies_refuse(cls, values, words):
-    with pytest.raises(SceneError, match=words):
-        cls(**values)
 
 
 def test_a_known_mesh_opens_no_file(tmp_path):

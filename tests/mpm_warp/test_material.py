@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpm_warp import Material, Scene, SceneError
-from mpm_warp.material import FRICTION_MAPS, static_friction
+from mpm_warp import Material
+from mpm_warp.material import static_friction
 from sgns_testing.scenes import cut
 
 
@@ -50,42 +50,9 @@ def test_limit_friction_is_raised_above_the_static_one(angle, name):
     assert cut(material=soil).warnings() == [warning]
 
 
-@pytest.mark.parametrize("angle", [30.0, 37.0, 43.0])
-def test_the_papers_wheel_soils_need_no_raise(angle):
-    assert Material(friction_angle=angle).limit_friction == 0.9616
-
-
 def test_a_friction_that_is_not_used_is_named():
     (warning,) = Material(friction_angle=40.0, static_friction=0.6).warnings()
     assert "material.static_friction 0.6 is not used" in warning
-
-
-def test_a_scene_with_an_angle_survives_plain_data():
-    scene = cut(material=Material(friction_angle=44.0, friction_map="triaxial"))
-    assert Scene.from_dict(scene.to_dict()) == scene
-
-
-def test_an_angle_in_plain_data_is_checked():
-    assert Scene.from_dict({"material": {"friction_angle": 30}}).material.friction_angle == 30.0
-    with pytest.raises(SceneError, match="friction_angle is 'steep'; it must be a finite number"):
-        Scene.from_dict({"material": {"friction_angle": "steep"}})
-
-
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ({"friction_map": "cos"}, "friction_map is 'cos'; allowed: sin, tan, triaxial"),
-        ({"friction_angle": 0.0}, "friction_angle is 0.0; allowed: above 0 and below 90 degrees"),
-        ({"friction_angle": 90.0}, "friction_angle is 90.0; allowed"),
-        ({"rate_law": "cubic"}, "rate_law is 'cubic'; allowed: saturating, linear"),
-        ({"nonlocal_amplitude": -0.1}, "nonlocal_amplitude is -0.1; it must be 0 or more"),
-        ({"fluidity_time": 0.0}, "fluidity_time is 0.0; it must be a number above 0"),
-        ({"fluidity_at_walls": "some"}, "fluidity_at_walls is 'some'; allowed: zero, free"),
-    ],
-)
-def test_what_a_material_refuses(values, words):
-    with pytest.raises(SceneError, match=words):
-        Material(**values)
 
 
 def test_cooperativity_length():
@@ -100,8 +67,3 @@ def test_cooperativity_length():
             found = 0.5 * math.pi * replace(beads, rate_law=law).cooperativity_length(mu)
             assert found == pytest.approx(expected, rel=2e-3)
     assert beads.cooperativity_length(0.3819) == math.inf
-
-
-def test_every_map_grows_with_the_angle():
-    for name in FRICTION_MAPS:
-        assert np.all(np.diff([static_friction(a, name) for a in range(1, 90)]) > 0.0)

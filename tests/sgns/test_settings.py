@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Iterator
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
+import mpm_warp
 import sgns.settings as typed
+from mpm_warp.settings import described
 from sgns.cli import COMMANDS
 from sgns.config import UserError
 from sgns.settings import (
@@ -141,3 +147,60 @@ def test_a_value_that_is_not_allowed(cls: type[Group], values: dict[str, Any], l
 def test_an_unknown_kind_of_model() -> None:
     with pytest.raises(UserError, match=r"model\.kind is \[\]; allowed: network, polynomial"):
         typed.model_settings({"kind": []})
+
+
+SOIL = [
+    "Scene",
+    "Excavation",
+    "Wheel",
+    "Body",
+    "Column",
+    "Incline",
+    "Bed",
+    "Walls",
+    "Plate",
+    "Box",
+    "Cylinder",
+]
+CLASSES = [
+    *(getattr(mpm_warp, name) for name in (*SOIL, "MeshBody", "Material", "Effects", "Tolerances")),
+    *(
+        typed.SolverSettings,
+        typed.LossWeights,
+        typed.Errors,
+        DatasetSettings,
+        PublishedSettings,
+        ReductionSettings,
+    ),
+    *(one for kind in typed.MODELS.values() for one in kind),
+    *typed.COMMANDS.values(),
+]
+
+
+def wrong_values() -> Iterator[tuple[type, str, object]]:
+    """Class, setting and what it may not be, by what its definition says is allowed."""
+    for cls in CLASSES:
+        for name, _, allowed, _ in described(cls):
+            default, wrong = getattr(cls, name, None), []
+            if isinstance(default, bool):
+                wrong = [1]
+            elif isinstance(default, float):
+                wrong = [math.nan]
+            elif isinstance(default, str) and allowed:
+                wrong = ["other"]
+            for part in allowed.split(", "):
+                wrong += map(float, re.findall(r"(?:above|below) (\S+)", part))
+                wrong += [np.nextafter(float(x), -np.inf) for x in re.findall(r"(\S+) (?:or more|to )", part)]
+                wrong += [np.nextafter(float(x), np.inf) for x in re.findall(r"(?:at most|to) (\S+)", part)]
+            if cls in (mpm_warp.MeshBody, DatasetSettings):
+                wrong = []
+            several = len(default) if isinstance(default, tuple) else 0
+            yield from ((cls, name, (value,) * several if several else value) for value in wrong)
+
+
+def test_what_is_allowed_is_as_its_definition_says() -> None:
+    wrong = list(wrong_values())
+    for cls, name, value in wrong:
+        with pytest.raises(cls.raises, match=rf"{name}(\[0\])? is "):
+            cls(**{name: value})
+    assert len(wrong) > 250

@@ -30,7 +30,7 @@ import torch
 import yaml
 
 from mpm_warp import SceneError
-from mpm_warp.mesh import read_mesh
+from mpm_warp.bodies import read_mesh
 from sgns.config import UserError, parse_yaml
 from sgns.data.check import check_run
 from sgns.data.dataset import Dataset

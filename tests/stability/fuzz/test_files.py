@@ -20,7 +20,7 @@ from kills import as_bytes
 from scipy.spatial.transform import Rotation, Slerp
 
 from mpm_warp import Scene
-from mpm_warp.mesh import closed_mesh, read_mesh
+from mpm_warp.bodies import closed_mesh, read_mesh
 from sgns.config import parse_yaml
 from sgns.data.check import check_run
 from sgns.data.dataset import Dataset
