@@ -34,8 +34,8 @@ from sgns.data.dataset import Dataset
 from sgns.data.run import Run
 from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
 from sgns.evaluate.metrics import VectorErrors, mean_prediction, skill
+from sgns.model.dynamics import Standardiser
 from sgns.model.features import BodyTrack
-from sgns.model.network import Standardiser
 from sgns.model.settings import ModelSettings
 from sgns.reduction.reduce import reduce_dataset
 from sgns.simulator import Simulator

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from sgns.model import algebra as affine
-from sgns.model.algebra import Adjacency, IndexedAdjacency, adjacency_of
-from sgns.model.network import EncodeProcessDecode
+from sgns.model import network as module
+from sgns.model.network import Adjacency, EncodeProcessDecode, IndexedAdjacency, adjacency_of
 
 __all__ = ["Form", "forms_of", "multiplications", "onednn"]
 
@@ -54,11 +53,11 @@ def rearranged(
 @contextmanager
 def onednn(allowed: bool):
     """oneDNN's products allowed or not."""
-    before, affine._AVAILABLE = affine._AVAILABLE, allowed and affine._AVAILABLE
+    before, module._AVAILABLE = module._AVAILABLE, allowed and module._AVAILABLE
     try:
         yield
     finally:
-        affine._AVAILABLE = before
+        module._AVAILABLE = before
 
 
 def multiplications(network: EncodeProcessDecode, nodes: int, edges: int) -> int:

@@ -25,8 +25,9 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from sgns.evaluate.costs import cpu_model
-from sgns.model.algebra import GraphStepper, product
+from sgns.model.fast_step import GraphStepper
 from sgns.model.features import BodyTrack
+from sgns.model.network import product
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
 

@@ -20,8 +20,9 @@ from mpm_warp.launch import start_warp
 from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
 from sgns.data.run import Run
+from sgns.model.dynamics import Standardiser
 from sgns.model.features import BodyTrack, body_track
-from sgns.model.network import EncodeProcessDecode, Standardiser
+from sgns.model.network import EncodeProcessDecode
 from sgns.model.settings import ModelSettings
 from sgns.train.windows import random_walk
 

@@ -14,9 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sgns.model.dynamics import Dynamics, Step
+from sgns.model.dynamics import Dynamics, Standardiser, Step
 from sgns.model.features import BodyTrack, free_axes
-from sgns.model.network import Standardiser
 from sgns.model.settings import PolynomialSettings
 
 
@@ -49,6 +48,8 @@ class PolynomialDynamics(Dynamics):
     """
 
     settings: PolynomialSettings
+    free: Tensor
+    prescribed: Tensor
     used: Tensor
     bounds: Tensor
     terms: Tensor

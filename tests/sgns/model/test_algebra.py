@@ -7,10 +7,10 @@ import time
 import pytest
 import torch
 
-from sgns.model import algebra as module
-from sgns.model.algebra import CompleteAdjacency, GraphStepper, IndexedAdjacency, adjacency_of, affine
+from sgns.model import network as module
+from sgns.model.fast_step import GraphStepper
 from sgns.model.features import edge_indices
-from sgns.model.network import EncodeProcessDecode
+from sgns.model.network import CompleteAdjacency, EncodeProcessDecode, IndexedAdjacency, adjacency_of, affine
 
 # --- Both matrix libraries give the same linear layer and the same gradients ----------------------------
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from sgns.model.dynamics import Standardiser
 from sgns.model.features import edge_indices
-from sgns.model.network import MLP, EncodeProcessDecode, InteractionNetwork, Standardiser
+from sgns.model.network import MLP, EncodeProcessDecode, InteractionNetwork
 
 # --- The network against a message-passing step written out by hand, its fast form against its definition,
 # symmetries.

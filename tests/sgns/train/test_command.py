@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sgns.config import UserError
-from sgns.model.network_dynamics import Path
+from sgns.model.dynamics import Path
 from sgns.simulator import Simulator
 from sgns.train import lightning_module as module
 from sgns.train.callbacks import ValidationRollouts
