@@ -26,7 +26,7 @@ from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step
 from sgns.model.features import BodyTrack, ToolMotion, body_track, context_of, markers, step_frames
-from sgns.model.training_range import Excess, TrainingRange
+from sgns.model.training_range import Excess
 from sgns.states import Rollout, Rollouts, State
 
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
@@ -48,8 +48,17 @@ class Simulator:
             all training runs (see `sgns.model.features`).
 
     Attributes:
+        basis: Modes of the soil.
         start_positions: Of all particles at rest [m], shape (n, 3).
         body_points: Those of the training runs, in the body frame [m], shape (M, 3).
+        mean_force: Of the training runs [N], shape (3,): the simplest prediction of a force.
+        frame_rate: Steps per second of simulated time [Hz].
+        history: d, positions the network looks back on.
+        num_modes: r, modes of the soil.
+        context_keys: Numbers of the scene that the network is told.
+        predicts_body: Whether the tool's height is predicted, as that of a wheel, not prescribed.
+        arrangement_hash: Of the particle arrangement it knows.
+        card: Where it comes from: settings, runs, versions.
 
     Raises:
         UserError: The device cannot be used, or the modes are more than there are.
@@ -76,14 +85,21 @@ class Simulator:
             raise UserError(
                 f"device={device} cannot be used: {str(error).splitlines()[0]}; use device=cpu"
             ) from error
-        self._dynamics, self.basis = surrogate.dynamics, surrogate.basis
+        dynamics, self.basis = surrogate.dynamics, surrogate.basis
         if num_modes is not None:
-            self._dynamics, self.basis = self._dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
-        self._rate_independent = rate_independent and not self._dynamics.predicts_body
+            dynamics, self.basis = dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
+        self._dynamics = dynamics
+        self.history, self.num_modes = dynamics.history, dynamics.num_modes
+        self.context_keys, self.predicts_body = dynamics.context_keys, dynamics.predicts_body
+        self.frame_rate, self.card = surrogate.frame_rate, surrogate.card
+        self.arrangement_hash = self.basis.arrangement_hash
+        self._rate_independent = rate_independent and not dynamics.predicts_body
         self._pace = surrogate.slowest_travel, math.ceil(_SETTLING * surrogate.frame_rate)
         # Copies: what a tensor shares with an array is freed when the tensor is sent to another process.
-        self.start_positions = surrogate.start_positions.cpu().numpy().copy()
-        self.body_points = surrogate.body_points.cpu().numpy().copy()
+        self.start_positions, self.body_points, self.mean_force = (
+            tensor.cpu().numpy().copy()
+            for tensor in (surrogate.start_positions, surrogate.body_points, dynamics.force.mean)
+        )
         self._start_latent = self.basis.transform(surrogate.start_positions.cpu())
         self.reset()
 
@@ -102,58 +118,14 @@ class Simulator:
         num_modes: int | None = None,
         rate_independent: bool = True,
     ) -> Simulator:
-        """From a checkpoint written by `sgns train`; arguments as of the class.
-
-        Raises:
-            UserError: The file is missing, truncated or not such a checkpoint.
-        """
+        """From a checkpoint written by `sgns train`, or UserError; the other arguments as of the class."""
         return cls(load_surrogate(path), device, num_modes, rate_independent)
-
-    @property
-    def frame_rate(self) -> float:
-        """Steps per second of simulated time [Hz]."""
-        return self._surrogate.frame_rate
-
-    @property
-    def history(self) -> int:
-        """d, positions the network looks back on."""
-        return self._dynamics.history
-
-    @property
-    def num_modes(self) -> int:
-        """r, modes of the soil."""
-        return self._dynamics.num_modes
-
-    @property
-    def mean_force(self) -> np.ndarray:
-        """Of the training runs [N], shape (3,): the simplest prediction of a force."""
-        return self._dynamics.force.mean.cpu().numpy().copy()
-
-    @property
-    def context_keys(self) -> tuple[str, ...]:
-        """Numbers of the scene that the network is told."""
-        return self._dynamics.context_keys
-
-    @property
-    def predicts_body(self) -> bool:
-        """Whether the tool's height is predicted, as that of a wheel, not prescribed."""
-        return self._dynamics.predicts_body
-
-    @property
-    def arrangement_hash(self) -> str:
-        """Of the particle arrangement it knows."""
-        return self.basis.arrangement_hash
 
     @property
     def scene(self) -> dict[str, Any]:
         """Scene of one of the training runs, as plain data, a copy: its bed is the bed it knows. The mesh of a tool is
         not in it, but in the run (`Run.mesh`)."""
         return copy.deepcopy(self._surrogate.card["scene"])
-
-    @property
-    def card(self) -> dict[str, Any]:
-        """Where it comes from: settings, runs, versions."""
-        return self._surrogate.card
 
     @property
     def step_count(self) -> int:
@@ -166,7 +138,7 @@ class Simulator:
         history: tuple[np.ndarray, np.ndarray] | None = None,
         values: Mapping[str, Any] | None = None,
     ) -> State:
-        """Start again.
+        """Start again; returns the state at frame 0.
 
         Args:
             scene: An `mpm_warp.Scene`, whose first pose and body points are taken; or a pose, shape (7,), or
@@ -176,9 +148,6 @@ class Simulator:
                 the bed at rest at its common start.
             values: The scene as plain data, where `scene` is none; a network that was trained with different loads,
                 soils or the like reads them there. None: those of `simulator.scene`.
-
-        Returns:
-            The state at frame 0.
 
         Raises:
             UserError: The scene has another bed, or what is given is not of the shape and kind above; then the
@@ -195,11 +164,9 @@ class Simulator:
         elif scene is not None:
             pose = first_pose(scene)
         points, numbers = self._checked_points(points), self._numbers_of(values)
-        poses: list[np.ndarray] = []
         if history is None:
             latent = self._start_latent.expand(self.history, -1, -1)
-            if pose is not None:
-                poses = [pose] * self.history
+            poses = [] if pose is None else [pose] * self.history
         else:
             latent, poses = self._checked_beginning(history)
         stepper = self._dynamics.stepper(len(points), self._told(numbers))
@@ -214,13 +181,10 @@ class Simulator:
         return self._state()
 
     def step(self, tool_pose: np.ndarray) -> State:
-        """Move the tool to its next pose and the soil with it.
+        """Move the tool to its next pose and the soil with it; returns the state then.
 
         Args:
             tool_pose: Centre of mass [m] and unit quaternion x, y, z, w one frame from now, shape (7,).
-
-        Returns:
-            The state after the step.
 
         Raises:
             UserError: The pose is no finite array of shape (7,), its quaternion is not of unit length, or the answer is
@@ -283,9 +247,6 @@ class Simulator:
             torque_history: Torque of the first d frames [N m], likewise.
             values: The scene as plain data, as for `reset`.
 
-        Returns:
-            The rollout.
-
         Raises:
             UserError: What is given is not of the shape and kind above, or the path is shorter than the history.
         """
@@ -329,9 +290,6 @@ class Simulator:
             body_points: In the body frame [m], shape (M, 3), for all; None: those of the training runs.
             values: The scene as plain data, as for `reset`, for all.
             paths_at_once: Paths stepped together: bounds the memory beside the result.
-
-        Returns:
-            The rollouts.
 
         Raises:
             UserError: What is given is not of the shape and kind above.
@@ -393,17 +351,14 @@ class Simulator:
         parts = [part[np.arange(count)[:, None], np.stack(newest)] for part in parts]
         if self.predicts_body:
             found = [self._predicted_poses(*pair, points) for pair in zip(poses, nodes, strict=True)]
-            poses = np.stack(found)
-            worlds = (
-                nodes
-                if self._dynamics.settings.body_nodes == "points"
-                else np.stack([in_world_frame(path, points) for path in poses])
-            )
+            poses, worlds = np.stack(found), nodes
+            if self._dynamics.settings.body_nodes == "pose":
+                worlds = np.stack([in_world_frame(path, points) for path in poses])
         return *parts, poses, worlds
 
     def _steps_of(self, poses: np.ndarray, world: np.ndarray, given: int) -> tuple[np.ndarray, np.ndarray]:
-        """Frames that the soil takes a step into, the given ones first, and for each frame of the path which of them
-        is the newest; poses (T, 7) and body points (T, M, 3)."""
+        """Frames of a path of poses (T, 7) and body points (T, M, 3) that the soil takes a step into, the given ones
+        first, and for each frame of the path which of them is the newest."""
         if not self._rate_independent:
             return np.arange(len(poses)), np.arange(len(poses))
         frames = step_frames(markers(poses, world), given, *self._pace)
@@ -444,7 +399,7 @@ class Simulator:
         """Says when asked how far frames are outside the training range. It holds nothing of the simulator that goes
         on changing."""
         context = dict(zip(self.context_keys, numbers.tolist(), strict=True))
-        return partial(excess_of, self._surrogate.training_range, poses, points, latent, context)
+        return partial(self._surrogate.training_range.excess, poses, points, latent, context)
 
     def _numbers_of(self, values: Mapping[str, Any] | None) -> np.ndarray:
         """Those of a scene that the network is told, shape (K,)."""
@@ -494,17 +449,3 @@ class Simulator:
     def _markers(self, poses: Sequence[np.ndarray]) -> np.ndarray:
         path = np.stack(poses)
         return markers(path, in_world_frame(path, self._points))
-
-
-def excess_of(
-    known: TrainingRange,
-    poses: np.ndarray,
-    points: np.ndarray,
-    latent: np.ndarray,
-    context: Mapping[str, float],
-) -> Excess | None:
-    """How far frames are outside a training range; body points (M, 3) in the body frame [m], else as
-    `TrainingRange.excess`. None where the tool is nowhere yet."""
-    if not np.isfinite(poses).all():
-        return None
-    return known.excess(poses, in_world_frame(poses, points), latent, context)

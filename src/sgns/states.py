@@ -58,7 +58,7 @@ class Rollout:
         torque: About its centre of mass [N m], shape (T, 3).
         poses: Of the tool, shape (T, 7); predicted where the tool is free.
         body_points: World frame [m], shape (T, M, 3).
-        wall_time_s: Time of the network's steps, force included, decoding not [s].
+        wall_time_s: Time of all steps, force included, decoding not [s].
     """
 
     latent: np.ndarray
@@ -78,15 +78,7 @@ class Rollout:
 
 @dataclass(frozen=True, eq=False)
 class Rollouts:
-    """Many tool paths, B of them.
-
-    Attributes:
-        latent: Modes [m], shape (B, T, r, 3), float64.
-        force: By the soil on the tool [N], shape (B, T, 3); zero in frame 0.
-        torque: About its centre of mass [N m], shape (B, T, 3); zero in frame 0.
-        poses: Of the tool, shape (B, T, 7); predicted where the tool is free.
-        wall_time_s: Time of all steps, force included, decoding not [s].
-    """
+    """Many tool paths: as of `Rollout`, with B before every shape; `wall_time_s` is that of all of them."""
 
     latent: np.ndarray
     force: np.ndarray

@@ -296,13 +296,17 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """
     file = folder / SUMMARY
     summary = read_json(file, _WRONG, _ADVICE)
-    types = {"seconds": (int, float), "skill": (int, float), "steps": int}
     if not isinstance(summary, dict):
         raise UserError(f"{file} is {_WRONG} (no group of keys); {_ADVICE}")
-    for key, type_ in types.items():
-        value = summary.get(key, 1 if key == "steps" else None)  # polynomials are fitted without any
-        # The skill is no number where nothing moves; no other may be none.
-        good = isinstance(value, type_) and not isinstance(value, bool)
-        if not good or (key != "skill" and not (key == "steps") <= value < math.inf):
+    # Polynomials are fitted without any steps. The skill may be NaN: nothing moved.
+    values: dict[str, Any] = {"steps": 1} | summary
+    for key, types, least in (
+        ("seconds", (int, float), 0),
+        ("skill", (int, float), None),
+        ("steps", (int,), 1),
+    ):
+        value: Any = values.get(key)
+        number = isinstance(value, types) and not isinstance(value, bool)
+        if not number or (least is not None and not least <= value < math.inf):
             raise UserError(f"{file} is {_WRONG} ({key} is {value!r:.40}); {_ADVICE}")
     return summary

@@ -119,7 +119,7 @@ class LatentDynamics(Dynamics):
         """Predict one step of every window in a batch; arguments as for `advance`."""
         modes, nodes = latent.shape[-2], body.position.shape[-2]
         edge_index = self.edge_index(modes, nodes, latent.device)
-        graph = build_graph(
+        features, edges = build_graph(
             self._mode_features(latent),
             self.body_features(body),
             self._edge_positions(latent[:, -1], body.position[:, -2]),
@@ -127,7 +127,7 @@ class LatentDynamics(Dynamics):
             self.settings.edge_length,
         )
         told = self.told(modes, nodes, latent.shape[0], context)
-        return self.read(self.network(torch.cat([graph.nodes, told], dim=-1), graph.edges, edge_index))
+        return self.read(self.network(torch.cat([features, told], dim=-1), edges, edge_index))
 
     def read(self, decoded: Tensor) -> Prediction:
         """The prediction in what the network decodes, shape (B, V, 6 or 9)."""

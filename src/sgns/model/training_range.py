@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from mpm_warp.poses import in_world_frame
 from sgns.model.features import body_track, context_of
 
 if TYPE_CHECKING:
@@ -116,11 +117,13 @@ class TrainingRange:
 
     def excess(
         self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, context: Mapping[str, float]
-    ) -> Excess:
-        """How far a path of poses (T, 7), body points in the world frame (T, M, 3) [m] and modes (T, r, 3) [m] is
-        outside; fewer modes than those of the training are compared with the first of them."""
+    ) -> Excess | None:
+        """How far a path of poses (T, 7), body points in the body frame (M, 3) [m] and modes (T, r, 3) [m] is outside;
+        None where the tool is nowhere. Fewer modes than those of the training are compared with the first of them."""
+        if not np.isfinite(poses).all():
+            return None
         amounts, names = [], []
-        found = quantities(poses, points, latent, context)
+        found = quantities(poses, in_world_frame(poses, points), latent, context)
         for name in self.low:
             values = found[name]
             low, high = (side[name][: values.shape[1]] for side in (self.low, self.high))
