@@ -26,7 +26,6 @@ from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step
 from sgns.model.features import BodyTrack, ToolMotion, body_track, context_of, markers, step_frames
-from sgns.model.training_range import Excess
 from sgns.states import Rollout, Rollouts, State
 
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
@@ -163,15 +162,15 @@ class Simulator:
             points, pose, values = scene.body_points(), first_pose(scene.body_poses()), scene.to_dict()
         elif scene is not None:
             pose = first_pose(scene)
-        points, numbers = self._checked_points(points), self._numbers_of(values)
+        points, context = self._checked_points(points), self._context_of(values)
         if history is None:
             latent = self._start_latent.expand(self.history, -1, -1)
             poses = [] if pose is None else [pose] * self.history
         else:
             latent, poses = self._checked_beginning(history)
-        stepper = self._dynamics.stepper(len(points), self._told(numbers))
+        stepper = self._dynamics.stepper(len(points), self._told(context))
         # All is in order: nothing is changed before.
-        self._frame, self._points, self._numbers, self._stepper = 0, points, numbers, stepper
+        self._frame, self._points, self._context, self._stepper = 0, points, context, stepper
         self._poses, self._latent = poses, latent.clone()[None].to(self.device)
         self._load = np.zeros(3), np.zeros(3)
         self._motion: ToolMotion | None = None
@@ -267,13 +266,13 @@ class Simulator:
                 raise UserError(
                     f"the path has {len(poses)} frames; with a given history it needs at least {d}"
                 )
-        numbers = self._numbers_of(values)
-        context = self._told(numbers)
+        context = self._context_of(values)
+        told = self._told(context)
         began = time.perf_counter()
-        found = self._unrolled(poses[None], points, context, latent, given, loads)
+        found = self._unrolled(poses[None], points, told, latent, given, loads)
         wall_time = elapsed(began, time.perf_counter())
         states, force, torque, poses, world = (part[0] for part in found)
-        excess = self._excess(poses, points, states, numbers)
+        excess = partial(self._surrogate.training_range.excess, poses, points, states, context)
         return Rollout(states, force, torque, poses, world, wall_time, excess)
 
     def rollouts(
@@ -299,12 +298,12 @@ class Simulator:
             raise UserError(f"the array of paths has shape {poses.shape}; it needs shape (paths, frames, 7)")
         if not is_whole(paths_at_once) or paths_at_once < 1:
             raise UserError(f"paths_at_once is {paths_at_once!r}; it must be a whole number, at least 1")
-        points, context = self._checked_points(body_points), self._told(self._numbers_of(values))
+        points, told = self._checked_points(body_points), self._told(self._context_of(values))
         poses = np.stack([check_poses(path, f"path {i}") for i, path in enumerate(poses)])
         start = self._start_latent.expand(self.history, -1, -1)
         began = time.perf_counter()
         parts = [
-            self._unrolled(poses[first : first + paths_at_once], points, context, start)[:4]
+            self._unrolled(poses[first : first + paths_at_once], points, told, start)[:4]
             for first in range(0, len(poses), paths_at_once)
         ]
         latent, force, torque, poses = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -314,7 +313,7 @@ class Simulator:
         self,
         poses: np.ndarray,
         points: np.ndarray,
-        context: Tensor,
+        told: Tensor,
         latent: Tensor,
         given: int = 1,
         loads: Sequence[np.ndarray | None] = (None, None),
@@ -324,7 +323,7 @@ class Simulator:
         Args:
             poses: Shape (B, T, 7).
             points: Shape (M, 3).
-            context: Shape (1, K).
+            told: Numbers of the scene, shape (1, K).
             latent: The first d positions, shape (d, r, 3); of a bed at rest d times the same.
             given: Frames of the paths that these are: 1 for a bed at rest, or d.
             loads: Force and torque of these frames.
@@ -341,7 +340,7 @@ class Simulator:
         track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
         with torch.inference_mode():
             path = self._dynamics.unroll(
-                latent.to(self.device).expand(count, -1, -1, -1), track, context.expand(count, -1)
+                latent.to(self.device).expand(count, -1, -1, -1), track, told.expand(count, -1)
             )
             parts = [part[:, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque)]
             nodes = path.body.position[:, padding:].cpu().numpy()
@@ -372,46 +371,36 @@ class Simulator:
 
     def _require_finite(self, step: Step) -> None:
         """Refuses a step that says nothing; the simulator stays where it was."""
-        found = {
-            "the soil's state": step.latent,
-            "the force": step.force,
-            "the torque": step.torque,
-            "the tool's motion": step.displacement,
-        }
-        bad = [name for name, part in found.items() if not bool(torch.isfinite(part).all())]
-        if bad:
-            raise UserError(
-                f"{bad[0]} is not finite at frame {self._frame + 1}, likely because the tool's pose of that frame lies "
-                f"far from everything the network knows; frame {self._frame} is kept: step to another pose, or reset"
-            )
+        names = "the soil's state", "the force", "the torque", "the tool's motion"
+        for name, part in zip(names, step, strict=True):
+            if not bool(torch.isfinite(part).all()):
+                raise UserError(
+                    f"{name} is not finite at frame {self._frame + 1}, likely because the tool's pose of that frame "
+                    "lies far from everything the network knows; "
+                    f"frame {self._frame} is kept: step to another pose, or reset"
+                )
 
     def _state(self) -> State:
         """The newest state."""
         # How far it is outside takes the frame before as well, for velocities.
         poses, latent = (np.stack(part) for part in zip(*self._shown, strict=True))
-        excess = self._excess(poses, self._points, latent, self._numbers)
+        # It holds nothing of the simulator that goes on changing.
+        excess = partial(self._surrogate.training_range.excess, poses, self._points, latent, self._context)
         force, torque = (part.copy() for part in self._load)
         return State(self._frame, latent[-1].copy(), force, torque, poses[-1].copy(), self.basis, excess)
 
-    def _excess(
-        self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, numbers: np.ndarray
-    ) -> partial[Excess | None]:
-        """Says when asked how far frames are outside the training range. It holds nothing of the simulator that goes
-        on changing."""
-        context = dict(zip(self.context_keys, numbers.tolist(), strict=True))
-        return partial(self._surrogate.training_range.excess, poses, points, latent, context)
-
-    def _numbers_of(self, values: Mapping[str, Any] | None) -> np.ndarray:
-        """Those of a scene that the network is told, shape (K,)."""
+    def _context_of(self, values: Mapping[str, Any] | None) -> dict[str, float]:
+        """The numbers of a scene that the network is told, by their keys."""
         if values is not None and not isinstance(values, Mapping):
             raise UserError(
                 f"values is a {type(values).__name__}; it must be a scene as plain data, such as simulator.scene"
             )
-        return context_of(self._surrogate.card["scene"] if values is None else values, self.context_keys)
+        numbers = context_of(self.card["scene"] if values is None else values, self.context_keys)
+        return dict(zip(self.context_keys, numbers.tolist(), strict=True))
 
-    def _told(self, numbers: np.ndarray) -> Tensor:
-        """Numbers (K,) as the dynamics take them, shape (1, K)."""
-        return torch.as_tensor(numbers)[None].to(self.device)
+    def _told(self, context: Mapping[str, float]) -> Tensor:
+        """The numbers as the dynamics take them, shape (1, K)."""
+        return torch.tensor([list(context.values())], dtype=torch.float64, device=self.device)
 
     def _track(self, poses: np.ndarray, points: np.ndarray) -> BodyTrack:
         track = body_track(poses, points, self._dynamics.settings.body_nodes)

@@ -26,14 +26,8 @@ def in_place(activation: nn.Module) -> Callable[[Tensor], Tensor]:
 
 
 class Layer:
-    """A linear layer for a known number of rows, with an activation or without, into memory of its own.
-
-    Args:
-        weight: Shape (outputs, inputs).
-        bias: Shape (outputs,).
-        rows: Their number.
-        activation: What follows; None for nothing.
-    """
+    """A linear layer, weight (outputs, inputs) and bias (outputs,), for a known number of rows, with an activation or
+    without, into memory of its own."""
 
     def __init__(self, weight: Tensor, bias: Tensor, rows: int, activation: nn.Module | None = None) -> None:
         self.bias = bias.clone()

@@ -190,11 +190,8 @@ def varying_context(runs: Sequence[ReducedRun], candidates: Sequence[str]) -> li
 
 
 def context_of(scene: Mapping[str, Any], keys: Sequence[str]) -> np.ndarray:
-    """The numbers of a scene by their keys, in the units of the scene, shape (K,).
-
-    Raises:
-        UserError: The scene lacks one, or it is not finite.
-    """
+    """The numbers of a scene by their keys, in the units of the scene, shape (K,); UserError if one is missing or not
+    finite."""
     values = []
     for key in keys:
         value = _value(scene, key)

@@ -261,7 +261,8 @@ class MLP(nn.Module):
         relu = isinstance(self.rest[0], nn.ReLU)
         for linear in linears:
             x = affine(x, linear.weight, linear.bias, relu)
-            x = x if relu else self.rest[0](x)
+            if not relu:
+                x = self.rest[0](x)
         return x
 
     def hidden(self, x: Tensor) -> Tensor:
@@ -280,13 +281,8 @@ class MLP(nn.Module):
 
 
 class Unapplied(NamedTuple):
-    """A linear layer together with its input: it may be multiplied with the next, or moved behind a sum.
-
-    Attributes:
-        hidden: Input, shape (..., hidden).
-        weight: Shape (outputs, hidden).
-        bias: Shape (outputs,).
-    """
+    """A linear layer, weight (outputs, hidden) and bias (outputs,), together with its input (..., hidden): it may be
+    multiplied with the next, or moved behind a sum."""
 
     hidden: Tensor
     weight: Tensor
@@ -316,15 +312,8 @@ class InteractionNetwork(MessagePassing):
     .. math::
         e'_{ij} = \phi_e([e_{ij}, v_i, v_j]), \qquad v'_i = \phi_v([v_i, \sum_j e'_{ij}])
 
-    for the edge from sender j to receiver i.
-
-    Args:
-        width: Of node and edge features.
-        hidden: Width of the hidden layers of each MLP.
-        hidden_layers: Their number.
-        layer_norm: Whether updates are layer-normalised.
-        residual: Whether updates are added to what they update.
-        activation: Between layers.
+    for the edge from sender j to receiver i; node and edge features are `width` wide. With `residual` updates are added
+    to what they update.
     """
 
     def __init__(

@@ -204,23 +204,6 @@ def test_a_threshold_above_everything_leaves_nothing(data) -> None:
     assert torch.equal(coefficients(known, Setting(0.0, 1e-3)), ridge(known, 1e-3))
 
 
-def test_unrolling_is_stepping(data) -> None:
-    windows = windows_of(data.runs("train"))
-    model = fit(windows, 2, Setting(0.3, 1e-2), Setting(0.1, 1e-1))
-    frames = torch.arange(10)
-    body = BodyTrack(*(part[frames][None] for part in windows.body))
-    latent, force, torque, followed = model.unroll(windows.latent[None, :HISTORY], body)
-    assert followed is body  # prescribed
-    states = list(windows.latent[:HISTORY])
-    for t in range(HISTORY, 10):
-        window = body.frames(slice(t - HISTORY + 1, t + 1))
-        z, f, m, _ = model.advance(torch.stack(states[-HISTORY:])[None], window)
-        states.append(z[0])
-        assert torch.equal(f[0], force[0, t]) and torch.equal(m[0], torque[0, t])
-    assert torch.equal(torch.stack(states), latent[0])
-    assert not force[0, :HISTORY].any() and not torque[0, :HISTORY].any()
-
-
 def test_nothing_runs_away_outside_the_known_range(data) -> None:
     windows = windows_of(data.runs("train"))
     model = blank(windows, 2)

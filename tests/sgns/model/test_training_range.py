@@ -62,7 +62,9 @@ def away(path):
     {
         "the tool's orientation": lambda run: {"pose": turned(run)},
         "the tool's lowest point": lambda run: {"points": [0.0, 0.0, -0.1]},
-        "the tool's displacement per frame (x)": lambda run: {"pose": away(run.pose)},
+        "the tool's displacement per frame (x)": lambda run: {
+            "pose": np.column_stack([away(run.pose[:, 0]), run.pose[:, 1:]])
+        },
         "the soil's state": lambda run: {"latent": run.latent[:, :4] + [[0.0, 0.0, 9.0]]},
         "the soil's": lambda run: {"latent": away(run.latent[:, :4])},
         "depth": lambda run: {"depth": 1.0},
