@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from mpm_warp import Scene
-    from sgns.simulator import Simulator
-    from sgns.states import Rollout
+    from sgns.simulator import Rollout, Simulator
 
 
 log = logging.getLogger(__name__)

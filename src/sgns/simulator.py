@@ -10,8 +10,9 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,90 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mpm_warp.poses import fitted_poses, in_world_frame
+from mpm_warp.poses import in_world_frame
 from sgns.arrays import check_pose, check_poses, finite_array, first_pose, is_whole, real_array
 from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step
-from sgns.model.features import BodyTrack, ToolMotion, body_track, context_of, markers, step_frames
-from sgns.states import Rollout, Rollouts, State
+from sgns.model.features import ToolMotion, context_of, markers
+from sgns.model.training_range import Excess
+from sgns.reduction.basis import Basis
 
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
 _SETTLING = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The bed and the tool at one frame.
+
+    Attributes:
+        frame: 0 at the reset.
+        latent: Modes [m], shape (r, 3).
+        force: By the soil on the tool over the last frame [N], world frame, shape (3,); zero at the reset.
+        torque: About the tool's centre of mass [N m], shape (3,).
+        pose: Tool's centre of mass [m] and quaternion x, y, z, w, shape (7,).
+    """
+
+    frame: int
+    latent: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    pose: np.ndarray
+    _basis: Basis = field(repr=False)
+    _excess: Callable[[], Excess | None] = field(repr=False)
+
+    @property
+    def outside(self) -> float:
+        """How far this frame is from all that the training runs covered [1]: the distance of the worst of the tool's
+        pose and motion, the soil's modes and their velocity, and the context from its training range, in widths of
+        that range. 0: inside every range; above 0.05 the answer is a guess; NaN: the tool is nowhere yet."""
+        found = self._excess()
+        return np.nan if found is None else float(found.amount[-1])
+
+    def soil(self) -> np.ndarray:
+        """Positions of all particles [m], shape (n, 3); decoded when asked for."""
+        return self._basis.inverse(self.latent).numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A whole tool path.
+
+    Attributes:
+        latent: Modes [m], shape (T, r, 3), float64.
+        force: By the soil on the tool [N], shape (T, 3).
+        torque: About its centre of mass [N m], shape (T, 3).
+        poses: Of the tool, shape (T, 7); predicted where the tool is free.
+        body_points: World frame [m], shape (T, M, 3).
+        wall_time_s: Time of all steps, force included, decoding not [s].
+    """
+
+    latent: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    poses: np.ndarray
+    body_points: np.ndarray
+    wall_time_s: float
+    _excess: Callable[[], Excess | None] = field(repr=False)
+
+    @cached_property
+    def excess(self) -> Excess | None:
+        """How far every frame is outside the training runs' range, see `State.outside`, and in what; None: a
+        predicted tool is nowhere."""
+        return self._excess()
+
+
+@dataclass(frozen=True, eq=False)
+class Rollouts:
+    """Many tool paths: as of `Rollout`, with B before every shape; `wall_time_s` is that of all of them."""
+
+    latent: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    poses: np.ndarray
+    wall_time_s: float
 
 
 class Simulator:
@@ -92,8 +166,10 @@ class Simulator:
         self.context_keys, self.predicts_body = dynamics.context_keys, dynamics.predicts_body
         self.frame_rate, self.card = surrogate.frame_rate, surrogate.card
         self.arrangement_hash = self.basis.arrangement_hash
-        self._rate_independent = rate_independent and not dynamics.predicts_body
-        self._pace = surrogate.slowest_travel, math.ceil(_SETTLING * surrogate.frame_rate)
+        # How a tool moves at least that the soil follows the clock under (see `ToolMotion`); None: it always does.
+        self._pace: tuple[float, int] | None = None
+        if rate_independent and not dynamics.predicts_body:
+            self._pace = surrogate.slowest_travel, math.ceil(_SETTLING * surrogate.frame_rate)
         # Copies: what a tensor shares with an array is freed when the tensor is sent to another process.
         self.start_positions, self.body_points, self.mean_force = (
             tensor.cpu().numpy().copy()
@@ -193,10 +269,12 @@ class Simulator:
         poses, shown = self._poses, self._shown[-1]
         if not poses:
             poses, shown = [pose] * self.history, (pose, shown[1])
-        before = self._motion or ToolMotion.along(self._markers(poses), *self._pace)
-        motion = before.moved(self._markers([pose])[0])
+        motion = None
+        if self._pace is not None:
+            before = self._motion or ToolMotion.along(self._markers(poses), *self._pace)
+            motion = before.moved(self._markers([pose])[0])
         latent, load = self._latent, self._load
-        if motion.steps or not self._rate_independent:
+        if motion is None or motion.steps:
             pose, latent, load = self._step_soil(poses, pose)
             poses = [*poses[1:], pose]
         self._poses, self._motion, self._latent, self._load = poses, motion, latent, load
@@ -211,7 +289,7 @@ class Simulator:
         (1, d, r, 3), and force and torque. What fails changes nothing."""
         # One frame more than the network sees, because the first motion needs a frame before it.
         window = np.stack([*poses, pose])
-        body = self._track(window, in_world_frame(window, self._points)).frames(slice(1, None))
+        body = self._dynamics.track(window, in_world_frame(window, self._points)).frames(slice(1, None))
         memory = self._stepper.memory
         try:
             with torch.inference_mode():
@@ -220,7 +298,7 @@ class Simulator:
                 latent = torch.cat([self._latent[:, 1:], step.latent[:, None]], dim=1)
             if self.predicts_body:
                 there = body.position[0, -2] + step.displacement[0]
-                pose = self._predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
+                pose = self._dynamics.predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
         except BaseException:  # an interruption as well
             self._stepper.memory = memory
             raise
@@ -269,7 +347,7 @@ class Simulator:
         context = self._context_of(values)
         told = self._told(context)
         began = time.perf_counter()
-        found = self._unrolled(poses[None], points, told, latent, given, loads)
+        found = self._dynamics.follow(poses[None], points, told, latent, self._pace, given, loads)
         wall_time = elapsed(began, time.perf_counter())
         states, force, torque, poses, world = (part[0] for part in found)
         excess = partial(self._surrogate.training_range.excess, poses, points, states, context)
@@ -303,71 +381,11 @@ class Simulator:
         start = self._start_latent.expand(self.history, -1, -1)
         began = time.perf_counter()
         parts = [
-            self._unrolled(poses[first : first + paths_at_once], points, told, start)[:4]
+            self._dynamics.follow(poses[first : first + paths_at_once], points, told, start, self._pace)[:4]
             for first in range(0, len(poses), paths_at_once)
         ]
         latent, force, torque, poses = (np.concatenate(part) for part in zip(*parts, strict=True))
         return Rollouts(latent, force, torque, poses, elapsed(began, time.perf_counter()))
-
-    def _unrolled(
-        self,
-        poses: np.ndarray,
-        points: np.ndarray,
-        told: Tensor,
-        latent: Tensor,
-        given: int = 1,
-        loads: Sequence[np.ndarray | None] = (None, None),
-    ) -> tuple[np.ndarray, ...]:
-        """Latent positions, force, torque, poses and body points in the world frame along some paths.
-
-        Args:
-            poses: Shape (B, T, 7).
-            points: Shape (M, 3).
-            told: Numbers of the scene, shape (1, K).
-            latent: The first d positions, shape (d, r, 3); of a bed at rest d times the same.
-            given: Frames of the paths that these are: 1 for a bed at rest, or d.
-            loads: Force and torque of these frames.
-        """
-        count, padding = len(poses), self.history - given
-        worlds = np.stack([in_world_frame(path, points) for path in poses])
-        frames, newest = zip(
-            *(self._steps_of(*path, given) for path in zip(poses, worlds, strict=True)), strict=True
-        )
-        # Before its first frame a bed is at rest. Side by side all take as many steps: those that are done rest.
-        longest = max(map(len, frames))
-        shown = [np.pad(each, (padding, longest - len(each)), mode="edge") for each in frames]
-        tracks = [self._track(poses[i, index], worlds[i, index]) for i, index in enumerate(shown)]
-        track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
-        with torch.inference_mode():
-            path = self._dynamics.unroll(
-                latent.to(self.device).expand(count, -1, -1, -1), track, told.expand(count, -1)
-            )
-            parts = [part[:, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque)]
-            nodes = path.body.position[:, padding:].cpu().numpy()
-        for part, load in zip(parts[1:], loads, strict=True):
-            if load is not None:
-                part[:, :given] = load
-        parts = [part[np.arange(count)[:, None], np.stack(newest)] for part in parts]
-        if self.predicts_body:
-            found = [self._predicted_poses(*pair, points) for pair in zip(poses, nodes, strict=True)]
-            poses, worlds = np.stack(found), nodes
-            if self._dynamics.settings.body_nodes == "pose":
-                worlds = np.stack([in_world_frame(path, points) for path in poses])
-        return *parts, poses, worlds
-
-    def _steps_of(self, poses: np.ndarray, world: np.ndarray, given: int) -> tuple[np.ndarray, np.ndarray]:
-        """Frames of a path of poses (T, 7) and body points (T, M, 3) that the soil takes a step into, the given ones
-        first, and for each frame of the path which of them is the newest."""
-        if not self._rate_independent:
-            return np.arange(len(poses)), np.arange(len(poses))
-        frames = step_frames(markers(poses, world), given, *self._pace)
-        return frames, np.searchsorted(frames, np.arange(len(poses)), side="right") - 1
-
-    def _predicted_poses(self, poses: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Poses (T, 7) of body nodes (T, N, 3) [m]; the prescribed orientation of a pose node is kept."""
-        if self._dynamics.settings.body_nodes == "points":
-            return fitted_poses(points, nodes)
-        return np.concatenate([nodes[:, 0], poses[:, 3:]], axis=1)
 
     def _require_finite(self, step: Step) -> None:
         """Refuses a step that says nothing; the simulator stays where it was."""
@@ -401,10 +419,6 @@ class Simulator:
     def _told(self, context: Mapping[str, float]) -> Tensor:
         """The numbers as the dynamics take them, shape (1, K)."""
         return torch.tensor([list(context.values())], dtype=torch.float64, device=self.device)
-
-    def _track(self, poses: np.ndarray, points: np.ndarray) -> BodyTrack:
-        track = body_track(poses, points, self._dynamics.settings.body_nodes)
-        return BodyTrack(*(part[None].to(self.device) for part in track))
 
     def _checked_history(self, latent: np.ndarray | Tensor) -> Tensor:
         if isinstance(latent, Tensor):

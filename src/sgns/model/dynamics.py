@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mpm_warp.poses import fitted_poses, in_world_frame
 from sgns.arrays import is_whole
 from sgns.config import UserError
-from sgns.model.features import BodyTrack
+from sgns.model.features import BodyTrack, body_track, markers, step_frames
 from sgns.model.settings import ModelSettings, PolynomialSettings
 
 # No latent position goes further than this from its mean, in deviations; training runs stay within about half of it. It
@@ -226,6 +228,67 @@ class Dynamics(nn.Module):
         return unrolled(
             lambda history, window: self.advance(history, window, context), latent, body, self.predicts_body
         )
+
+    def follow(
+        self,
+        poses: np.ndarray,
+        points: np.ndarray,
+        context: Tensor,
+        latent: Tensor,
+        pace: tuple[float, int] | None,
+        given: int = 1,
+        loads: Sequence[np.ndarray | None] = (None, None),
+    ) -> tuple[np.ndarray, ...]:
+        """Latent positions, force, torque, poses and body points in the world frame along some paths of a tool.
+
+        Args:
+            poses: Shape (B, T, 7).
+            points: In the body frame [m], shape (M, 3).
+            context: Shape (1, K).
+            latent: The first d positions, shape (d, r, 3); of a bed at rest d times the same.
+            pace: `least` and `settling` of `ToolMotion`; None: the soil takes a step into every frame.
+            given: Frames of the paths that the first positions are of: 1 for a bed at rest, or d.
+            loads: Force and torque of these frames.
+        """
+        count, padding, every = len(poses), self.history - given, np.arange(poses.shape[1])
+        worlds = np.stack([in_world_frame(path, points) for path in poses])
+        # Frames that the soil takes a step into, and for each frame of the path which of them is the newest.
+        frames = [every] * count
+        if pace is not None:
+            paths = (markers(*path) for path in zip(poses, worlds, strict=True))
+            frames = [step_frames(path, given, *pace) for path in paths]
+        newest = np.stack([np.searchsorted(each, every, side="right") - 1 for each in frames])
+        # Before its first frame a bed is at rest. Side by side all take as many steps: those that are done rest.
+        longest = max(map(len, frames))
+        shown = [np.pad(each, (padding, longest - len(each)), mode="edge") for each in frames]
+        tracks = [self.track(poses[i, index], worlds[i, index]) for i, index in enumerate(shown)]
+        track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
+        with torch.inference_mode():
+            start = latent.to(self.lowest.device).expand(count, -1, -1, -1)
+            path = self.unroll(start, track, context.expand(count, -1))
+            parts = [part[:, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque)]
+            nodes = path.body.position[:, padding:].cpu().numpy()
+        for part, load in zip(parts[1:], loads, strict=True):
+            if load is not None:
+                part[:, :given] = load
+        parts = [part[np.arange(count)[:, None], newest] for part in parts]
+        if self.predicts_body:
+            found = [self.predicted_poses(*pair, points) for pair in zip(poses, nodes, strict=True)]
+            poses, worlds = np.stack(found), nodes
+            if self.settings.body_nodes == "pose":
+                worlds = np.stack([in_world_frame(path, points) for path in poses])
+        return *parts, poses, worlds
+
+    def track(self, poses: np.ndarray, points: np.ndarray) -> BodyTrack:
+        """Of poses (T, 7) and body points in the world frame (T, M, 3), with B = 1."""
+        track = body_track(poses, points, self.settings.body_nodes)
+        return BodyTrack(*(part[None].to(self.lowest.device) for part in track))
+
+    def predicted_poses(self, poses: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Poses (T, 7) of body nodes (T, N, 3) [m]; the prescribed orientation of a pose node is kept."""
+        if self.settings.body_nodes == "points":
+            return fitted_poses(points, nodes)
+        return np.concatenate([nodes[:, 0], poses[:, 3:]], axis=1)
 
     def check_modes(self, num_modes: int) -> None:
         """For `with_modes`."""

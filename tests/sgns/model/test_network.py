@@ -22,16 +22,26 @@ from sgns.model.network import (
     affine,
 )
 
+
+def assert_close(found: list[torch.Tensor], expected: list[torch.Tensor], tolerance: float) -> None:
+    """Tensors, to a share of the largest value of each."""
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance * float(b.abs().max()))
+
+
 # --- Both matrix libraries give the same linear layer and the same gradients ----------------------------
 
 
 def affine_outcome(shape: tuple[int, ...], relu: bool) -> list[torch.Tensor]:
+    """Values with gradients asked for, and without; gradients."""
     torch.manual_seed(0)
     tensors = [torch.randn(*shape, 40), torch.randn(60, 40), torch.randn(60)]
     for tensor in tensors:
         tensor.requires_grad_()
     y = affine(*tensors, relu=relu)
-    return [y.detach(), *torch.autograd.grad(y.sin().sum(), tensors)]
+    with torch.inference_mode():
+        alone = affine(*tensors, relu=relu)
+    return [y.detach(), alone, *torch.autograd.grad(y.sin().sum(), tensors)]
 
 
 @pytest.mark.parametrize("relu", [False, True])
@@ -43,16 +53,7 @@ def test_onednn_is_the_linear_layer(shape, relu, monkeypatch) -> None:
     expected = affine_outcome(shape, relu)
     monkeypatch.setattr(module, "_WORTH_IT", 0)
     assert module.prefers_onednn(torch.empty(*shape, 40), torch.empty(60, 40))
-    for a, b in zip(affine_outcome(shape, relu), expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5 * float(b.abs().max()))
-
-
-def test_without_gradients_it_is_the_same() -> None:
-    x, weight, bias = torch.randn(700, 128), torch.randn(128, 128), torch.randn(128)
-    with torch.inference_mode():
-        found = affine(x, weight, bias, relu=True)
-    expected = torch.nn.functional.linear(x.double(), weight.double(), bias.double()).relu()
-    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-4)
+    assert_close(affine_outcome(shape, relu), expected, 1e-5)
 
 
 def test_double_precision_stays_double() -> None:
@@ -79,12 +80,9 @@ def test_a_part_of_a_matrix_is_no_slower() -> None:
 # --- Sums along edges without an index equal those with one ---------------------------------------------
 
 
-def inputs(v: int, e: int) -> list[torch.Tensor]:
+def outcome_of_sums(adjacency, v: int, e: int) -> list[torch.Tensor]:
     torch.manual_seed(0)
-    return [torch.randn(2, rows, 3).double().requires_grad_() for rows in (e, v, v)]
-
-
-def outcome_of_sums(adjacency, tensors) -> list[torch.Tensor]:
+    tensors = [torch.randn(2, rows, 3).double().requires_grad_() for rows in (e, v, v)]
     spread = adjacency.spread(tensors[0] * 1.0, *tensors[1:])
     summed = adjacency.gather(spread.sin())
     return [spread, summed, *torch.autograd.grad(summed.square().sum(), tensors)]
@@ -96,11 +94,8 @@ def test_broadcasting_is_indexing(v, self_loops) -> None:
     index = edge_indices(v - 1, 1, self_loops=self_loops)
     adjacency = adjacency_of(index, v)
     assert isinstance(adjacency, CompleteAdjacency) and adjacency.degree == index.shape[1] // v
-    tensors = inputs(v, index.shape[1])
-    for a, b in zip(
-        outcome_of_sums(adjacency, tensors), outcome_of_sums(IndexedAdjacency(index, v), tensors), strict=True
-    ):
-        torch.testing.assert_close(a, b)
+    found, expected = (outcome_of_sums(a, v, index.shape[1]) for a in (adjacency, IndexedAdjacency(index, v)))
+    assert_close(found, expected, 1e-12)
 
 
 def test_any_other_edges_are_indexed() -> None:
@@ -188,8 +183,7 @@ def test_the_algebra_changes_nothing(residual, layer_norm, steps, activation, ed
     index = EDGES[edges]
     inputs = torch.randn(3, 5, 6).double(), torch.randn(3, index.shape[1], 4).double()
     expected = outcome(network.plain, network, *inputs, index)
-    for a, b in zip(outcome(network, network, *inputs, index), expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10 * float(b.abs().max()))
+    assert_close(outcome(network, network, *inputs, index), expected, 1e-10)
 
 
 @pytest.mark.parametrize("hidden_layers", [1, 2, 3])
@@ -199,8 +193,7 @@ def test_the_algebra_changes_nothing_in_float32_at_the_papers_size(hidden_layers
     index = edge_indices(8, 15)
     inputs = torch.randn(9, 23, 20), torch.randn(9, 506, 4)
     expected = outcome(network.plain, network, *inputs, index)
-    for a, b in zip(outcome(network, network, *inputs, index), expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5 * float(b.abs().max()))
+    assert_close(outcome(network, network, *inputs, index), expected, 1e-5)
 
 
 def test_renaming_nodes_renames_the_answer() -> None:
