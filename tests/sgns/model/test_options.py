@@ -47,7 +47,7 @@ def module_of(data, model=None, training=None):
 @pytest.mark.parametrize("option", OPTIONS)
 def test_it_trains_and_comes_back(data, tmp_path, option) -> None:
     model, training = OPTIONS[option]
-    changes = TRAINING | training | {"learning_rate": 3e-3, "max_steps": 40, "validate_every": 40}
+    changes = TRAINING | training | {"learning_rate": 3e-3, "max_steps": 60, "validate_every": 60}
     assert train(data, num_modes=4, model=MODEL | model, training=changes, output=tmp_path) > -10.0
     module, windows = module_of(data, model, training)
     batch = windows.training_windows.batch(0, 8, windows.noise)
