@@ -104,36 +104,21 @@ def line(*steps: float) -> np.ndarray:
     return path
 
 
-def test_soil_under_a_slow_tool_steps_by_the_way_it_goes() -> None:
-    frames = step_frames(line(*[0.3] * 10), 1, 1.0, 5)
-    np.testing.assert_array_equal(frames, [0, 4, 8])
-
-
-@pytest.mark.parametrize("given", [1, 3, 11])
-def test_a_fast_tool_steps_in_every_frame(given) -> None:
-    np.testing.assert_array_equal(step_frames(line(*[1.0] * 10), given, 1.0, 5), np.arange(11))
-
-
-def test_soil_settles_after_a_fast_tool() -> None:
-    frames = step_frames(line(0.0, 0.0, 2.0, *[0.0] * 9, 0.5, 0.5), 1, 1.0, 4)
-    np.testing.assert_array_equal(frames, [0, 3, 4, 5, 6, 14])
-
-
-def test_shaking_is_no_motion_unless_it_is_far() -> None:
-    assert len(step_frames(line(*[0.9, -0.9] * 10), 1, 1.0, 5)) == 1
-    assert len(step_frames(line(*[0.5, 0.5, -0.5, -0.5] * 5), 1, 1.0, 5)) == 11
-
-
-def test_given_frames_are_all_seen_and_say_how_the_tool_moves() -> None:
-    path = line(0.1, 2.0, *[0.0] * 8)
-    np.testing.assert_array_equal(step_frames(path, 3, 1.0, 4), [0, 1, 2, 3, 4, 5])
-    np.testing.assert_array_equal(step_frames(line(*[0.4] * 8), 3, 1.0, 4), [0, 1, 2, 5, 8])
-
-
-def test_nothing_is_slower_than_rest() -> None:
-    """Without a known pace only a tool at rest is slow."""
-    frames = step_frames(line(*[1e-6] * 3, *[0.0] * 6), 1, 0.0, 2)
-    np.testing.assert_array_equal(frames, [0, 1, 2, 3, 4])
+@pytest.mark.parametrize(
+    ("why", "steps", "given", "least", "settling", "expected"),
+    [
+        ("under a slow tool by the way it goes", [0.3] * 10, 1, 1.0, 5, [0, 4, 8]),
+        *[("every frame of a fast tool", [1.0] * 10, given, 1.0, 5, range(11)) for given in (1, 3, 11)],
+        ("settling after a fast tool", [0, 0, 2] + [0] * 9 + [0.5, 0.5], 1, 1.0, 4, [0, 3, 4, 5, 6, 14]),
+        ("shaking is no motion", [0.9, -0.9] * 10, 1, 1.0, 5, [0]),
+        ("unless it is far", [0.5, 0.5, -0.5, -0.5] * 5, 1, 1.0, 5, range(0, 21, 2)),
+        ("given frames are all seen and say how the tool moves", [0.1, 2] + [0] * 8, 3, 1.0, 4, range(6)),
+        ("given frames of a slow tool", [0.4] * 8, 3, 1.0, 4, [0, 1, 2, 5, 8]),
+        ("without a known pace only a tool at rest is slow", [1e-6] * 3 + [0] * 6, 1, 0.0, 2, range(5)),
+    ],
+)
+def test_when_soil_takes_a_step(why, steps, given, least, settling, expected) -> None:
+    np.testing.assert_array_equal(step_frames(line(*steps), given, least, settling), list(expected))
 
 
 def test_turning_is_motion_of_the_points() -> None:
