@@ -171,9 +171,9 @@ def require_same_freedom(simulator: Simulator, scene: Scene, checkpoint: str | P
     """Refuses a wheel for a network that knows of prescribed bodies only, and the other way round."""
     if (scene.axle is not None) == simulator.predicts_body:
         return
-    learned, asked = "prescribed bodies", "is free"
-    if simulator.predicts_body:
-        learned, asked = "wheels", "is prescribed"
+    learned, asked = (
+        ("wheels", "is prescribed") if simulator.predicts_body else ("prescribed bodies", "is free")
+    )
     raise UserError(
         f"scene.kind is {scene.kind}, whose height {asked}; {checkpoint} was trained on {learned}: use a checkpoint "
         "that was trained on such scenes"

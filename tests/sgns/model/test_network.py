@@ -85,7 +85,7 @@ def outcome_of_sums(adjacency, v: int, e: int) -> list[torch.Tensor]:
     tensors = [torch.randn(2, rows, 3).double().requires_grad_() for rows in (e, v, v)]
     spread = adjacency.spread(tensors[0] * 1.0, *tensors[1:])
     summed = adjacency.gather(spread.sin())
-    return [spread, summed, *torch.autograd.grad(summed.square().sum(), tensors)]
+    return [spread.detach(), summed.detach(), *torch.autograd.grad(summed.square().sum(), tensors)]
 
 
 @pytest.mark.parametrize("v", [2, 3, 6])
