@@ -90,36 +90,22 @@ class Standardiser(nn.Module):
 
 
 class Step(NamedTuple):
-    """One step in physical units, float64.
+    """One step in physical units, float64. The displacement is the prescribed one, with what is predicted in its place
+    along the free axes."""
 
-    Attributes:
-        latent: Next latent positions [m], shape (B, r, 3).
-        force: On the body [N], shape (B, 3).
-        torque: On the body [N m], shape (B, 3).
-        displacement: Of the body nodes [m], shape (B, N, 3): the prescribed one, with what is predicted in its place
-            along the free axes.
-    """
-
-    latent: Tensor
-    force: Tensor
-    torque: Tensor
-    displacement: Tensor
+    latent: Tensor  # next positions [m], shape (B, r, 3)
+    force: Tensor  # on the body [N], shape (B, 3)
+    torque: Tensor  # on the body [N m], shape (B, 3)
+    displacement: Tensor  # of the body nodes [m], shape (B, N, 3)
 
 
 class Path(NamedTuple):
-    """A whole path, float64.
+    """A whole path, float64. The first d frames hold the given positions and no force or torque."""
 
-    Attributes:
-        latent: Latent positions [m], shape (B, T, r, 3); the first d frames are the given ones.
-        force: [N], shape (B, T, 3), zero in the first d frames.
-        torque: [N m], shape (B, T, 3), zero in the first d frames.
-        body: The body at all frames, predicted where it is free.
-    """
-
-    latent: Tensor
-    force: Tensor
-    torque: Tensor
-    body: BodyTrack
+    latent: Tensor  # positions [m], shape (B, T, r, 3)
+    force: Tensor  # [N], shape (B, T, 3)
+    torque: Tensor  # [N m], shape (B, T, 3)
+    body: BodyTrack  # at all frames, predicted where it is free
 
 
 class Dynamics(nn.Module):

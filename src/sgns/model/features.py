@@ -229,23 +229,14 @@ _STOPPING, _ROUNDING = 0.01, 0.01
 
 
 class ToolMotion(NamedTuple):
-    """How a tool has moved, as far as the next step of the soil depends on it.
+    """How a tool has moved, as far as the next step of the soil depends on it."""
 
-    Attributes:
-        least: How far it moves in a frame at least that is not called slow [m].
-        settling: Frames that the soil follows the clock after that: what was thrown up comes down.
-        here: Where its markers are (see `markers`) [m], shape (M + 1, 3).
-        stepped: Where they were when the soil took its last step.
-        slow: Frames since it was last not slow.
-        steps: Whether the soil takes a step into this frame.
-    """
-
-    least: float
-    settling: int
-    here: np.ndarray
-    stepped: np.ndarray
-    slow: int
-    steps: bool
+    least: float  # how far it moves in a frame at least that is not called slow [m]
+    settling: int  # frames that the soil follows the clock after that: what was thrown up comes down
+    here: np.ndarray  # where its markers are (see `markers`) [m], shape (M + 1, 3)
+    stepped: np.ndarray  # where they were when the soil took its last step
+    slow: int  # frames since it was last not slow
+    steps: bool  # whether the soil takes a step into this frame
 
     @classmethod
     def along(cls, given: np.ndarray, least: float, settling: int) -> ToolMotion:

@@ -22,13 +22,10 @@ from sgns.model.settings import ModelSettings
 
 
 class Prediction(NamedTuple):
-    """What the network says of one step, normalised.
+    """What the network says of every node in one step, normalised [1], shape (B, V, 3) each; modes first.
 
-    Attributes:
-        change: Of every node's position: its second difference, or with `model.predicts=velocity` its first [1], shape
-            (B, V, 3). Modes first; of a body node only what is free counts.
-        force: Contribution of every node [1], shape (B, V, 3).
-        torque: Contribution of every node [1], shape (B, V, 3).
+    The change is the position's second difference, or with `model.predicts=velocity` its first; of a body node only
+    what is free counts. Force and torque are what the node contributes to them.
     """
 
     change: Tensor

@@ -29,12 +29,8 @@ _SOIL = "the soil's state"
 
 
 class Excess(NamedTuple):
-    """How far every frame lies outside the training range.
-
-    Attributes:
-        amount: Distance of the worst quantity from its range, in widths of that range [1], shape (T,); 0 inside.
-        quantity: Its name in every frame, T of them.
-    """
+    """How far every frame lies outside the training range: the distance of the worst quantity from its range, in widths
+    of that range [1], shape (T,), 0 inside; and its name."""
 
     amount: np.ndarray
     quantity: list[str]
@@ -58,12 +54,7 @@ class Excess(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TrainingRange:
-    """Smallest and largest values of tool, soil and context in the training runs.
-
-    Attributes:
-        low: Quantity -> smallest value of every component [its unit].
-        high: Quantity -> largest value, likewise.
-    """
+    """Smallest and largest values of tool, soil and context in the training runs, of every component [its unit]."""
 
     low: dict[str, np.ndarray]
     high: dict[str, np.ndarray]
