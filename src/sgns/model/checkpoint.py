@@ -292,13 +292,9 @@ def read_summary(folder: Path) -> dict[str, Any]:
         raise UserError(f"{file} is {_WRONG} (no group of keys); {_ADVICE}")
     # Polynomials are fitted without any steps. The skill may be NaN: nothing moved.
     values: dict[str, Any] = {"steps": 1} | summary
-    for key, types, least in (
-        ("seconds", (int, float), 0),
-        ("skill", (int, float), None),
-        ("steps", (int,), 1),
-    ):
+    for key, type_, least in (("seconds", float, 0), ("skill", float, None), ("steps", int, 1)):
         value: Any = values.get(key)
-        number = isinstance(value, types) and not isinstance(value, bool)
+        number = isinstance(value, (int, type_)) and not isinstance(value, bool)
         if not number or (least is not None and not least <= value < math.inf):
             raise UserError(f"{file} is {_WRONG} ({key} is {value!r:.40}); {_ADVICE}")
     return summary
