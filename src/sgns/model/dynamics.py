@@ -267,8 +267,8 @@ class Dynamics(nn.Module):
 
     def track(self, poses: np.ndarray, points: np.ndarray) -> BodyTrack:
         """Of poses (T, 7) and body points in the world frame (T, M, 3), with B = 1."""
-        track = body_track(poses, points, self.settings.body_nodes)
-        return BodyTrack(*(part[None].to(self.lowest.device) for part in track))
+        track, device = body_track(poses, points, self.settings.body_nodes), self.lowest.device
+        return BodyTrack(*(part[None].to(device) for part in track))
 
     def predicted_poses(self, poses: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Poses (T, 7) of body nodes (T, N, 3) [m]; the prescribed orientation of a pose node is kept."""
