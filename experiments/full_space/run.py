@@ -36,8 +36,8 @@ from sgns.data.run import Run
 from sgns.evaluate.costs import forget_peak, peak_memory
 from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
 from sgns.evaluate.metrics import VectorErrors, mean_prediction, skill
+from sgns.model.dynamics import Standardiser
 from sgns.model.features import BodyTrack
-from sgns.model.network import Standardiser
 from sgns.reduction.reduce import reduce_dataset
 from sgns.settings import ModelSettings, TrainingSettings
 from sgns.simulator import Simulator

@@ -26,7 +26,6 @@ from common import training_settings, write_rows
 from torch import Tensor
 
 from sgns.evaluate.costs import cpu_model
-from sgns.model import algebra
 from sgns.model.features import BodyTrack
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.settings import ModelSettings
@@ -88,11 +87,11 @@ def in_turn(
 @contextmanager
 def onednn(allowed: bool) -> Iterator[None]:
     """oneDNN's products allowed or not."""
-    before, algebra._AVAILABLE = algebra._AVAILABLE, allowed and algebra._AVAILABLE
+    before, network._AVAILABLE = network._AVAILABLE, allowed and network._AVAILABLE
     try:
         yield
     finally:
-        algebra._AVAILABLE = before
+        network._AVAILABLE = before
 
 
 def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[Row]:

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from mpm_warp import Scene
-    from sgns.simulator import Simulator
-    from sgns.states import Rollout
+    from sgns.simulator import Rollout, Simulator
 
 
 log = logging.getLogger(__name__)
@@ -32,13 +31,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RolloutTiming:
-    """Wall time of a rollout.
-
-    Attributes:
-        simulated: time simulated [s].
-        inference: wall time of the network's steps with force and torque [s].
-        writing: wall time of decoding every frame and writing the run file [s].
-    """
+    """Time simulated, wall time of the network's steps with force and torque, and of decoding every frame and writing
+    the run file [s]."""
 
     simulated: float
     inference: float
@@ -51,7 +45,7 @@ class RolloutTiming:
 
     @property
     def complete_rate(self) -> float:
-        """Wall seconds per simulated second: steps, decoding and writing every frame."""
+        """Wall seconds per simulated second: steps, and every frame decoded and written."""
         return (self.inference + self.writing) / self.simulated
 
 
@@ -78,12 +72,12 @@ def write_rollout(
     given_frames: int = 1,
     mesh: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Path:
-    """Decodes a rollout and writes it as a run file (producer `rollout`).
+    """Decodes a rollout and writes it as a run file (producer `rollout`), complete or not at all; returns its path.
 
     Velocities are backward differences of the positions times the frame rate, zero at frame 0 (at rest).
 
     Args:
-        path: run file to write; complete or absent, never half-written.
+        path: run file to write.
         simulator: the one that made the rollout.
         scene: the scene as plain data.
         rollout: of T frames.
@@ -92,9 +86,6 @@ def write_rollout(
         checkpoint: file that the simulator was loaded from; recorded with its settings.
         given_frames: how many frames at the start are no predictions; recorded as `history`.
         mesh: of the scene's tool, if it is one.
-
-    Returns:
-        The path written.
 
     Raises:
         UserError: the rollout is not finite, when the frames before that are in `<name>.stopped.h5` instead; or the
@@ -155,8 +146,7 @@ def write_rollout(
 
 def finite_frames(rollout: Rollout) -> int:
     """Frames before the first in which a rollout is not finite."""
-    latent = np.asarray(rollout.latent, dtype=np.float64).reshape(len(rollout.latent), -1)
-    parts = [latent, np.asarray(rollout.force), np.asarray(rollout.torque), np.asarray(rollout.poses)]
+    parts = rollout.latent.reshape(len(rollout.latent), -1), rollout.force, rollout.torque, rollout.poses
     finite = np.isfinite(np.hstack(parts)).all(axis=1)
     return len(finite) if finite.all() else int(np.argmin(finite))
 
@@ -192,10 +182,8 @@ def require_same_freedom(simulator: Simulator, scene: Scene, checkpoint: str | P
 
 def bed_differences(known: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     """Names the values of two scenes' beds that differ, the checkpoint's first."""
-    named = [
-        f"{key} {a} (here {b})"
-        for key, (a, b) in differences(known.get("bed", {}), asked.get("bed", {})).items()
-    ]
+    found = differences(known.get("bed", {}), asked.get("bed", {}))
+    named = [f"{key} {a} (here {b})" for key, (a, b) in found.items()]
     if not named:
         return "the particles' arrangement differs"
     more = f" and {len(named) - 4} more" if len(named) > 4 else ""
@@ -203,53 +191,27 @@ def bed_differences(known: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
 
 
 # What changes soil and force beside the path: named when it differs and the network is not told.
-_FIXED = (
-    "blade",
-    "material",
-    "gravity",
-    "friction",
-    "load",
-    "diameter",
-    "width",
-    "friction_angle",
-    "grousers",
-    "damping",
-)
-
-
+_FIXED = "blade material gravity friction load diameter width friction_angle grousers damping".split()
 # What follows from a number that a network may be told.
 _FOLLOWING = {"friction_angle": ("static_friction", "limit_friction")}
 
 
 def unlearned(known: Mapping[str, Any], asked: Mapping[str, Any], told: Sequence[str] = ()) -> list[str]:
-    """What a scene changes that the training runs' scene fixes and neither path nor context can tell the network.
-
-    Args:
-        known: A training run's scene.
-        asked: The scene to be rolled out.
-        told: Keys that the network is told.
-
-    Returns:
-        `key value (trained with value)` for every such key of blade, wheel, material and gravity.
-    """
+    """What a scene asked for changes in the known one, a training run's, that neither the path nor the keys that the
+    network is told can tell it: `key value (trained with value)` for every such key of `_FIXED`."""
     covered = {name for key in told for name in (key.split(".")[-1], *_FOLLOWING.get(key, ()))}
     return [
         f"{key} {b} (trained with {a})"
         for key, (a, b) in differences(known, asked).items()
-        if key.split(".")[0] in _FIXED
-        and key.split(".")[-1] not in covered
-        and a is not None
-        and b is not None
+        if key.split(".")[0] in _FIXED and key.split(".")[-1] not in covered and None not in (a, b)
     ]
 
 
 def rollout_scene(
     simulator: Simulator, scene: Scene, path: str | Path, *, seed: int = 0, checkpoint: str | Path = ""
 ) -> RolloutTiming:
-    """Rolls a scene that was never simulated out, from the common start at rest, into a run file.
-
-    Warns where path or soil leave what the training runs covered.
-    """
+    """Rolls a scene out from the common start at rest into a run file; warns where path or soil leave what the training
+    runs covered."""
     with single_thread():
         rollout = simulator.rollout(scene.body_poses(), scene.body_points(), values=scene.to_dict())
     if rollout.excess is not None and (words := rollout.excess.words()):

@@ -10,8 +10,9 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +20,90 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mpm_warp.poses import fitted_poses, in_world_frame
+from mpm_warp.poses import in_world_frame
 from sgns.arrays import check_pose, check_poses, finite_array, first_pose, is_whole, real_array
 from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step
-from sgns.model.features import BodyTrack, ToolMotion, body_track, context_of, markers, step_frames
-from sgns.model.training_range import Excess, TrainingRange
-from sgns.states import Rollout, Rollouts, State
+from sgns.model.features import ToolMotion, context_of, markers
+from sgns.model.training_range import Excess
+from sgns.reduction.basis import Basis
 
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
 _SETTLING = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The bed and the tool at one frame.
+
+    Attributes:
+        frame: 0 at the reset.
+        latent: Modes [m], shape (r, 3).
+        force: By the soil on the tool over the last frame [N], world frame, shape (3,); zero at the reset.
+        torque: About the tool's centre of mass [N m], shape (3,).
+        pose: Tool's centre of mass [m] and quaternion x, y, z, w, shape (7,).
+    """
+
+    frame: int
+    latent: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    pose: np.ndarray
+    _basis: Basis = field(repr=False)
+    _excess: Callable[[], Excess | None] = field(repr=False)
+
+    @property
+    def outside(self) -> float:
+        """How far this frame is from all that the training runs covered [1]: the distance of the worst of the tool's
+        pose and motion, the soil's modes and their velocity, and the context from its training range, in widths of
+        that range. 0: inside every range; above 0.05 the answer is a guess; NaN: the tool is nowhere yet."""
+        found = self._excess()
+        return np.nan if found is None else float(found.amount[-1])
+
+    def soil(self) -> np.ndarray:
+        """Positions of all particles [m], shape (n, 3); decoded when asked for."""
+        return self._basis.inverse(self.latent).numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A whole tool path.
+
+    Attributes:
+        latent: Modes [m], shape (T, r, 3), float64.
+        force: By the soil on the tool [N], shape (T, 3).
+        torque: About its centre of mass [N m], shape (T, 3).
+        poses: Of the tool, shape (T, 7); predicted where the tool is free.
+        body_points: World frame [m], shape (T, M, 3).
+        wall_time_s: Time of all steps, force included, decoding not [s].
+    """
+
+    latent: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    poses: np.ndarray
+    body_points: np.ndarray
+    wall_time_s: float
+    _excess: Callable[[], Excess | None] = field(repr=False)
+
+    @cached_property
+    def excess(self) -> Excess | None:
+        """How far every frame is outside the training runs' range, see `State.outside`, and in what; None: a
+        predicted tool is nowhere."""
+        return self._excess()
+
+
+@dataclass(frozen=True, eq=False)
+class Rollouts:
+    """Many tool paths: as of `Rollout`, with B before every shape; `wall_time_s` is that of all of them."""
+
+    latent: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    poses: np.ndarray
+    wall_time_s: float
 
 
 class Simulator:
@@ -48,8 +121,17 @@ class Simulator:
             all training runs (see `sgns.model.features`).
 
     Attributes:
+        basis: Modes of the soil.
         start_positions: Of all particles at rest [m], shape (n, 3).
         body_points: Those of the training runs, in the body frame [m], shape (M, 3).
+        mean_force: Of the training runs [N], shape (3,): the simplest prediction of a force.
+        frame_rate: Steps per second of simulated time [Hz].
+        history: d, positions the network looks back on.
+        num_modes: r, modes of the soil.
+        context_keys: Numbers of the scene that the network is told.
+        predicts_body: Whether the tool's height is predicted, as that of a wheel, not prescribed.
+        arrangement_hash: Of the particle arrangement it knows.
+        card: Where it comes from: settings, runs, versions.
 
     Raises:
         UserError: The device cannot be used, or the modes are more than there are.
@@ -76,14 +158,23 @@ class Simulator:
             raise UserError(
                 f"device={device} cannot be used: {str(error).splitlines()[0]}; use device=cpu"
             ) from error
-        self._dynamics, self.basis = surrogate.dynamics, surrogate.basis
+        dynamics, self.basis = surrogate.dynamics, surrogate.basis
         if num_modes is not None:
-            self._dynamics, self.basis = self._dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
-        self._rate_independent = rate_independent and not self._dynamics.predicts_body
-        self._pace = surrogate.slowest_travel, math.ceil(_SETTLING * surrogate.frame_rate)
+            dynamics, self.basis = dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
+        self._dynamics = dynamics
+        self.history, self.num_modes = dynamics.history, dynamics.num_modes
+        self.context_keys, self.predicts_body = dynamics.context_keys, dynamics.predicts_body
+        self.frame_rate, self.card = surrogate.frame_rate, surrogate.card
+        self.arrangement_hash = self.basis.arrangement_hash
+        # How a tool moves at least that the soil follows the clock under (see `ToolMotion`); None: it always does.
+        self._pace: tuple[float, int] | None = None
+        if rate_independent and not dynamics.predicts_body:
+            self._pace = surrogate.slowest_travel, math.ceil(_SETTLING * surrogate.frame_rate)
         # Copies: what a tensor shares with an array is freed when the tensor is sent to another process.
-        self.start_positions = surrogate.start_positions.cpu().numpy().copy()
-        self.body_points = surrogate.body_points.cpu().numpy().copy()
+        self.start_positions, self.body_points, self.mean_force = (
+            tensor.cpu().numpy().copy()
+            for tensor in (surrogate.start_positions, surrogate.body_points, dynamics.force.mean)
+        )
         self._start_latent = self.basis.transform(surrogate.start_positions.cpu())
         self.reset()
 
@@ -102,58 +193,14 @@ class Simulator:
         num_modes: int | None = None,
         rate_independent: bool = True,
     ) -> Simulator:
-        """From a checkpoint written by `sgns train`; arguments as of the class.
-
-        Raises:
-            UserError: The file is missing, truncated or not such a checkpoint.
-        """
+        """From a checkpoint written by `sgns train`, or UserError; the other arguments as of the class."""
         return cls(load_surrogate(path), device, num_modes, rate_independent)
-
-    @property
-    def frame_rate(self) -> float:
-        """Steps per second of simulated time [Hz]."""
-        return self._surrogate.frame_rate
-
-    @property
-    def history(self) -> int:
-        """d, positions the network looks back on."""
-        return self._dynamics.history
-
-    @property
-    def num_modes(self) -> int:
-        """r, modes of the soil."""
-        return self._dynamics.num_modes
-
-    @property
-    def mean_force(self) -> np.ndarray:
-        """Of the training runs [N], shape (3,): the simplest prediction of a force."""
-        return self._dynamics.force.mean.cpu().numpy().copy()
-
-    @property
-    def context_keys(self) -> tuple[str, ...]:
-        """Numbers of the scene that the network is told."""
-        return self._dynamics.context_keys
-
-    @property
-    def predicts_body(self) -> bool:
-        """Whether the tool's height is predicted, as that of a wheel, not prescribed."""
-        return self._dynamics.predicts_body
-
-    @property
-    def arrangement_hash(self) -> str:
-        """Of the particle arrangement it knows."""
-        return self.basis.arrangement_hash
 
     @property
     def scene(self) -> dict[str, Any]:
         """Scene of one of the training runs, as plain data, a copy: its bed is the bed it knows. The mesh of a tool is
         not in it, but in the run (`Run.mesh`)."""
         return copy.deepcopy(self._surrogate.card["scene"])
-
-    @property
-    def card(self) -> dict[str, Any]:
-        """Where it comes from: settings, runs, versions."""
-        return self._surrogate.card
 
     @property
     def step_count(self) -> int:
@@ -166,7 +213,7 @@ class Simulator:
         history: tuple[np.ndarray, np.ndarray] | None = None,
         values: Mapping[str, Any] | None = None,
     ) -> State:
-        """Start again.
+        """Start again; returns the state at frame 0.
 
         Args:
             scene: An `mpm_warp.Scene`, whose first pose and body points are taken; or a pose, shape (7,), or
@@ -176,9 +223,6 @@ class Simulator:
                 the bed at rest at its common start.
             values: The scene as plain data, where `scene` is none; a network that was trained with different loads,
                 soils or the like reads them there. None: those of `simulator.scene`.
-
-        Returns:
-            The state at frame 0.
 
         Raises:
             UserError: The scene has another bed, or what is given is not of the shape and kind above; then the
@@ -194,17 +238,15 @@ class Simulator:
             points, pose, values = scene.body_points(), first_pose(scene.body_poses()), scene.to_dict()
         elif scene is not None:
             pose = first_pose(scene)
-        points, numbers = self._checked_points(points), self._numbers_of(values)
-        poses: list[np.ndarray] = []
+        points, context = self._checked_points(points), self._context_of(values)
         if history is None:
             latent = self._start_latent.expand(self.history, -1, -1)
-            if pose is not None:
-                poses = [pose] * self.history
+            poses = [] if pose is None else [pose] * self.history
         else:
             latent, poses = self._checked_beginning(history)
-        stepper = self._dynamics.stepper(len(points), self._told(numbers))
+        stepper = self._dynamics.stepper(len(points), self._told(context))
         # All is in order: nothing is changed before.
-        self._frame, self._points, self._numbers, self._stepper = 0, points, numbers, stepper
+        self._frame, self._points, self._context, self._stepper = 0, points, context, stepper
         self._poses, self._latent = poses, latent.clone()[None].to(self.device)
         self._load = np.zeros(3), np.zeros(3)
         self._motion: ToolMotion | None = None
@@ -214,13 +256,10 @@ class Simulator:
         return self._state()
 
     def step(self, tool_pose: np.ndarray) -> State:
-        """Move the tool to its next pose and the soil with it.
+        """Move the tool to its next pose and the soil with it; returns the state then.
 
         Args:
             tool_pose: Centre of mass [m] and unit quaternion x, y, z, w one frame from now, shape (7,).
-
-        Returns:
-            The state after the step.
 
         Raises:
             UserError: The pose is no finite array of shape (7,), its quaternion is not of unit length, or the answer is
@@ -230,10 +269,12 @@ class Simulator:
         poses, shown = self._poses, self._shown[-1]
         if not poses:
             poses, shown = [pose] * self.history, (pose, shown[1])
-        before = self._motion or ToolMotion.along(self._markers(poses), *self._pace)
-        motion = before.moved(self._markers([pose])[0])
+        motion = None
+        if self._pace is not None:
+            before = self._motion or ToolMotion.along(self._markers(poses), *self._pace)
+            motion = before.moved(self._markers([pose])[0])
         latent, load = self._latent, self._load
-        if motion.steps or not self._rate_independent:
+        if motion is None or motion.steps:
             pose, latent, load = self._step_soil(poses, pose)
             poses = [*poses[1:], pose]
         self._poses, self._motion, self._latent, self._load = poses, motion, latent, load
@@ -248,7 +289,7 @@ class Simulator:
         (1, d, r, 3), and force and torque. What fails changes nothing."""
         # One frame more than the network sees, because the first motion needs a frame before it.
         window = np.stack([*poses, pose])
-        body = self._track(window, in_world_frame(window, self._points)).frames(slice(1, None))
+        body = self._dynamics.track(window, in_world_frame(window, self._points)).frames(slice(1, None))
         memory = self._stepper.memory
         try:
             with torch.inference_mode():
@@ -257,7 +298,7 @@ class Simulator:
                 latent = torch.cat([self._latent[:, 1:], step.latent[:, None]], dim=1)
             if self.predicts_body:
                 there = body.position[0, -2] + step.displacement[0]
-                pose = self._predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
+                pose = self._dynamics.predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
         except BaseException:  # an interruption as well
             self._stepper.memory = memory
             raise
@@ -283,9 +324,6 @@ class Simulator:
             torque_history: Torque of the first d frames [N m], likewise.
             values: The scene as plain data, as for `reset`.
 
-        Returns:
-            The rollout.
-
         Raises:
             UserError: What is given is not of the shape and kind above, or the path is shorter than the history.
         """
@@ -306,13 +344,13 @@ class Simulator:
                 raise UserError(
                     f"the path has {len(poses)} frames; with a given history it needs at least {d}"
                 )
-        numbers = self._numbers_of(values)
-        context = self._told(numbers)
+        context = self._context_of(values)
+        told = self._told(context)
         began = time.perf_counter()
-        found = self._unrolled(poses[None], points, context, latent, given, loads)
+        found = self._dynamics.follow(poses[None], points, told, latent, self._pace, given, loads)
         wall_time = elapsed(began, time.perf_counter())
         states, force, torque, poses, world = (part[0] for part in found)
-        excess = self._excess(poses, points, states, numbers)
+        excess = partial(self._surrogate.training_range.excess, poses, points, states, context)
         return Rollout(states, force, torque, poses, world, wall_time, excess)
 
     def rollouts(
@@ -330,9 +368,6 @@ class Simulator:
             values: The scene as plain data, as for `reset`, for all.
             paths_at_once: Paths stepped together: bounds the memory beside the result.
 
-        Returns:
-            The rollouts.
-
         Raises:
             UserError: What is given is not of the shape and kind above.
         """
@@ -341,126 +376,49 @@ class Simulator:
             raise UserError(f"the array of paths has shape {poses.shape}; it needs shape (paths, frames, 7)")
         if not is_whole(paths_at_once) or paths_at_once < 1:
             raise UserError(f"paths_at_once is {paths_at_once!r}; it must be a whole number, at least 1")
-        points, context = self._checked_points(body_points), self._told(self._numbers_of(values))
+        points, told = self._checked_points(body_points), self._told(self._context_of(values))
         poses = np.stack([check_poses(path, f"path {i}") for i, path in enumerate(poses)])
         start = self._start_latent.expand(self.history, -1, -1)
         began = time.perf_counter()
         parts = [
-            self._unrolled(poses[first : first + paths_at_once], points, context, start)[:4]
+            self._dynamics.follow(poses[first : first + paths_at_once], points, told, start, self._pace)[:4]
             for first in range(0, len(poses), paths_at_once)
         ]
         latent, force, torque, poses = (np.concatenate(part) for part in zip(*parts, strict=True))
         return Rollouts(latent, force, torque, poses, elapsed(began, time.perf_counter()))
 
-    def _unrolled(
-        self,
-        poses: np.ndarray,
-        points: np.ndarray,
-        context: Tensor,
-        latent: Tensor,
-        given: int = 1,
-        loads: Sequence[np.ndarray | None] = (None, None),
-    ) -> tuple[np.ndarray, ...]:
-        """Latent positions, force, torque, poses and body points in the world frame along some paths.
-
-        Args:
-            poses: Shape (B, T, 7).
-            points: Shape (M, 3).
-            context: Shape (1, K).
-            latent: The first d positions, shape (d, r, 3); of a bed at rest d times the same.
-            given: Frames of the paths that these are: 1 for a bed at rest, or d.
-            loads: Force and torque of these frames.
-        """
-        count, padding = len(poses), self.history - given
-        worlds = np.stack([in_world_frame(path, points) for path in poses])
-        frames, newest = zip(
-            *(self._steps_of(*path, given) for path in zip(poses, worlds, strict=True)), strict=True
-        )
-        # Before its first frame a bed is at rest. Side by side all take as many steps: those that are done rest.
-        longest = max(map(len, frames))
-        shown = [np.pad(each, (padding, longest - len(each)), mode="edge") for each in frames]
-        tracks = [self._track(poses[i, index], worlds[i, index]) for i, index in enumerate(shown)]
-        track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
-        with torch.inference_mode():
-            path = self._dynamics.unroll(
-                latent.to(self.device).expand(count, -1, -1, -1), track, context.expand(count, -1)
-            )
-            parts = [part[:, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque)]
-            nodes = path.body.position[:, padding:].cpu().numpy()
-        for part, load in zip(parts[1:], loads, strict=True):
-            if load is not None:
-                part[:, :given] = load
-        parts = [part[np.arange(count)[:, None], np.stack(newest)] for part in parts]
-        if self.predicts_body:
-            found = [self._predicted_poses(*pair, points) for pair in zip(poses, nodes, strict=True)]
-            poses = np.stack(found)
-            worlds = (
-                nodes
-                if self._dynamics.settings.body_nodes == "points"
-                else np.stack([in_world_frame(path, points) for path in poses])
-            )
-        return *parts, poses, worlds
-
-    def _steps_of(self, poses: np.ndarray, world: np.ndarray, given: int) -> tuple[np.ndarray, np.ndarray]:
-        """Frames that the soil takes a step into, the given ones first, and for each frame of the path which of them
-        is the newest; poses (T, 7) and body points (T, M, 3)."""
-        if not self._rate_independent:
-            return np.arange(len(poses)), np.arange(len(poses))
-        frames = step_frames(markers(poses, world), given, *self._pace)
-        return frames, np.searchsorted(frames, np.arange(len(poses)), side="right") - 1
-
-    def _predicted_poses(self, poses: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Poses (T, 7) of body nodes (T, N, 3) [m]; the prescribed orientation of a pose node is kept."""
-        if self._dynamics.settings.body_nodes == "points":
-            return fitted_poses(points, nodes)
-        return np.concatenate([nodes[:, 0], poses[:, 3:]], axis=1)
-
     def _require_finite(self, step: Step) -> None:
         """Refuses a step that says nothing; the simulator stays where it was."""
-        found = {
-            "the soil's state": step.latent,
-            "the force": step.force,
-            "the torque": step.torque,
-            "the tool's motion": step.displacement,
-        }
-        bad = [name for name, part in found.items() if not bool(torch.isfinite(part).all())]
-        if bad:
-            raise UserError(
-                f"{bad[0]} is not finite at frame {self._frame + 1}, likely because the tool's pose of that frame lies "
-                f"far from everything the network knows; frame {self._frame} is kept: step to another pose, or reset"
-            )
+        names = "the soil's state", "the force", "the torque", "the tool's motion"
+        for name, part in zip(names, step, strict=True):
+            if not bool(torch.isfinite(part).all()):
+                raise UserError(
+                    f"{name} is not finite at frame {self._frame + 1}, likely because the tool's pose of that frame "
+                    "lies far from everything the network knows; "
+                    f"frame {self._frame} is kept: step to another pose, or reset"
+                )
 
     def _state(self) -> State:
         """The newest state."""
         # How far it is outside takes the frame before as well, for velocities.
         poses, latent = (np.stack(part) for part in zip(*self._shown, strict=True))
-        excess = self._excess(poses, self._points, latent, self._numbers)
+        # It holds nothing of the simulator that goes on changing.
+        excess = partial(self._surrogate.training_range.excess, poses, self._points, latent, self._context)
         force, torque = (part.copy() for part in self._load)
         return State(self._frame, latent[-1].copy(), force, torque, poses[-1].copy(), self.basis, excess)
 
-    def _excess(
-        self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, numbers: np.ndarray
-    ) -> partial[Excess | None]:
-        """Says when asked how far frames are outside the training range. It holds nothing of the simulator that goes
-        on changing."""
-        context = dict(zip(self.context_keys, numbers.tolist(), strict=True))
-        return partial(excess_of, self._surrogate.training_range, poses, points, latent, context)
-
-    def _numbers_of(self, values: Mapping[str, Any] | None) -> np.ndarray:
-        """Those of a scene that the network is told, shape (K,)."""
+    def _context_of(self, values: Mapping[str, Any] | None) -> dict[str, float]:
+        """The numbers of a scene that the network is told, by their keys."""
         if values is not None and not isinstance(values, Mapping):
             raise UserError(
                 f"values is a {type(values).__name__}; it must be a scene as plain data, such as simulator.scene"
             )
-        return context_of(self._surrogate.card["scene"] if values is None else values, self.context_keys)
+        numbers = context_of(self.card["scene"] if values is None else values, self.context_keys)
+        return dict(zip(self.context_keys, numbers.tolist(), strict=True))
 
-    def _told(self, numbers: np.ndarray) -> Tensor:
-        """Numbers (K,) as the dynamics take them, shape (1, K)."""
-        return torch.as_tensor(numbers)[None].to(self.device)
-
-    def _track(self, poses: np.ndarray, points: np.ndarray) -> BodyTrack:
-        track = body_track(poses, points, self._dynamics.settings.body_nodes)
-        return BodyTrack(*(part[None].to(self.device) for part in track))
+    def _told(self, context: Mapping[str, float]) -> Tensor:
+        """The numbers as the dynamics take them, shape (1, K)."""
+        return torch.tensor([list(context.values())], dtype=torch.float64, device=self.device)
 
     def _checked_history(self, latent: np.ndarray | Tensor) -> Tensor:
         if isinstance(latent, Tensor):
@@ -494,17 +452,3 @@ class Simulator:
     def _markers(self, poses: Sequence[np.ndarray]) -> np.ndarray:
         path = np.stack(poses)
         return markers(path, in_world_frame(path, self._points))
-
-
-def excess_of(
-    known: TrainingRange,
-    poses: np.ndarray,
-    points: np.ndarray,
-    latent: np.ndarray,
-    context: Mapping[str, float],
-) -> Excess | None:
-    """How far frames are outside a training range; body points (M, 3) in the body frame [m], else as
-    `TrainingRange.excess`. None where the tool is nowhere yet."""
-    if not np.isfinite(poses).all():
-        return None
-    return known.excess(poses, in_world_frame(poses, points), latent, context)

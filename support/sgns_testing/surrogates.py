@@ -20,7 +20,7 @@ from sgns_testing.runs import make_run
 
 @dataclass
 class FakeRollout:
-    """The fields of `sgns.states.Rollout`."""
+    """The fields of `sgns.simulator.Rollout`."""
 
     latent: np.ndarray
     force: np.ndarray

@@ -48,8 +48,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from sgns.data.dataset import Dataset
-    from sgns.simulator import Simulator
-    from sgns.states import Rollout
+    from sgns.simulator import Rollout, Simulator
 
 log = logging.getLogger(__name__)
 

@@ -18,8 +18,9 @@ from torch.nn.functional import pad
 from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
 from sgns.data.run import Run
+from sgns.model.dynamics import Standardiser
 from sgns.model.features import BodyTrack, body_track
-from sgns.model.network import EncodeProcessDecode, Standardiser
+from sgns.model.network import EncodeProcessDecode
 from sgns.settings import ModelSettings
 from sgns.train.windows import random_walk
 

@@ -48,8 +48,7 @@ from sgns.reduction.reduce import ReducedDataset, ReducedRun, fit_runs, reduce_d
 from sgns.rollout import finite_frames, single_thread
 from sgns.settings import ModelSettings, TrainingSettings, model_settings
 from sgns.simulate.scene import asked_effects, decided
-from sgns.simulator import Simulator
-from sgns.states import Rollout
+from sgns.simulator import Rollout, Simulator
 from sgns.train.command import train
 from sgns.train.lightning_module import SurrogateTraining, prepared
 

@@ -129,11 +129,7 @@ class Surrogate(nn.Module):
 
 
 def write_checkpoint(content: dict[str, Any], path: Path) -> None:
-    """Write a checkpoint; it appears complete or not at all.
-
-    Raises:
-        OSError: The disk does not take it.
-    """
+    """Write a checkpoint, complete or not at all; OSError if the disk does not take it."""
     buffer = io.BytesIO()  # torch says of a full disk only that some position is unexpected
     torch.save(content, buffer)
     with whole_file(path) as temporary:
@@ -186,21 +182,12 @@ def load_surrogate(path: str | Path) -> Surrogate:
     content = read_checkpoint(path)
     card = content["hyper_parameters"]
     try:
-        state = {
-            key.removeprefix(_PREFIX): value
-            for key, value in content["state_dict"].items()
-            if key.startswith(_PREFIX)
-        }
+        state = _below(_PREFIX, content["state_dict"])
         _require_own_values(state)
         if not isinstance(scene := card["scene"], dict) or not isinstance(scene.get("bed", {}), dict):
             raise ValueError("its card does not say what the scene is")
         require_mesh_was_read(scene)
-        held = {
-            name.removeprefix("dynamics."): value
-            for name, value in state.items()
-            if name.startswith("dynamics.")
-        }
-        dynamics = DYNAMICS[card["model"]["kind"]].from_card(card, held)
+        dynamics = DYNAMICS[card["model"]["kind"]].from_card(card, _below("dynamics.", state))
         tensors = {name: state[f"basis_{name}"] for name in ("mean", "modes", "eigenvalues")}
         basis = Basis.from_state(card["basis"] | tensors, where=str(path))
         surrogate = Surrogate(dynamics, basis, state["start_positions"], state["body_points"], card)
@@ -217,6 +204,11 @@ def load_surrogate(path: str | Path) -> Surrogate:
             f"{path} is a checkpoint whose parts do not fit together ({reason}); train again"
         ) from error
     return surrogate.eval().requires_grad_(False)
+
+
+def _below(prefix: str, state: dict[str, Any]) -> dict[str, Any]:
+    """The part of a state dict whose names begin with a prefix, without it."""
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
 def _require_plain_archive(path: Path) -> None:
@@ -296,13 +288,13 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """
     file = folder / SUMMARY
     summary = read_json(file, _WRONG, _ADVICE)
-    types = {"seconds": (int, float), "skill": (int, float), "steps": int}
     if not isinstance(summary, dict):
         raise UserError(f"{file} is {_WRONG} (no group of keys); {_ADVICE}")
-    for key, type_ in types.items():
-        value = summary.get(key, 1 if key == "steps" else None)  # polynomials are fitted without any
-        # The skill is no number where nothing moves; no other may be none.
-        good = isinstance(value, type_) and not isinstance(value, bool)
-        if not good or (key != "skill" and not (key == "steps") <= value < math.inf):
+    # Polynomials are fitted without any steps. The skill may be NaN: nothing moved.
+    values: dict[str, Any] = {"steps": 1} | summary
+    for key, type_, least in (("seconds", float, 0), ("skill", float, None), ("steps", int, 1)):
+        value: Any = values.get(key)
+        number = isinstance(value, (int, type_)) and not isinstance(value, bool)
+        if not number or (least is not None and not least <= value < math.inf):
             raise UserError(f"{file} is {_WRONG} ({key} is {value!r:.40}); {_ADVICE}")
     return summary

@@ -1,4 +1,5 @@
-"""The interface of all latent dynamics, the network's and the polynomials': steps, and paths of them.
+"""The interface of all latent dynamics, the network's and the polynomials': steps, and paths of them; and the
+normalisation of what they see and say.
 
 Shapes: B batch, d history positions, r modes, N body nodes, V = r + N nodes, K context numbers, T frames.
 """
@@ -7,16 +8,17 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mpm_warp.poses import fitted_poses, in_world_frame
 from sgns.arrays import is_whole
 from sgns.config import UserError
-from sgns.model.features import BodyTrack
-from sgns.model.network import Standardiser
+from sgns.model.features import BodyTrack, body_track, markers, step_frames
 from sgns.settings import ModelSettings, PolynomialSettings
 
 # No latent position goes further than this from its mean, in deviations; training runs stay within about half of it. It
@@ -24,75 +26,86 @@ from sgns.settings import ModelSettings, PolynomialSettings
 _REACH = 10.0
 
 
-class Prediction(NamedTuple):
-    """What the network says of one step, normalised.
+class Standardiser(nn.Module):
+    """Shift and scale a quantity to zero mean and unit deviation, in float64; kept with the model.
 
-    Attributes:
-        change: Of every node's position: its second difference, or with `model.predicts=velocity` its first [1], shape
-            (B, V, 3). Modes first; of a body node only what is free counts.
-        force: Contribution of every node [1], shape (B, V, 3).
-        torque: Contribution of every node [1], shape (B, V, 3).
+    Latent positions are large and their differences tiny, so the subtraction happens before anything becomes
+    float32.
+
+    Args:
+        mean: Mean of the quantity [its unit], any shape that broadcasts against the quantity.
+        scale: Deviation of the quantity [its unit], same shape, positive.
     """
 
-    change: Tensor
-    force: Tensor
-    torque: Tensor
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, mean: Tensor, scale: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("mean", mean.double().clone())
+        self.register_buffer("scale", scale.double().clone())
+
+    @classmethod
+    def fit(cls, samples: Tensor, floor: float = 0.0, centred: bool = True) -> Standardiser:
+        """Statistics over the first dimension; a quantity that never varies gets scale one.
+
+        Args:
+            samples: Training values [unit], shape (samples, ...).
+            floor: Smallest scale as a share of the largest one; a direction in which (almost) nothing happens, such as
+                the lateral one by symmetry, keeps a small normalised value instead of being blown up.
+            centred: Whether the mean is subtracted; without it zero stays zero and the scale is the root mean square.
+        """
+        samples = samples.double()
+        if samples[0].numel() == 0:
+            return cls.empty(*samples.shape[1:])
+        mean = samples.mean(0) if centred else torch.zeros_like(samples[0])
+        scale = (samples - mean).square().mean(0).sqrt()
+        largest = float(scale.max())
+        # Round-off of a constant is not variation: below 1e-12 of the values themselves the scale is one.
+        if largest <= 1e-12 * float(samples.abs().max()) or largest == 0.0:
+            return cls(mean, torch.ones_like(scale))
+        return cls(mean, scale.clamp_min(max(floor, 1e-9) * largest))
+
+    def __getitem__(self, index: slice | Tensor) -> Standardiser:
+        """Of a part of the quantity."""
+        return Standardiser(self.mean[index], self.scale[index])
+
+    @classmethod
+    def cat(cls, parts: Iterable[Standardiser]) -> Standardiser:
+        """Of several quantities side by side."""
+        return cls(*(torch.cat(values) for values in zip(*((p.mean, p.scale) for p in parts), strict=True)))
+
+    @classmethod
+    def empty(cls, *shape: int) -> Standardiser:
+        """A neutral one of the given shape, to be filled from a checkpoint."""
+        return cls(torch.zeros(shape, dtype=torch.float64), torch.ones(shape, dtype=torch.float64))
+
+    def normalise(self, value: Tensor) -> Tensor:
+        """Value in deviations from the mean [1], float32, same shape."""
+        return ((value - self.mean) / self.scale).float()
+
+    def denormalise(self, value: Tensor) -> Tensor:
+        """Back to the quantity's unit, float64, same shape."""
+        return value.double() * self.scale + self.mean
 
 
 class Step(NamedTuple):
-    """One step in physical units, float64.
+    """One step in physical units, float64. The displacement is the prescribed one, with what is predicted in its place
+    along the free axes."""
 
-    Attributes:
-        latent: Next latent positions [m], shape (B, r, 3).
-        force: On the body [N], shape (B, 3).
-        torque: On the body [N m], shape (B, 3).
-        displacement: Of the body nodes [m], shape (B, N, 3): the prescribed one, with what the network predicts in
-            its place along the free axes.
-    """
-
-    latent: Tensor
-    force: Tensor
-    torque: Tensor
-    displacement: Tensor
+    latent: Tensor  # next positions [m], shape (B, r, 3)
+    force: Tensor  # on the body [N], shape (B, 3)
+    torque: Tensor  # on the body [N m], shape (B, 3)
+    displacement: Tensor  # of the body nodes [m], shape (B, N, 3)
 
 
 class Path(NamedTuple):
-    """A whole path, float64.
+    """A whole path, float64. The first d frames hold the given positions and no force or torque."""
 
-    Attributes:
-        latent: Latent positions [m], shape (B, T, r, 3); the first d frames are the given ones.
-        force: [N], shape (B, T, 3), zero in the first d frames.
-        torque: [N m], shape (B, T, 3), zero in the first d frames.
-        body: The body at all frames, predicted where it is free.
-    """
-
-    latent: Tensor
-    force: Tensor
-    torque: Tensor
-    body: BodyTrack
-
-
-class Stepper:
-    """Takes the steps of one path without gradients.
-
-    Args:
-        dynamics: Whose.
-        context: Numbers of the run, shape (1, K); not needed when K is 0.
-
-    Attributes:
-        memory: All that a step depends on of those before it, besides what it is given; put back, it undoes them.
-    """
-
-    memory: Any = None
-
-    def __init__(self, dynamics: Dynamics, context: Tensor | None) -> None:
-        self.dynamics = dynamics
-        self.context = context
-
-    def advance(self, latent: Tensor, body: BodyTrack) -> Step:
-        """One step; latent (1, d, r, 3) and body (1, d, N, ...) as for `Dynamics.advance`."""
-        with torch.inference_mode():
-            return self.dynamics.advance(latent, body, self.context)
+    latent: Tensor  # positions [m], shape (B, T, r, 3)
+    force: Tensor  # [N], shape (B, T, 3)
+    torque: Tensor  # [N m], shape (B, T, 3)
+    body: BodyTrack  # at all frames, predicted where it is free
 
 
 class Dynamics(nn.Module):
@@ -110,7 +123,6 @@ class Dynamics(nn.Module):
         highest: Likewise.
     """
 
-    settings: ModelSettings | PolynomialSettings
     force: Standardiser
     lowest: Tensor
     highest: Tensor
@@ -187,12 +199,8 @@ class Dynamics(nn.Module):
         """
 
     def stepper(self, body_points: int, context: Tensor | None = None) -> Stepper:
-        """Takes the steps of one path without gradients, with the weights as they are now.
-
-        Args:
-            body_points: M.
-            context: Numbers of the run, shape (1, K); not needed when K is 0.
-        """
+        """Takes the steps of one path under a body of M points without gradients, with the weights as they are now;
+        context (1, K)."""
         return Stepper(self, context)
 
     def unroll(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Path:
@@ -206,6 +214,67 @@ class Dynamics(nn.Module):
         return unrolled(
             lambda history, window: self.advance(history, window, context), latent, body, self.predicts_body
         )
+
+    def follow(
+        self,
+        poses: np.ndarray,
+        points: np.ndarray,
+        context: Tensor,
+        latent: Tensor,
+        pace: tuple[float, int] | None,
+        given: int = 1,
+        loads: Sequence[np.ndarray | None] = (None, None),
+    ) -> tuple[np.ndarray, ...]:
+        """Latent positions, force, torque, poses and body points in the world frame along some paths of a tool.
+
+        Args:
+            poses: Shape (B, T, 7).
+            points: In the body frame [m], shape (M, 3).
+            context: Shape (1, K).
+            latent: The first d positions, shape (d, r, 3); of a bed at rest d times the same.
+            pace: `least` and `settling` of `ToolMotion`; None: the soil takes a step into every frame.
+            given: Frames of the paths that the first positions are of: 1 for a bed at rest, or d.
+            loads: Force and torque of these frames.
+        """
+        count, padding, every = len(poses), self.history - given, np.arange(poses.shape[1])
+        worlds = np.stack([in_world_frame(path, points) for path in poses])
+        # Frames that the soil takes a step into, and for each frame of the path which of them is the newest.
+        frames = [every] * count
+        if pace is not None:
+            paths = (markers(*path) for path in zip(poses, worlds, strict=True))
+            frames = [step_frames(path, given, *pace) for path in paths]
+        newest = np.stack([np.searchsorted(each, every, side="right") - 1 for each in frames])
+        # Before its first frame a bed is at rest. Side by side all take as many steps: those that are done rest.
+        longest = max(map(len, frames))
+        shown = [np.pad(each, (padding, longest - len(each)), mode="edge") for each in frames]
+        tracks = [self.track(poses[i, index], worlds[i, index]) for i, index in enumerate(shown)]
+        track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
+        with torch.inference_mode():
+            start = latent.to(self.lowest.device).expand(count, -1, -1, -1)
+            path = self.unroll(start, track, context.expand(count, -1))
+            parts = [part[:, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque)]
+            nodes = path.body.position[:, padding:].cpu().numpy()
+        for part, load in zip(parts[1:], loads, strict=True):
+            if load is not None:
+                part[:, :given] = load
+        parts = [part[np.arange(count)[:, None], newest] for part in parts]
+        if self.predicts_body:
+            found = [self.predicted_poses(*pair, points) for pair in zip(poses, nodes, strict=True)]
+            poses, worlds = np.stack(found), nodes
+            if self.settings.body_nodes == "pose":
+                worlds = np.stack([in_world_frame(path, points) for path in poses])
+        return *parts, poses, worlds
+
+    def track(self, poses: np.ndarray, points: np.ndarray) -> BodyTrack:
+        """Of poses (T, 7) and body points in the world frame (T, M, 3), with B = 1."""
+        track, device = body_track(poses, points, self.settings.body_nodes), self.lowest.device
+        return BodyTrack(*(part[None].to(device) for part in track))
+
+    def predicted_poses(self, poses: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Poses (T, 7) of body nodes (T, N, 3) [m]; the prescribed orientation of a pose node is kept."""
+        if self.settings.body_nodes == "points":
+            return fitted_poses(points, nodes)
+        return np.concatenate([nodes[:, 0], poses[:, 3:]], axis=1)
 
     def check_modes(self, num_modes: int) -> None:
         """For `with_modes`."""
@@ -224,14 +293,30 @@ class Dynamics(nn.Module):
         return context
 
 
+class Stepper:
+    """Takes the steps of one path without gradients; made by `Dynamics.stepper`.
+
+    Attributes:
+        memory: All that a step depends on of those before it, besides what it is given; put back, it undoes them.
+    """
+
+    memory: Any = None
+
+    def __init__(self, dynamics: Dynamics, context: Tensor | None) -> None:
+        self.dynamics = dynamics
+        self.context = context
+
+    def advance(self, latent: Tensor, body: BodyTrack) -> Step:
+        """One step; latent (1, d, r, 3) and body (1, d, N, ...) as for `Dynamics.advance`."""
+        with torch.inference_mode():
+            return self.dynamics.advance(latent, body, self.context)
+
+
 def unrolled(
     advance: Callable[[Tensor, BodyTrack], Step], latent: Tensor, body: BodyTrack, predicts_body: bool
 ) -> Path:
-    """Whole paths by steps that see what the steps before said.
-
-    `advance` takes a step from d latent positions (B, d, r, 3) and the body (B, d, N, ...), which goes where the steps
-    say if it is predicted; the others as for `Dynamics.unroll`.
-    """
+    """Whole paths by steps that see what the steps before said; a predicted body goes where they say. Arguments as for
+    `Dynamics.unroll`."""
     d, frames = latent.shape[1], body.position.shape[1]
     states = latent.new_empty((latent.shape[0], frames, *latent.shape[2:]), dtype=torch.float64)
     states[:, :d] = latent

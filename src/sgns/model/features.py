@@ -22,20 +22,6 @@ if TYPE_CHECKING:
 # Shapes: B batch, V nodes, E edges, d history positions, r modes.
 
 
-class Graph(NamedTuple):
-    """A batch of graphs that share one set of edges.
-
-    Attributes:
-        nodes: Node features [1], shape (B, V, node features).
-        edges: Edge features [1], shape (B, E, 3 or 4).
-        edge_index: Sender and receiver of every edge, shape (2, E).
-    """
-
-    nodes: Tensor
-    edges: Tensor
-    edge_index: Tensor
-
-
 def edge_indices(
     modes: int,
     body_nodes: int,
@@ -62,11 +48,11 @@ def build_graph(
     position: Tensor,
     edge_index: Tensor,
     edge_length: bool = True,
-) -> Graph:
-    """Put features on the nodes and edges.
+) -> tuple[Tensor, Tensor]:
+    """Features of the nodes [1], shape (B, V, any), and of the edges [1], shape (B, E, 3 or 4).
 
     The narrower kind of node is padded with zeros so that one encoder serves both. An edge holds the sender's position
-    relative to the receiver's, and its length.
+    relative to the receiver's, and its length if so set.
 
     Args:
         mode_features: [1], shape (B, r, any).
@@ -75,19 +61,14 @@ def build_graph(
         edge_index: Senders and receivers, shape (2, E).
         edge_length: Whether edges hold their length.
     """
-    width = max(mode_features.shape[-1], body_features.shape[-1])
-    nodes = torch.cat(
-        [
-            torch.nn.functional.pad(part, (0, width - part.shape[-1]))
-            for part in (mode_features, body_features)
-        ],
-        dim=-2,
-    )
+    features = mode_features, body_features
+    width = max(part.shape[-1] for part in features)
+    padded = [torch.nn.functional.pad(part, (0, width - part.shape[-1])) for part in features]
     sender, receiver = edge_index
     edges = position.index_select(-2, sender) - position.index_select(-2, receiver)
     if edge_length:
         edges = torch.cat([edges, torch.linalg.vector_norm(edges, dim=-1, keepdim=True)], dim=-1)
-    return Graph(nodes, edges, edge_index)
+    return torch.cat(padded, dim=-2), edges
 
 
 # --- What the network is told about the body: where it is and how it moves, frame by frame --------------
@@ -147,9 +128,7 @@ def body_track(poses: np.ndarray, points: np.ndarray | None, body_nodes: str) ->
                 "model.body_nodes=points needs body points and the runs have none; use model.body_nodes=pose"
             )
         position = torch.as_tensor(np.array(points, dtype=np.float64))
-        motion = torch.zeros_like(position)
-        motion[1:] = position[1:] - position[:-1]
-        return BodyTrack(position, position[..., :0], motion)
+        return BodyTrack(position, position[..., :0], position.diff(dim=0, prepend=position[:1]))
     poses = np.asarray(poses, dtype=np.float64)
     columns = rotation_matrices(poses[:, 3:])[:, :, :2]
     motion = np.zeros((len(poses), 6))
@@ -198,28 +177,28 @@ def nearest_rigid(reference: Tensor, points: Tensor) -> Tensor:
 def varying_context(runs: Sequence[ReducedRun], candidates: Sequence[str]) -> list[str]:
     """Those of the candidates, keys of the scene such as `load` or `material.friction_angle`, whose numbers differ
     between runs: a constant tells nothing."""
-    values = {key: [_value(run.scene, key) for run in runs] for key in candidates}
-    numbers = {
-        key: found for key, found in values.items() if all(v is not None and math.isfinite(v) for v in found)
-    }
-    return [key for key, found in numbers.items() if len(set(found)) > 1]
+    values = {key: {_value(run.scene, key) for run in runs} for key in candidates}
+    return [
+        key
+        for key, found in values.items()
+        if len(found) > 1 and all(value is not None and math.isfinite(value) for value in found)
+    ]
 
 
 def context_of(scene: Mapping[str, Any], keys: Sequence[str]) -> np.ndarray:
-    """The numbers of a scene by their keys, in the units of the scene, shape (K,).
-
-    Raises:
-        UserError: The scene lacks one, or it is not finite.
-    """
-    values = [_value(scene, key) for key in keys]
-    if None in values:
-        raise UserError(
-            f"the scene has no number {keys[values.index(None)]}, which this network needs; "
-            f"it was trained with different values of {', '.join(keys)}"
-        )
-    for key, value in zip(keys, values, strict=True):
+    """The numbers of a scene by their keys, in the units of the scene, shape (K,); UserError if one is missing or not
+    finite."""
+    values = []
+    for key in keys:
+        value = _value(scene, key)
+        if value is None:
+            raise UserError(
+                f"the scene has no number {key}, which this network needs; "
+                f"it was trained with different values of {', '.join(keys)}"
+            )
         if not math.isfinite(value):
             raise UserError(f"the scene's {key} is {value}; it must be finite")
+        values.append(value)
     return np.array(values, dtype=np.float64)
 
 
@@ -246,23 +225,14 @@ _STOPPING, _ROUNDING = 0.01, 0.01
 
 
 class ToolMotion(NamedTuple):
-    """How a tool has moved, as far as the next step of the soil depends on it.
+    """How a tool has moved, as far as the next step of the soil depends on it."""
 
-    Attributes:
-        least: How far it moves in a frame at least that is not called slow [m].
-        settling: Frames that the soil follows the clock after that: what was thrown up comes down.
-        here: Where its markers are (see `markers`) [m], shape (M + 1, 3).
-        stepped: Where they were when the soil took its last step.
-        slow: Frames since it was last not slow.
-        steps: Whether the soil takes a step into this frame.
-    """
-
-    least: float
-    settling: int
-    here: np.ndarray
-    stepped: np.ndarray
-    slow: int
-    steps: bool
+    least: float  # how far it moves in a frame at least that is not called slow [m]
+    settling: int  # frames that the soil follows the clock after that: what was thrown up comes down
+    here: np.ndarray  # where its markers are (see `markers`) [m], shape (M + 1, 3)
+    stepped: np.ndarray  # where they were when the soil took its last step
+    slow: int  # frames since it was last not slow
+    steps: bool  # whether the soil takes a step into this frame
 
     @classmethod
     def along(cls, given: np.ndarray, least: float, settling: int) -> ToolMotion:

@@ -1,32 +1,207 @@
-"""Encode, pass messages, decode: the graph network of the paper (section 3.3), batched over graphs of one
-topology.
+"""Encode, pass messages, decode: the graph network of the paper (section 3.3), batched over graphs of one topology.
 
-Every part is written twice. `forward` of `MLP` and `InteractionNetwork` and `EncodeProcessDecode.plain` are the
-definition. What `EncodeProcessDecode.forward` runs is the same function by exact algebra:
+`MLP.forward`, `InteractionNetwork.forward` and `EncodeProcessDecode.plain` are the definition. What
+`EncodeProcessDecode.forward` runs is the same function by exact algebra:
 
 - the first layer of the edge update is linear, so its receiver and sender blocks are applied to the V nodes and
   not to the E edges, and its edge block can be multiplied into the last layer of whatever made the edges;
 - the last layer of the edge update is linear, so it is applied to the V sums and not to the E edges;
-- a complete graph needs no index: senders and receivers are broadcast (`adjacency`);
+- a complete graph needs no index: senders and receivers are broadcast (`CompleteAdjacency`);
 - without gradients batches go through in blocks, so that memory is bounded and stays in the cache.
 
 A layer normalisation stands in the way of the second, and of the multiplication in the first; the rest holds.
+
+Shapes: B batch, V nodes, E edges, H hidden width.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch_geometric.nn import MessagePassing
-
-from sgns.model.algebra import Adjacency, adjacency_of, affine
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "silu": nn.SiLU, "gelu": nn.GELU, "tanh": nn.Tanh}
 # Edges that go through the network at once on a CPU when nothing is kept for gradients.
 EDGES_AT_ONCE = 4096
+
+
+# --- A linear layer, with or without ReLU, through the faster of torch's two matrix libraries on the CPU --
+# torch multiplies float32 matrices with the BLAS it was built with. oneDNN, which it also holds, applies bias
+# and ReLU on the way. torch gives it no public function: `nn.functional.linear` and ReLU take 1.04 times as
+# long for 4096 rows and 1.24 times for 9000 on one processor, twice as long on another
+# (experiments/rollout_speed); `torch.mkldnn` tensors, copied there and back, take 4 times as long.
+
+# Below this many multiplications a product is over before oneDNN has begun.
+_WORTH_IT = 2**22
+# Rows whose products with each other are summed at once: more fall out of the cache, and take many times as long.
+_ROWS_AT_ONCE = 2048
+_AVAILABLE = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+
+
+def affine(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
+    """x Wᵀ + b, then ReLU if asked for; shapes and values of `torch.nn.functional.linear`, to rounding."""
+    if prefers_onednn(x, weight):
+        return (_Affine.apply if torch.is_grad_enabled() else product)(x, weight, bias, relu)
+    y = nn.functional.linear(x, weight, bias)
+    return y.relu_() if relu else y
+
+
+def prefers_onednn(x: Tensor, weight: Tensor) -> bool:
+    """Whether oneDNN is there for this product and worth its start."""
+    return (
+        _AVAILABLE
+        and x.dtype == torch.float32
+        and x.device.type == "cpu"
+        and x.numel() * weight.shape[0] >= _WORTH_IT
+    )
+
+
+def product(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
+    """oneDNN's x Wᵀ + b with its ReLU; float32 on the CPU only."""
+    # Of a matrix with gaps between its rows, such as a part of another one, oneDNN takes a thousand times as long.
+    if not (weight.is_contiguous() or weight.t().is_contiguous()):
+        weight = weight.contiguous()
+    return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu" if relu else "none", [], "")
+
+
+class _Affine(torch.autograd.Function):
+    """oneDNN's product with its gradient, which torch does not define."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, relu: bool) -> Tensor:
+        # `data` is no view to autograd, which would forbid whoever comes next to work in place.
+        y = product(x, weight, bias, relu).data
+        ctx.relu = relu
+        ctx.save_for_backward(x, weight, *([y] if relu else []))
+        return y
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, Tensor, None]:
+        x, weight, *y = ctx.saved_tensors
+        if ctx.relu:  # whatever torch has in public for this takes four times as long
+            gradient = torch.ops.aten.threshold_backward(gradient, y[0], 0)
+        rows, inputs = gradient.reshape(-1, gradient.shape[-1]), x.reshape(-1, x.shape[-1])
+        to_x = product(gradient, weight.t().contiguous()) if ctx.needs_input_grad[0] else None
+        to_weight = torch.zeros_like(weight)
+        for row, value in zip(rows.split(_ROWS_AT_ONCE), inputs.split(_ROWS_AT_ONCE), strict=True):
+            to_weight += product(row.t(), value.t())
+        return to_x, to_weight, rows.sum(0), None
+
+
+# --- Sums along the edges of a graph: nodes to their edges, edges to their receivers --------------------
+
+
+class CompleteAdjacency:
+    """Every ordered pair of V nodes, receivers ascending: no index is needed.
+
+    Attributes:
+        degree: Edges that each node receives: V, or V - 1 without self loops.
+    """
+
+    def __init__(self, node_count: int, self_loops: bool) -> None:
+        self.node_count = node_count
+        self.self_loops = self_loops
+        self.degree = node_count - (not self_loops)
+
+    def spread(self, edges: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
+        """Each edge's own value (B, E, H), which is overwritten, plus that of its receiver and that of its sender
+        (B, V, H)."""
+        return _Spread.apply(edges, receiver, sender, self)
+
+    def gather(self, edges: Tensor) -> Tensor:
+        """Sum of the edges at their receivers, (B, E, H) to (B, V, H)."""
+        return self.by_receiver(edges).sum(-2)
+
+    def by_receiver(self, edges: Tensor) -> Tensor:
+        """A view (B, V, degree, H) of (B, E, H)."""
+        return edges.unflatten(1, (self.node_count, self.degree))
+
+    def by_turn(self, edges: Tensor) -> Tensor:
+        """A view (B, degree, V, H) of (B, E, H) in whose block k the senders are k + 1, k + 2, ... modulo V
+        (k = 0 and senders 0, 1, ... with self loops).
+
+        Without its diagonal a V × V matrix read row by row is V - 1 blocks of V values: each block begins one
+        column further.
+        """
+        return edges.unflatten(1, (self.degree, self.node_count))
+
+    def senders(self, sender: Tensor) -> Tensor:
+        """What `by_turn` finds at the edges' senders: a view of the nodes written twice, (B, V - 1, V, H)."""
+        if self.self_loops:
+            return sender[:, None]
+        return torch.cat([sender, sender], 1)[:, 1:-1].unfold(1, self.node_count, 1).transpose(-1, -2)
+
+    def sum_at_senders(self, edges: Tensor) -> Tensor:
+        """Sum of the edges at their senders, (B, E, H) to (B, V, H)."""
+        if self.self_loops:
+            return self.by_receiver(edges).sum(1)
+        batch, v, width = len(edges), self.node_count, edges.shape[-1]
+        square = edges.new_zeros(batch, v * v, width)
+        square[:, 1:].unflatten(1, (v - 1, v + 1))[:, :, :v] = self.by_turn(edges)
+        return square.unflatten(1, (v, v)).sum(1)
+
+
+class _Spread(torch.autograd.Function):
+    """`CompleteAdjacency.spread`: written by hand because it overwrites the edges instead of copying them twice."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, edges: Tensor, receiver: Tensor, sender: Tensor, adjacency: CompleteAdjacency
+    ) -> Tensor:
+        ctx.adjacency = adjacency
+        ctx.mark_dirty(edges)
+        adjacency.by_receiver(edges).add_(receiver[:, :, None])
+        adjacency.by_turn(edges).add_(adjacency.senders(sender))
+        return edges
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
+        gradient = gradient.contiguous()
+        return gradient, ctx.adjacency.gather(gradient), ctx.adjacency.sum_at_senders(gradient), None
+
+
+class IndexedAdjacency:
+    """Any set of edges: senders and receivers (2, E) between V nodes; methods as of `CompleteAdjacency`."""
+
+    def __init__(self, edge_index: Tensor, node_count: int) -> None:
+        self.sender, self.receiver = edge_index
+        self.node_count = node_count
+        self.degree = torch.bincount(self.receiver, minlength=node_count)[:, None]
+
+    def spread(self, edges: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
+        """As `CompleteAdjacency.spread`."""
+        return edges + receiver.index_select(1, self.receiver) + sender.index_select(1, self.sender)
+
+    def gather(self, edges: Tensor) -> Tensor:
+        """As `CompleteAdjacency.gather`."""
+        empty = edges.new_zeros(len(edges), self.node_count, edges.shape[-1])
+        return empty.index_add(1, self.receiver, edges)
+
+
+Adjacency = CompleteAdjacency | IndexedAdjacency
+
+
+def adjacency_of(edge_index: Tensor, node_count: int) -> Adjacency:
+    """The quickest form of these edges; they are those of a complete graph only in its order."""
+    for self_loops in (False, True):
+        # Their number first: a graph of all particles has few edges, and all pairs of its nodes take tens of GB.
+        if node_count < 2 or edge_index.shape[1] != node_count * (node_count - (not self_loops)):
+            continue
+        index = torch.arange(node_count, device=edge_index.device)
+        receiver, sender = torch.meshgrid(index, index, indexing="ij")
+        keep = (receiver != sender) | self_loops
+        if torch.equal(edge_index, torch.stack([sender[keep], receiver[keep]])):
+            return CompleteAdjacency(node_count, self_loops)
+    return IndexedAdjacency(edge_index, node_count)
+
+
+# --- The network ------------------------------------------------------------------------------------------
 
 
 def keep_freed_memory() -> None:
@@ -81,24 +256,22 @@ class MLP(nn.Module):
         activation = self.rest[0]
         return x.relu_() if isinstance(activation, nn.ReLU) else activation(x)
 
-    def layer(self, x: Tensor, linear: nn.Linear) -> Tensor:
-        """A linear layer and the activation."""
+    def layers(self, x: Tensor, linears: Sequence[nn.Linear]) -> Tensor:
+        """Some of the linear layers, each with its activation."""
         relu = isinstance(self.rest[0], nn.ReLU)
-        y = affine(x, linear.weight, linear.bias, relu)
-        return y if relu else self.rest[0](y)
+        for linear in linears:
+            x = affine(x, linear.weight, linear.bias, relu)
+            if not relu:
+                x = self.rest[0](x)
+        return x
 
     def hidden(self, x: Tensor) -> Tensor:
         """The last hidden layer, (..., inputs) to (..., hidden)."""
-        for linear in self.linears[:-1]:
-            x = self.layer(x, linear)
-        return x
+        return self.layers(x, self.linears[:-1])
 
     def hidden_after_first(self, x: Tensor) -> Tensor:
         """The last hidden layer from what the first linear layer gives, which is overwritten."""
-        x = self.activate(x)
-        for linear in self.linears[1:-1]:
-            x = self.layer(x, linear)
-        return x
+        return self.layers(self.activate(x), self.linears[1:-1])
 
     def ending(self, hidden: Tensor) -> Tensor | Unapplied:
         """The output from the last hidden layer; where the last step is linear it is left for later."""
@@ -108,13 +281,8 @@ class MLP(nn.Module):
 
 
 class Unapplied(NamedTuple):
-    """A linear layer together with its input: it may be multiplied with the next, or moved behind a sum.
-
-    Attributes:
-        hidden: Input, shape (..., hidden).
-        weight: Shape (outputs, hidden).
-        bias: Shape (outputs,).
-    """
+    """A linear layer, weight (outputs, hidden) and bias (outputs,), together with its input (..., hidden): it may be
+    multiplied with the next, or moved behind a sum."""
 
     hidden: Tensor
     weight: Tensor
@@ -144,19 +312,8 @@ class InteractionNetwork(MessagePassing):
     .. math::
         e'_{ij} = \phi_e([e_{ij}, v_i, v_j]), \qquad v'_i = \phi_v([v_i, \sum_j e'_{ij}])
 
-    for the edge from sender j to receiver i.
-
-    Args:
-        width: Of node and edge features.
-        hidden: Width of the hidden layers of each MLP.
-        hidden_layers: Their number.
-        layer_norm: Whether updates are layer-normalised.
-        residual: Whether updates are added to what they update.
-        activation: Between layers.
-
-    Shapes:
-        nodes (..., V, width), edges (..., E, width), edge_index (2, E) with senders in row 0.
-        Returns nodes and edges of the same shapes.
+    for the edge from sender j to receiver i; node and edge features are `width` wide. With `residual` updates are added
+    to what they update.
     """
 
     def __init__(
@@ -175,14 +332,12 @@ class InteractionNetwork(MessagePassing):
         self.node_mlp = MLP(2 * width, hidden, hidden_layers, width, layer_norm, activation)
 
     def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
-        """Update edges, sum them at their receivers, update nodes."""
+        """New nodes (..., V, width) and edges (..., E, width) from old ones; senders are row 0 of edge_index (2, E)."""
         updated = self.edge_updater(edge_index, nodes=nodes, edges=edges)
         count = nodes.shape[-2]
         summed = self.propagate(edge_index, edges=updated, size=(count, count))
         moved = self.node_mlp(torch.cat([nodes, summed], dim=-1))
-        if self.residual:
-            return nodes + moved, edges + updated
-        return moved, updated
+        return (nodes + moved, edges + updated) if self.residual else (moved, updated)
 
     def edge_update(self, nodes_i: Tensor, nodes_j: Tensor, edges: Tensor) -> Tensor:
         """The edge MLP on edge, receiver and sender; shape (..., E, width)."""
@@ -198,11 +353,10 @@ class InteractionNetwork(MessagePassing):
         """The same by the algebra of this module's head; nodes (B, V, width), edges (B, E, width)."""
         first = self.edge_mlp.first
         own_weight, receiver_weight, sender_weight = first.weight.split(self.width, dim=1)
-        own = (
-            edges.into(own_weight, first.bias)
-            if isinstance(edges, Unapplied)
-            else affine(edges, own_weight, first.bias)
-        )
+        if isinstance(edges, Unapplied):
+            own = edges.into(own_weight, first.bias)
+        else:
+            own = affine(edges, own_weight, first.bias)
         spread = adjacency.spread(
             own, nn.functional.linear(nodes, receiver_weight), nn.functional.linear(nodes, sender_weight)
         )
@@ -218,9 +372,6 @@ class EncodeProcessDecode(nn.Module):
     """Five MLPs: encoders of nodes and edges, edge and node updates of every message-passing step, decoder of nodes.
 
     Every layer and what is encoded is `hidden` wide; the layer normalisation comes after every MLP but the decoder.
-
-    Shapes:
-        nodes (..., V, node_inputs), edges (..., E, edge_inputs), edge_index (2, E). Returns (..., V, outputs).
     """
 
     def __init__(
@@ -239,16 +390,18 @@ class EncodeProcessDecode(nn.Module):
         keep_freed_memory()
         self.encode_nodes = MLP(node_inputs, hidden, hidden_layers, hidden, layer_norm, activation)
         self.encode_edges = MLP(edge_inputs, hidden, hidden_layers, hidden, layer_norm, activation)
-        self.process = nn.ModuleList(
+        process = nn.ModuleList(
             InteractionNetwork(hidden, hidden, hidden_layers, layer_norm, residual, activation)
             for _ in range(steps)
         )
+        self.process = cast("Sequence[InteractionNetwork]", process)
         self.decode = MLP(hidden, hidden, hidden_layers, outputs, activation=activation)
         # The edges of the last call: a training or a rollout keeps them.
         self._known_adjacency: tuple[Tensor, Adjacency] | None = None
 
     def plain(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> Tensor:
-        """Node quantities from a batch of graphs, as defined."""
+        """Node quantities (..., V, outputs) from a batch of graphs as defined: nodes (..., V, node_inputs), edges
+        (..., E, edge_inputs), edge_index (2, E)."""
         nodes = self.encode_nodes(nodes)
         edges = self.encode_edges(edges)
         for step in self.process:
@@ -256,7 +409,7 @@ class EncodeProcessDecode(nn.Module):
         return self.decode(nodes)
 
     def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> Tensor:
-        """Node quantities from a batch of graphs: `plain` to rounding, in less time and memory."""
+        """`plain` to rounding, in less time and memory."""
         leading = nodes.shape[:-2]
         nodes, edges = nodes.reshape(-1, *nodes.shape[-2:]), edges.reshape(-1, *edges.shape[-2:])
         adjacency = self.adjacency(edge_index, nodes.shape[1])
@@ -283,69 +436,3 @@ class EncodeProcessDecode(nn.Module):
             with torch.inference_mode(False):
                 known = self._known_adjacency = edge_index, adjacency_of(edge_index, node_count)
         return known[1]
-
-
-# --- Mean and scale of a quantity on the training windows, kept with the model --------------------------
-
-
-class Standardiser(nn.Module):
-    """Shift and scale a quantity to zero mean and unit deviation, in float64.
-
-    Latent positions are large and their differences tiny, so the subtraction happens before anything becomes
-    float32.
-
-    Args:
-        mean: Mean of the quantity [its unit], any shape that broadcasts against the quantity.
-        scale: Deviation of the quantity [its unit], same shape, positive.
-    """
-
-    mean: Tensor
-    scale: Tensor
-
-    def __init__(self, mean: Tensor, scale: Tensor) -> None:
-        super().__init__()
-        self.register_buffer("mean", mean.double().clone())
-        self.register_buffer("scale", scale.double().clone())
-
-    @classmethod
-    def fit(cls, samples: Tensor, floor: float = 0.0, centred: bool = True) -> Standardiser:
-        """Statistics over the first dimension; a quantity that never varies gets scale one.
-
-        Args:
-            samples: Training values [unit], shape (samples, ...).
-            floor: Smallest scale as a share of the largest one; a direction in which (almost) nothing happens, such as
-                the lateral one by symmetry, keeps a small normalised value instead of being blown up.
-            centred: Whether the mean is subtracted; without it zero stays zero and the scale is the root mean square.
-        """
-        samples = samples.double()
-        if samples[0].numel() == 0:
-            return cls.empty(*samples.shape[1:])
-        mean = samples.mean(0) if centred else torch.zeros_like(samples[0])
-        scale = (samples - mean).square().mean(0).sqrt()
-        largest = float(scale.max())
-        # Round-off of a constant is not variation: below 1e-12 of the values themselves the scale is one.
-        if largest <= 1e-12 * float(samples.abs().max()) or largest == 0.0:
-            return cls(mean, torch.ones_like(scale))
-        return cls(mean, scale.clamp_min(max(floor, 1e-9) * largest))
-
-    def __getitem__(self, index: slice | Tensor) -> Standardiser:
-        """Of a part of the quantity."""
-        return Standardiser(self.mean[index], self.scale[index])
-
-    @classmethod
-    def cat(cls, parts: Iterable[Standardiser]) -> Standardiser:
-        """Of several quantities side by side."""
-        return cls(*(torch.cat(values) for values in zip(*((p.mean, p.scale) for p in parts), strict=True)))
-
-    @classmethod
-    def empty(cls, *shape: int) -> Standardiser:
-        """A neutral one of the given shape, to be filled from a checkpoint."""
-        return cls(torch.zeros(shape, dtype=torch.float64), torch.ones(shape, dtype=torch.float64))
-
-    def normalise(self, value: Tensor) -> Tensor:
-        """Value in deviations from the mean [1], float32, same shape."""
-        return ((value - self.mean) / self.scale).float()
-
-    def denormalise(self, value: Tensor) -> Tensor:
-        """Back to the quantity's unit, float64, same shape."""
-        return value.double() * self.scale + self.mean

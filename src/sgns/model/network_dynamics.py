@@ -9,27 +9,34 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from sgns.model.algebra import GraphStepper
-from sgns.model.dynamics import Dynamics, Path, Prediction, Step, Stepper, unrolled
+from sgns.model.dynamics import Dynamics, Path, Standardiser, Step, Stepper, unrolled
+from sgns.model.fast_step import GraphStepper
 from sgns.model.features import BodyTrack, build_graph, edge_indices, free_axes, nearest_rigid
-from sgns.model.network import EncodeProcessDecode, Standardiser
+from sgns.model.network import EncodeProcessDecode
 from sgns.settings import ModelSettings
 
 
-class LatentDynamics(Dynamics):
-    """Graph network on modes and body nodes, with the statistics that make its inputs and outputs of order
-    one.
+class Prediction(NamedTuple):
+    """What the network says of every node in one step, normalised [1], shape (B, V, 3) each; modes first.
 
-    Args:
-        settings: What to build.
-        num_modes: r.
-        context: Keys of the scene whose numbers every node is told, K of them.
-        predicts_body: Whether the body moves as the soil lets it (see `free_axes`).
+    The change is the position's second difference, or with `model.predicts=velocity` its first; of a body node only
+    what is free counts. Force and torque are what the node contributes to them.
+    """
+
+    change: Tensor
+    force: Tensor
+    torque: Tensor
+
+
+class LatentDynamics(Dynamics):
+    """Graph network on modes and body nodes, with the statistics that make its inputs and outputs of order one.
+
+    Arguments as of `Dynamics`; every node is told the context.
     """
 
     settings: ModelSettings
@@ -93,11 +100,7 @@ class LatentDynamics(Dynamics):
         return cls(*arguments)
 
     def with_modes(self, num_modes: int) -> LatentDynamics:
-        """The same network on the first modes only; the weights are shared.
-
-        Raises:
-            UserError: More modes than it was trained with.
-        """
+        """As for all `Dynamics`; the weights are shared."""
         self.check_modes(num_modes)
         fewer = copy.copy(self)
         fewer._modules = dict(self._modules)
@@ -113,7 +116,7 @@ class LatentDynamics(Dynamics):
         """Predict one step of every window in a batch; arguments as for `advance`."""
         modes, nodes = latent.shape[-2], body.position.shape[-2]
         edge_index = self.edge_index(modes, nodes, latent.device)
-        graph = build_graph(
+        features, edges = build_graph(
             self._mode_features(latent),
             self.body_features(body),
             self._edge_positions(latent[:, -1], body.position[:, -2]),
@@ -121,7 +124,7 @@ class LatentDynamics(Dynamics):
             self.settings.edge_length,
         )
         told = self.told(modes, nodes, latent.shape[0], context)
-        return self.read(self.network(torch.cat([graph.nodes, told], dim=-1), graph.edges, edge_index))
+        return self.read(self.network(torch.cat([features, told], dim=-1), edges, edge_index))
 
     def read(self, decoded: Tensor) -> Prediction:
         """The prediction in what the network decodes, shape (B, V, 6 or 9)."""
@@ -177,10 +180,9 @@ class LatentDynamics(Dynamics):
         Every node carries 1/V of the mean, so that the sum over nodes, not the average, is the physical quantity.
         """
         count = prediction.force.shape[-2]
-        return tuple(
-            part.double() * standard.scale + standard.mean / count
-            for part, standard in ((prediction.force, self.force), (prediction.torque, self.torque))
-        )  # type: ignore[return-value]
+        force = prediction.force.double() * self.force.scale + self.force.mean / count
+        torque = prediction.torque.double() * self.torque.scale + self.torque.mean / count
+        return force, torque
 
     def advance(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Step:
         """As for all `Dynamics`: z+ = z + (z - z-) + a, or z + v; a predicted body of points kept rigid if so set."""
@@ -258,32 +260,30 @@ class PathStepper(Stepper):
         context: Numbers of the run, shape (1, K); not needed when K is 0.
     """
 
+    dynamics: LatentDynamics
+
     def __init__(self, dynamics: LatentDynamics, body_nodes: int, context: Tensor | None = None) -> None:
-        self.arguments = dynamics, body_nodes, context
-        self.dynamics = dynamics
-        network, r = dynamics.network, dynamics.num_modes
-        count = r + body_nodes
-        self.edge_index = dynamics.edge_index(r, body_nodes, dynamics.force.mean.device)
+        super().__init__(dynamics, context)
+        self.body_nodes = body_nodes
         self.graph: GraphStepper | None = None
+        # Places of the body's nodes from its first when the edges within it were last computed [1], shape (N, 3).
+        self.shape: Tensor | None = None
+        r, count = dynamics.num_modes, dynamics.num_modes + body_nodes
+        self.edge_index = dynamics.edge_index(r, body_nodes, dynamics.force.mean.device)
         with torch.inference_mode():
-            if GraphStepper.covers(network):
-                self.graph = GraphStepper(network, self.edge_index, count, body_nodes)
+            if GraphStepper.covers(dynamics.network):
+                self.graph = GraphStepper(dynamics.network, self.edge_index, count, body_nodes)
             self.prepare_features(dynamics.told(r, body_nodes, 1, context)[0])
             self.prepare_outputs()
-        self.shape: Tensor | None = None
 
-    def __getstate__(self) -> tuple[tuple[Any, ...], Any]:
-        return self.arguments, self.memory
-
-    def __setstate__(self, state: tuple[tuple[Any, ...], Any]) -> None:
-        arguments, memory = state
-        PathStepper.__init__(self, *arguments)
-        self.memory = memory
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = None, {"memory": self.memory}  # in this form it is set as any attribute
+        return PathStepper, (self.dynamics, self.body_nodes, self.context), state
 
     @property
     def memory(self) -> tuple[Tensor | None, Tensor | None]:
-        """Places of the body's nodes from its first when the edges within it were last computed [1], shape (N, 3), and
-        what was computed of these edges (see `GraphStepper`), shape (N, any, H); never overwritten, only replaced."""
+        """`shape`, and what was computed of the edges within the body then (see `GraphStepper`), shape (N, any, H);
+        never overwritten, only replaced."""
         return self.shape, None if self.graph is None else self.graph.kept
 
     @memory.setter
@@ -295,10 +295,10 @@ class PathStepper(Stepper):
     def prepare_features(self, told: Tensor) -> None:
         """Memory of the network's inputs; what the nodes are told once, shape (V, any), stays in it."""
         dynamics, settings = self.dynamics, self.dynamics.settings
-        r, d = dynamics.num_modes, dynamics.history
-        first, count = dynamics.network.encode_nodes.first, len(told)
-        self.nodes = told.new_zeros(count, first.in_features)
-        self.nodes[:, first.in_features - told.shape[1] :] = told
+        r, d, count = dynamics.num_modes, dynamics.history, len(told)
+        width = dynamics.network.encode_nodes.first.in_features
+        self.nodes = told.new_zeros(count, width)
+        self.nodes[:, width - told.shape[1] :] = told
         place = 3 if settings.positions else 0
         columns = self.nodes[:r, place : place + 3 * (d - 1)]
         self.velocity_features = columns.unflatten(1, (d - 1, 3)).transpose(0, 1)
@@ -376,12 +376,11 @@ class PathStepper(Stepper):
         if self.accelerates:
             following.add_(self.velocity[-1])
         torch.clamp(following, self.nearest, self.furthest, out=following)
-        return following, decoded[:, 3:].sum(0, dtype=torch.float64).mul_(self.load_scale).add_(
-            self.load_mean
-        )
+        load = decoded[:, 3:].sum(0, dtype=torch.float64).mul_(self.load_scale).add_(self.load_mean)
+        return following, load
 
     def advance(self, latent: Tensor, body: BodyTrack) -> Step:
-        """One step; latent (1, d, r, 3), body (1, d, N, ...) as for `LatentDynamics.forward`."""
+        """As for all steppers."""
         with torch.inference_mode():
             features, places = self.windows(body)
             decoded = self.decoded(latent[0], features[0], places[0])

@@ -14,9 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sgns.model.dynamics import Dynamics, Step
+from sgns.model.dynamics import Dynamics, Standardiser, Step
 from sgns.model.features import BodyTrack, free_axes
-from sgns.model.network import Standardiser
 from sgns.settings import PolynomialSettings
 
 
@@ -27,11 +26,8 @@ def normalised(statistics: Standardiser, groups: Sequence[Tensor]) -> Tensor:
 
 
 def polynomial_terms(inputs: int, degree: int) -> Tensor:
-    """Every monomial up to degree 1 or 2 as a pair of inputs, where input 0 stands for the number 1.
-
-    Returns:
-        Ordered pairs, shape (m, 2); the first is the constant, (0, 0).
-    """
+    """Every monomial up to degree 1 or 2 as an ordered pair of inputs, where input 0 stands for the number 1; shape
+    (m, 2), the first is the constant, (0, 0)."""
     if degree == 1:
         return torch.stack([torch.zeros(inputs + 1, dtype=torch.long), torch.arange(inputs + 1)], dim=1)
     return torch.combinations(torch.arange(inputs + 1), 2, with_replacement=True)
@@ -40,15 +36,12 @@ def polynomial_terms(inputs: int, degree: int) -> Tensor:
 class PolynomialDynamics(Dynamics):
     """Polynomials with statistics of zero and one, bounds and coefficients of zero, to be filled in.
 
-    Args:
-        settings: What to build.
-        num_modes: r.
-        context: Keys of the scene whose numbers are inputs, K of them.
-        predicts_body: Whether the body's height is predicted (see `free_axes`).
-        used: Which raw inputs vary in the training windows, p of them; see `raw_inputs`.
+    Arguments as of `Dynamics`; used: which raw inputs vary in the training windows, p of them (see `raw_inputs`).
     """
 
     settings: PolynomialSettings
+    free: Tensor
+    prescribed: Tensor
     used: Tensor
     bounds: Tensor
     terms: Tensor
@@ -99,11 +92,7 @@ class PolynomialDynamics(Dynamics):
         return int(self.weights.count_nonzero())
 
     def with_modes(self, num_modes: int) -> PolynomialDynamics:
-        """The same polynomials where the other modes stay at their mean place: their terms are dropped.
-
-        Raises:
-            UserError: More modes than were fitted.
-        """
+        """As for all `Dynamics`: the other modes stay at their mean place, their terms are dropped."""
         self.check_modes(num_modes)
         d, r = self.history, self.num_modes
         # Modes come first in each of the d groups of raw inputs that belong to modes.
@@ -124,13 +113,11 @@ class PolynomialDynamics(Dynamics):
         return fewer
 
     def raw_inputs(self, latent: Tensor, body: BodyTrack, context: Tensor | None) -> list[Tensor]:
-        """What a step is computed from, in groups of one quantity each; arguments as for `advance`.
+        """What a step is computed from, in groups of one quantity each, shape (B, width); arguments as for `advance`.
 
-        Returns:
-            Newest latent position [m], d - 1 latent velocities [m]; of the body, one frame before the one to be
-            predicted, its position along the prescribed axes [m] and its orientation [1], then its d displacements
-            along these axes [m] and its d rotations [rad]; along the free axes its position and its d - 1 past
-            displacements [m]; the context; each of shape (B, width).
+        Newest latent position [m], d - 1 latent velocities [m]; of the body, one frame before the one to be predicted,
+        its position along the prescribed axes [m] and its orientation [1], then its d displacements along these axes
+        [m] and its d rotations [rad]; along the free axes its position and its d - 1 past displacements [m]; context.
         """
         place, moved = body.position[:, -2], body.motion[..., :3]
         groups = [

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from mpm_warp.poses import in_world_frame
 from sgns.model.features import body_track, context_of
 
 if TYPE_CHECKING:
@@ -28,12 +29,8 @@ _SOIL = "the soil's state"
 
 
 class Excess(NamedTuple):
-    """How far every frame lies outside the training range.
-
-    Attributes:
-        amount: Distance of the worst quantity from its range, in widths of that range [1], shape (T,); 0 inside.
-        quantity: Its name in every frame, T of them.
-    """
+    """How far every frame lies outside the training range: the distance of the worst quantity from its range, in widths
+    of that range [1], shape (T,), 0 inside; and its name."""
 
     amount: np.ndarray
     quantity: list[str]
@@ -57,12 +54,7 @@ class Excess(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TrainingRange:
-    """Smallest and largest values of tool, soil and context in the training runs.
-
-    Attributes:
-        low: Quantity -> smallest value of every component [its unit].
-        high: Quantity -> largest value, likewise.
-    """
+    """Smallest and largest values of tool, soil and context in the training runs, of every component [its unit]."""
 
     low: dict[str, np.ndarray]
     high: dict[str, np.ndarray]
@@ -116,11 +108,13 @@ class TrainingRange:
 
     def excess(
         self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, context: Mapping[str, float]
-    ) -> Excess:
-        """How far a path of poses (T, 7), body points in the world frame (T, M, 3) [m] and modes (T, r, 3) [m] is
-        outside; fewer modes than those of the training are compared with the first of them."""
+    ) -> Excess | None:
+        """How far a path of poses (T, 7), body points in the body frame (M, 3) [m] and modes (T, r, 3) [m] is outside;
+        None where the tool is nowhere. Fewer modes than those of the training are compared with the first of them."""
+        if not np.isfinite(poses).all():
+            return None
         amounts, names = [], []
-        found = quantities(poses, points, latent, context)
+        found = quantities(poses, in_world_frame(poses, points), latent, context)
         for name in self.low:
             values = found[name]
             low, high = (side[name][: values.shape[1]] for side in (self.low, self.high))

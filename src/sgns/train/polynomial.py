@@ -20,8 +20,8 @@ from torch import Tensor
 from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate
+from sgns.model.dynamics import Standardiser
 from sgns.model.features import moves_freely, varying_context
-from sgns.model.network import Standardiser
 from sgns.model.polynomial import PolynomialDynamics, normalised
 from sgns.settings import FitSettings, PolynomialSettings
 from sgns.train import Fit, Fitted, Task

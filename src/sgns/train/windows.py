@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from sgns.config import UserError
+from sgns.model.dynamics import Standardiser
 from sgns.model.features import BodyTrack, body_track, context_of, free_axes
-from sgns.model.network import Standardiser
 from sgns.model.network_dynamics import LatentDynamics
 
 if TYPE_CHECKING:

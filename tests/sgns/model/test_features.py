@@ -21,53 +21,39 @@ from sgns.model.features import (
     step_frames,
 )
 from sgns_testing.runs import random_poses
-from sgns_testing.tiny import reduced
 
 # --- The graph: which edges, and what is written on nodes and edges -------------------------------------
 
 
-def test_every_ordered_pair_of_different_nodes_is_an_edge_once() -> None:
-    edges = edge_indices(4, 1).T.tolist()
-    assert len(edges) == 20
-    assert {(s, r) for s, r in edges} == {(s, r) for s in range(5) for r in range(5) if s != r}
-
-
-def test_a_star_joins_modes_and_body_only() -> None:
-    edges = edge_indices(3, 2, "star").T.tolist()
-    assert len(edges) == 12
-    assert all((s < 3) != (r < 3) for s, r in edges)
-
-
-@pytest.mark.parametrize("edges", ["complete", "star"])
-def test_self_loops_are_added_and_receivers_ascend(edges) -> None:
-    without, loops = edge_indices(3, 2, edges), edge_indices(3, 2, edges, self_loops=True)
-    assert loops.shape[1] == without.shape[1] + 5
-    assert {(s, r) for s, r in loops.T.tolist() if s == r} == {(v, v) for v in range(5)}
-    assert loops[1].diff().min() >= 0
-
-
-def test_one_node_has_no_edges() -> None:
-    assert edge_indices(1, 0).shape == (2, 0)
+@pytest.mark.parametrize("self_loops", [False, True])
+@pytest.mark.parametrize("modes", [1, 3])
+@pytest.mark.parametrize("nodes", [0, 2])
+def test_edges_join_every_ordered_pair_that_they_should(nodes, modes, self_loops) -> None:
+    """All nodes in a complete graph, in a star one mode and one body node; receivers ascend."""
+    count = modes + nodes
+    pairs = [(s, r) for r in range(count) for s in range(count) if s != r or self_loops]
+    star = [(s, r) for s, r in pairs if (s < modes) != (r < modes) or s == r]
+    for edges, expected in (("complete", pairs), ("star", star)):
+        found = edge_indices(modes, nodes, edges, self_loops)
+        assert found.shape == (2, len(expected)) and found.T.tolist() == [list(pair) for pair in expected]
 
 
 def test_features_are_where_they_belong() -> None:
     torch.manual_seed(0)
-    mode_features, body_features, position = (
-        torch.randn(2, 3, 15),
-        torch.randn(2, 1, 20),
-        torch.randn(2, 4, 3),
-    )
-    graph = build_graph(mode_features, body_features, position, edge_indices(3, 1))
-    assert graph.nodes.shape == (2, 4, 20)
-    assert torch.equal(graph.nodes[:, :3, :15], mode_features)
-    assert torch.equal(graph.nodes[:, :3, 15:], torch.zeros(2, 3, 5))
-    assert torch.equal(graph.nodes[:, 3:], body_features)
-    for e, (sender, receiver) in enumerate(graph.edge_index.T.tolist()):
+    shapes = (2, 3, 15), (2, 1, 20), (2, 4, 3)
+    mode_features, body_features, position = (torch.randn(*shape) for shape in shapes)
+    edge_index = edge_indices(3, 1)
+    nodes, edges = build_graph(mode_features, body_features, position, edge_index)
+    assert nodes.shape == (2, 4, 20)
+    assert torch.equal(nodes[:, :3, :15], mode_features)
+    assert torch.equal(nodes[:, :3, 15:], torch.zeros(2, 3, 5))
+    assert torch.equal(nodes[:, 3:], body_features)
+    for e, (sender, receiver) in enumerate(edge_index.T.tolist()):
         difference = position[:, sender] - position[:, receiver]
-        torch.testing.assert_close(graph.edges[:, e, :3], difference)
-        torch.testing.assert_close(graph.edges[:, e, 3], difference.norm(dim=-1))
-    bare = build_graph(mode_features, body_features, position, edge_indices(3, 1), edge_length=False)
-    assert torch.equal(bare.edges, graph.edges[..., :3])
+        torch.testing.assert_close(edges[:, e, :3], difference)
+        torch.testing.assert_close(edges[:, e, 3], difference.norm(dim=-1))
+    _, bare = build_graph(mode_features, body_features, position, edge_index, edge_length=False)
+    assert torch.equal(bare, edges[..., :3])
 
 
 # --- The tool as the network sees it --------------------------------------------------------------------
@@ -118,36 +104,21 @@ def line(*steps: float) -> np.ndarray:
     return path
 
 
-def test_soil_under_a_slow_tool_steps_by_the_way_it_goes() -> None:
-    frames = step_frames(line(*[0.3] * 10), 1, 1.0, 5)
-    np.testing.assert_array_equal(frames, [0, 4, 8])
-
-
-@pytest.mark.parametrize("given", [1, 3, 11])
-def test_a_fast_tool_steps_in_every_frame(given) -> None:
-    np.testing.assert_array_equal(step_frames(line(*[1.0] * 10), given, 1.0, 5), np.arange(11))
-
-
-def test_soil_settles_after_a_fast_tool() -> None:
-    frames = step_frames(line(0.0, 0.0, 2.0, *[0.0] * 9, 0.5, 0.5), 1, 1.0, 4)
-    np.testing.assert_array_equal(frames, [0, 3, 4, 5, 6, 14])
-
-
-def test_shaking_is_no_motion_unless_it_is_far() -> None:
-    assert len(step_frames(line(*[0.9, -0.9] * 10), 1, 1.0, 5)) == 1
-    assert len(step_frames(line(*[0.5, 0.5, -0.5, -0.5] * 5), 1, 1.0, 5)) == 11
-
-
-def test_given_frames_are_all_seen_and_say_how_the_tool_moves() -> None:
-    path = line(0.1, 2.0, *[0.0] * 8)
-    np.testing.assert_array_equal(step_frames(path, 3, 1.0, 4), [0, 1, 2, 3, 4, 5])
-    np.testing.assert_array_equal(step_frames(line(*[0.4] * 8), 3, 1.0, 4), [0, 1, 2, 5, 8])
-
-
-def test_nothing_is_slower_than_rest() -> None:
-    """Without a known pace only a tool at rest is slow."""
-    frames = step_frames(line(*[1e-6] * 3, *[0.0] * 6), 1, 0.0, 2)
-    np.testing.assert_array_equal(frames, [0, 1, 2, 3, 4])
+@pytest.mark.parametrize(
+    ("why", "steps", "given", "least", "settling", "expected"),
+    [
+        ("under a slow tool by the way it goes", [0.3] * 10, 1, 1.0, 5, [0, 4, 8]),
+        *[("every frame of a fast tool", [1.0] * 10, given, 1.0, 5, range(11)) for given in (1, 3, 11)],
+        ("settling after a fast tool", [0, 0, 2] + [0] * 9 + [0.5, 0.5], 1, 1.0, 4, [0, 3, 4, 5, 6, 14]),
+        ("shaking is no motion", [0.9, -0.9] * 10, 1, 1.0, 5, [0]),
+        ("unless it is far", [0.5, 0.5, -0.5, -0.5] * 5, 1, 1.0, 5, range(0, 21, 2)),
+        ("given frames are all seen and say how the tool moves", [0.1, 2] + [0] * 8, 3, 1.0, 4, range(6)),
+        ("given frames of a slow tool", [0.4] * 8, 3, 1.0, 4, [0, 1, 2, 5, 8]),
+        ("without a known pace only a tool at rest is slow", [1e-6] * 3 + [0] * 6, 1, 0.0, 2, range(5)),
+    ],
+)
+def test_when_soil_takes_a_step(why, steps, given, least, settling, expected) -> None:
+    np.testing.assert_array_equal(step_frames(line(*steps), given, least, settling), list(expected))
 
 
 def test_turning_is_motion_of_the_points() -> None:
@@ -179,8 +150,8 @@ def test_motion_is_not_changed_by_looking_ahead() -> None:
     np.testing.assert_array_equal(here.stepped, line(0.5)[1])
 
 
-def test_the_slowest_travel_is_a_pace_not_a_stop(tmp_path) -> None:
-    runs = reduced(tmp_path).runs("train")
+def test_the_slowest_travel_is_a_pace_not_a_stop(data) -> None:
+    runs = data.runs("train")
     moved = np.concatenate([np.linalg.norm(np.diff(run.pose[:, :3], axis=0), axis=1) for run in runs])
     known = slowest_travel(runs)
     assert known == pytest.approx(moved.min(), rel=0.02)

@@ -4,15 +4,128 @@ symmetries.
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 import torch
 
+from sgns.model import network as module
 from sgns.model.features import edge_indices
-from sgns.model.network import MLP, EncodeProcessDecode, InteractionNetwork, Standardiser
+from sgns.model.network import (
+    MLP,
+    CompleteAdjacency,
+    EncodeProcessDecode,
+    IndexedAdjacency,
+    InteractionNetwork,
+    adjacency_of,
+    affine,
+)
 
-# --- The network against a message-passing step written out by hand, its fast form against its definition,
-# symmetries.
+
+def assert_close(found: list[torch.Tensor], expected: list[torch.Tensor], tolerance: float) -> None:
+    """Tensors, to a share of the largest value of each."""
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance * float(b.abs().max()))
+
+
+# --- Both matrix libraries give the same linear layer and the same gradients ----------------------------
+
+
+def affine_outcome(shape: tuple[int, ...], relu: bool) -> list[torch.Tensor]:
+    """Values with gradients asked for, and without; gradients."""
+    torch.manual_seed(0)
+    tensors = [torch.randn(*shape, 40), torch.randn(60, 40), torch.randn(60)]
+    for tensor in tensors:
+        tensor.requires_grad_()
+    y = affine(*tensors, relu=relu)
+    with torch.inference_mode():
+        alone = affine(*tensors, relu=relu)
+    return [y.detach(), alone, *torch.autograd.grad(y.sin().sum(), tensors)]
+
+
+@pytest.mark.parametrize("relu", [False, True])
+@pytest.mark.parametrize("shape", [(7,), (2, 3, 5), (5000,)])
+def test_onednn_is_the_linear_layer(shape, relu, monkeypatch) -> None:
+    if not torch.backends.mkldnn.is_available():
+        pytest.skip("torch was built without oneDNN")
+    monkeypatch.setattr(module, "_WORTH_IT", 2**60)
+    expected = affine_outcome(shape, relu)
+    monkeypatch.setattr(module, "_WORTH_IT", 0)
+    assert module.prefers_onednn(torch.empty(*shape, 40), torch.empty(60, 40))
+    assert_close(affine_outcome(shape, relu), expected, 1e-5)
+
+
+def test_double_precision_stays_double() -> None:
+    assert not module.prefers_onednn(torch.empty(5000, 128).double(), torch.empty(128, 128).double())
+    y = affine(torch.ones(5000, 128).double(), torch.ones(128, 128).double() / 3, torch.zeros(128).double())
+    torch.testing.assert_close(y, torch.full_like(y, 128 / 3), rtol=1e-14, atol=0.0)
+
+
+def test_a_part_of_a_matrix_is_no_slower() -> None:
+    x, whole, bias = torch.randn(1568, 128), torch.randn(128, 384), torch.randn(128)
+
+    def seconds(weight: torch.Tensor) -> float:
+        best = float("inf")
+        for _ in range(5):
+            began = time.perf_counter()
+            affine(x, weight, bias)
+            best = min(best, time.perf_counter() - began)
+        return best
+
+    # Taken as it lies in memory it was a thousand times slower.
+    assert seconds(whole[:, :128]) < 20 * seconds(whole[:, :128].contiguous())
+
+
+# --- Sums along edges without an index equal those with one ---------------------------------------------
+
+
+def outcome_of_sums(adjacency, v: int, e: int) -> list[torch.Tensor]:
+    torch.manual_seed(0)
+    tensors = [torch.randn(2, rows, 3).double().requires_grad_() for rows in (e, v, v)]
+    spread = adjacency.spread(tensors[0] * 1.0, *tensors[1:])
+    summed = adjacency.gather(spread.sin())
+    return [spread.detach(), summed.detach(), *torch.autograd.grad(summed.square().sum(), tensors)]
+
+
+@pytest.mark.parametrize("v", [2, 3, 6])
+@pytest.mark.parametrize("self_loops", [False, True])
+def test_broadcasting_is_indexing(v, self_loops) -> None:
+    index = edge_indices(v - 1, 1, self_loops=self_loops)
+    adjacency = adjacency_of(index, v)
+    assert isinstance(adjacency, CompleteAdjacency) and adjacency.degree == index.shape[1] // v
+    found, expected = (outcome_of_sums(a, v, index.shape[1]) for a in (adjacency, IndexedAdjacency(index, v)))
+    assert_close(found, expected, 1e-12)
+
+
+def test_any_other_edges_are_indexed() -> None:
+    whole = edge_indices(3, 1)
+    for index in (whole.flip(1), whole.flip(0), whole[:, :-1], edge_indices(3, 1, "star")):
+        assert isinstance(adjacency_of(index, 4), IndexedAdjacency)
+    # As many edges as a complete graph of five nodes would have.
+    assert isinstance(adjacency_of(edge_indices(4, 1).clamp(max=3), 5), IndexedAdjacency)
+
+
+def test_edges_end_where_the_index_says() -> None:
+    index = torch.tensor([[0, 1, 2, 0], [2, 2, 1, 1]])
+    adjacency = IndexedAdjacency(index, 4)
+    edges, nodes = torch.arange(4.0)[None, :, None], torch.tensor([10.0, 20, 30, 40])[None, :, None]
+    assert adjacency.degree.flatten().tolist() == [0, 2, 2, 0]
+    assert adjacency.gather(edges).flatten().tolist() == [0, 5, 1, 0]
+    assert adjacency.spread(edges, nodes, -nodes).flatten().tolist() == [20, 11, -8, 13]
+
+
+def test_one_node_alone() -> None:
+    adjacency = adjacency_of(edge_indices(1, 0), 1)
+    assert torch.equal(adjacency.gather(torch.empty(2, 0, 3)), torch.zeros(2, 1, 3))
+
+
+def test_a_graph_of_many_nodes_and_few_edges_needs_no_table_of_all_pairs() -> None:
+    nodes = 3_000_000  # all their pairs would take 144 TB
+    assert isinstance(adjacency_of(torch.tensor([[0, 1], [2, 2]]), nodes), IndexedAdjacency)
+
+
+# --- The network ------------------------------------------------------------------------------------------
 
 
 def by_hand(mlp: MLP, x: np.ndarray) -> np.ndarray:
@@ -70,8 +183,7 @@ def test_the_algebra_changes_nothing(residual, layer_norm, steps, activation, ed
     index = EDGES[edges]
     inputs = torch.randn(3, 5, 6).double(), torch.randn(3, index.shape[1], 4).double()
     expected = outcome(network.plain, network, *inputs, index)
-    for a, b in zip(outcome(network, network, *inputs, index), expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10 * float(b.abs().max()))
+    assert_close(outcome(network, network, *inputs, index), expected, 1e-10)
 
 
 @pytest.mark.parametrize("hidden_layers", [1, 2, 3])
@@ -81,17 +193,7 @@ def test_the_algebra_changes_nothing_in_float32_at_the_papers_size(hidden_layers
     index = edge_indices(8, 15)
     inputs = torch.randn(9, 23, 20), torch.randn(9, 506, 4)
     expected = outcome(network.plain, network, *inputs, index)
-    for a, b in zip(outcome(network, network, *inputs, index), expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5 * float(b.abs().max()))
-
-
-def test_a_batch_is_its_graphs_one_by_one() -> None:
-    torch.manual_seed(3)
-    network = EncodeProcessDecode(6, 4, 9, hidden=16, steps=2, layer_norm=True, residual=True).double()
-    nodes, edges, index = torch.randn(3, 5, 6).double(), torch.randn(3, 20, 4).double(), edge_indices(4, 1)
-    together = network(nodes, edges, index)
-    alone = torch.stack([network(n, e, index) for n, e in zip(nodes, edges, strict=True)])
-    torch.testing.assert_close(together, alone)
+    assert_close(outcome(network, network, *inputs, index), expected, 1e-5)
 
 
 def test_renaming_nodes_renames_the_answer() -> None:
@@ -116,15 +218,15 @@ def test_the_order_of_edges_does_not_matter() -> None:
 
 def test_leading_dimensions_and_blocks_are_free(monkeypatch) -> None:
     torch.manual_seed(6)
-    network = EncodeProcessDecode(6, 4, 9, hidden=16).double()
-    nodes, edges, index = (
-        torch.randn(2, 3, 5, 6).double(),
-        torch.randn(2, 3, 20, 4).double(),
-        edge_indices(4, 1),
-    )
+    network = EncodeProcessDecode(6, 4, 9, hidden=16, steps=2, layer_norm=True, residual=True).double()
+    nodes, edges = torch.randn(2, 3, 5, 6).double(), torch.randn(2, 3, 20, 4).double()
+    index = edge_indices(4, 1)
     together = network(nodes, edges, index)
-    assert together.shape == (2, 3, 5, 9)
-    torch.testing.assert_close(network(nodes[0, 0], edges[0, 0], index), together[0, 0])
+    alone = [
+        [network(*graph, index) for graph in zip(*pair, strict=True)]
+        for pair in zip(nodes, edges, strict=True)
+    ]
+    torch.testing.assert_close(torch.stack([torch.stack(row) for row in alone]), together)
     monkeypatch.setattr("sgns.model.network.EDGES_AT_ONCE", 40)
     with torch.inference_mode():
         torch.testing.assert_close(network(nodes, edges, index), together)
@@ -137,70 +239,3 @@ def test_the_inputs_are_left_as_they_are() -> None:
     before = nodes.clone(), edges.clone()
     network(nodes, edges, edge_indices(4, 1))
     assert torch.equal(nodes, before[0]) and torch.equal(edges, before[1])
-
-
-def test_parameter_count_is_that_of_five_mlps() -> None:
-    def mlp(inputs: int, outputs: int, h: int = 128) -> int:
-        return inputs * h + h + h * h + h + h * outputs + outputs
-
-    network = EncodeProcessDecode(30, 4, 9)
-    expected = mlp(30, 128) + mlp(4, 128) + mlp(3 * 128, 128) + mlp(2 * 128, 128) + mlp(128, 9)
-    assert sum(p.numel() for p in network.parameters()) == expected
-
-
-def test_messages_of_two_sets_of_edges_add_up() -> None:
-    torch.manual_seed(0)
-    step = InteractionNetwork(5, 8, 2).double()
-    nodes, edges, index = torch.randn(6, 5).double(), torch.randn(30, 5).double(), edge_indices(5, 1)
-
-    def summed(which: torch.Tensor) -> torch.Tensor:
-        messages = step.edge_updater(index[:, which], nodes=nodes, edges=edges[which])
-        return step.propagate(index[:, which], edges=messages, size=(6, 6))
-
-    some = torch.rand(30) < 0.5
-    torch.testing.assert_close(summed(some) + summed(~some), summed(torch.ones(30, dtype=torch.bool)))
-
-
-# --- Means and scales: round trip, nothing blown up, float64 before float32 -----------------------------
-
-
-def test_round_trip() -> None:
-    torch.manual_seed(0)
-    x = 3.0 + torch.randn(200, 4, 3, dtype=torch.float64) * torch.rand(4, 3, dtype=torch.float64)
-    standard = Standardiser.fit(x)
-    torch.testing.assert_close(standard.denormalise(standard.normalise(x)), x, rtol=0, atol=1e-6)
-    y = standard.normalise(x)
-    torch.testing.assert_close(y.mean(0), torch.zeros(4, 3), rtol=0, atol=1e-5)
-    torch.testing.assert_close(y.square().mean(0), torch.ones(4, 3), rtol=1e-4, atol=0)
-
-
-def test_zero_variance_stays_small() -> None:
-    x = torch.zeros(50, 2, 3, dtype=torch.float64)
-    x[:, 0] = torch.randn(50, 3)
-    x[:, 1, 1] = 1e-12 * torch.randn(50)
-    y = Standardiser.fit(x, floor=0.01).normalise(x)
-    assert torch.isfinite(y).all()
-    assert y[:, 1].abs().max() < 1e-9
-
-
-def test_a_constant_is_scaled_by_one() -> None:
-    constant = torch.full((9, 2, 3), 7.3, dtype=torch.float64)
-    for centred in (True, False):
-        standard = Standardiser.fit(constant if centred else 0 * constant, centred=centred)
-        assert torch.equal(standard.scale, torch.ones(2, 3, dtype=torch.float64))
-
-
-def test_without_centring_rest_stays_zero() -> None:
-    standard = Standardiser.fit(1.0 + torch.randn(50, 3), centred=False)
-    assert torch.equal(standard.normalise(torch.zeros(3)), torch.zeros(3))
-
-
-def test_small_movements_of_large_positions_survive() -> None:
-    x = 18.0 + 1e-7 * torch.arange(10, dtype=torch.float64)[:, None]
-    y = Standardiser.fit(x).normalise(x)
-    torch.testing.assert_close(y[:, 0].diff(), y[:, 0].diff().mean().expand(9), rtol=1e-5, atol=0)
-
-
-def test_an_empty_quantity() -> None:
-    standard = Standardiser.fit(torch.zeros(5, 0))
-    assert standard.normalise(torch.zeros(2, 0)).shape == (2, 0)

@@ -30,8 +30,8 @@ from sgns.train.windows import TrainingWindows
 HISTORY = 3
 
 
-def windows_of(runs, modes: int = 4) -> TrainingWindows:
-    return TrainingWindows(runs, modes, HISTORY, "pose")
+def windows_of(runs, modes: int = 4, context=()) -> TrainingWindows:
+    return TrainingWindows(runs, modes, HISTORY, "pose", context=context)
 
 
 def blank(windows, degree: int) -> PolynomialDynamics:
@@ -69,11 +69,8 @@ def with_known_law(data, law):
             velocity, force[t], torque[t] = law(np.array(shown), pose[t, :3] - pose[t - 1, :3])
             latent[t] = latent[t - 1] + velocity
             shown = [*shown[1:], latent[t]]
-        runs.append(
-            replace(
-                pattern, latent=latent, pose=pose, force=force, torque=torque, time=np.arange(frames) / 60.0
-            )
-        )
+        time = np.arange(frames) / 60.0
+        runs.append(replace(pattern, latent=latent, pose=pose, force=force, torque=torque, time=time))
     return runs
 
 
@@ -83,9 +80,15 @@ def linear_law(shown, step):
     return move, 100.0 * step + shown[-1, 0], 7.0 + shown[-1, 1] - 20.0 * step
 
 
+def unbound(model) -> PolynomialDynamics:
+    """The model, its inputs held to no range."""
+    model.bounds.copy_(torch.tensor([[-torch.inf], [torch.inf]]))
+    return model
+
+
 def check_rollouts(model, runs) -> None:
     """A law found exactly holds outside the range of the training runs, too."""
-    model.bounds.copy_(torch.tensor([[-torch.inf], [torch.inf]]))
+    unbound(model)
     rollouts = ValidationRollouts(runs, 2, HISTORY, "pose")
     score = rollouts.measure(model)
     assert min(score.skill, score.skill_at_rest) > 1 - 1e-9
@@ -135,8 +138,7 @@ def test_ridge_finds_a_linear_system(data, degree) -> None:
 
 def test_noise_is_on_the_inputs_and_not_on_the_targets(data) -> None:
     windows = windows_of(data.runs("train"))
-    model = blank(windows, 1)
-    model.bounds.copy_(torch.tensor([[-torch.inf], [torch.inf]]))
+    model = unbound(blank(windows, 1))
     clean, noisy = moments(model, windows, draws=1), moments(model, windows, noise=0.5, draws=40)
     # Raw inputs are 12 positions, then 12 older and 12 newest velocities.
     moving = [(place, int(raw)) for place, raw in enumerate(model.used, 1) if 24 <= raw < 36]
@@ -160,23 +162,6 @@ def test_penalty_draws_towards_the_mean(data) -> None:
     assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 1e-6
     # The constant is free.
     torch.testing.assert_close(ridge(known, 1e9)[0], known.target[0], rtol=1e-6, atol=1e-6)
-
-
-def test_unrolling_is_stepping(data) -> None:
-    windows = windows_of(data.runs("train"))
-    model = fit(windows, 2, Setting(0.3, 1e-2), Setting(0.1, 1e-1))
-    frames = torch.arange(10)
-    body = BodyTrack(*(part[frames][None] for part in windows.body))
-    latent, force, torque, followed = model.unroll(windows.latent[None, :HISTORY], body)
-    assert followed is body  # prescribed
-    states = list(windows.latent[:HISTORY])
-    for t in range(HISTORY, 10):
-        window = body.frames(slice(t - HISTORY + 1, t + 1))
-        z, f, m, _ = model.advance(torch.stack(states[-HISTORY:])[None], window)
-        states.append(z[0])
-        assert torch.equal(f[0], force[0, t]) and torch.equal(m[0], torque[0, t])
-    assert torch.equal(torch.stack(states), latent[0])
-    assert not force[0, :HISTORY].any() and not torque[0, :HISTORY].any()
 
 
 def test_nothing_runs_away_outside_the_known_range(data) -> None:
@@ -238,26 +223,22 @@ def wheels(data, count: int = 220, frames: int = 8):
             latent[t] = latent[last] + 0.3 * velocity - 0.05 * latent[last] + fall + drive + 1e-4 * load
             pose[t, 2] = pose[last, 2] + rise
             force[t] = 30.0 * drive + latent[last, 1] + 500.0 * fall + 0.1 * load
+        scene, torque, time = {"kind": "wheel", "load": load}, np.zeros((frames, 3)), np.arange(frames) / 60.0
         runs.append(
-            replace(
-                pattern,
-                latent=latent,
-                pose=pose,
-                force=force,
-                torque=np.zeros((frames, 3)),
-                time=np.arange(frames) / 60.0,
-                scene={"kind": "wheel", "load": load},
-            )
+            replace(pattern, latent=latent, pose=pose, force=force, torque=torque, time=time, scene=scene)
         )
     return runs
 
 
+def blank_wheel(windows, context=("load",)) -> PolynomialDynamics:
+    return unfitted(windows, PolynomialSettings(HISTORY, 1, ["load"]), tuple(context), predicts_body=True)
+
+
 def fitted_wheel(runs, context) -> PolynomialDynamics:
-    windows = TrainingWindows(runs, 2, HISTORY, "pose", context=context)
-    model = unfitted(windows, PolynomialSettings(HISTORY, 1, ["load"]), tuple(context), predicts_body=True)
+    windows = windows_of(runs, 2, context)
+    model = blank_wheel(windows, context)
     refitted(model, windows, Selection(*[Setting(0.0, 0.0)] * 3))
-    model.bounds.copy_(torch.tensor([[-torch.inf], [torch.inf]]))
-    return model
+    return unbound(model)
 
 
 def test_a_wheels_height_is_predicted_and_the_load_is_used(data) -> None:
@@ -274,7 +255,7 @@ def test_a_wheels_height_is_predicted_and_the_load_is_used(data) -> None:
 def test_where_a_wheel_will_be_is_not_looked_at(data) -> None:
     runs = wheels(data)
     model = fitted_wheel(runs, ["load"])
-    windows = TrainingWindows(runs[:3], 2, HISTORY, "pose", context=["load"])
+    windows = windows_of(runs[:3], 2, ["load"])
     batch = windows.windows(windows.targets)
     seen = model.advance(batch.history, batch.body, batch.context)
     elsewhere = batch.body.moved_last(batch.body.motion[:, -1, :, :3] + torch.tensor([0.0, 0.0, 1.0]))
@@ -287,9 +268,8 @@ def test_where_a_wheel_will_be_is_not_looked_at(data) -> None:
 
 
 def test_noise_moves_a_free_body_as_well(data) -> None:
-    windows = TrainingWindows(wheels(data, 40), 2, HISTORY, "pose", context=["load"])
-    model = unfitted(windows, PolynomialSettings(HISTORY, 1, ["load"]), ("load",), predicts_body=True)
-    model.bounds.copy_(torch.tensor([[-torch.inf], [torch.inf]]))
+    windows = windows_of(wheels(data, 40), 2, ["load"])
+    model = unbound(blank_wheel(windows))
     clean, noisy = (moments(model, windows, noise, draws=20) for noise in (0.0, 0.5))
     # The newest past rise is the last input before the context; its noise is that of the newest velocity.
     place = len(model.inputs.mean) - 2
@@ -319,8 +299,8 @@ def test_fewer_modes_are_the_others_at_their_mean(data) -> None:
 
 def test_a_free_body_is_chosen_by_its_own_error(data) -> None:
     runs = wheels(data, 40)
-    windows = TrainingWindows(runs[:-5], 2, HISTORY, "pose", context=["load"])
-    model = unfitted(windows, PolynomialSettings(HISTORY, 1, ["load"]), ("load",), predicts_body=True)
+    windows = windows_of(runs[:-5], 2, ["load"])
+    model = blank_wheel(windows)
     rollouts = ValidationRollouts(runs[-5:], 2, HISTORY, "pose", ["load"])
     found = candidates({noise: moments(model, windows, noise) for noise in (0.0, 1.0)}, (1e-4, 1.0))
     selection = select(model, found, rollouts)
@@ -328,7 +308,7 @@ def test_a_free_body_is_chosen_by_its_own_error(data) -> None:
     for setting in found:
         take(model, found[selection.motion], found[setting], found[selection.motion])
         assert rollouts.measure(model).body_rmse >= best
-    assert best < rollouts.measure(unfitted(windows, model.settings, ("load",), True)).body_rmse
+    assert best < rollouts.measure(blank_wheel(windows)).body_rmse
 
 
 def test_without_products_is_the_linear_fit(data) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +13,9 @@ import torch
 from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
 from sgns.model.features import nearest_rigid
-from sgns.simulator import Simulator
 from sgns.train.command import train
-from sgns_testing.tiny import MODEL, TRAINING, reduced
+from sgns_testing.tiny import BRIEF, MODEL
+from sgns_testing.trained import TrainedKinds
 
 KINDS = {
     "pose": {},
@@ -24,20 +25,15 @@ KINDS = {
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """Reduced data of a body whose height is free, and checkpoints."""
-    folder = tmp_path_factory.mktemp("wheel")
-    data = reduced(folder, scene={"kind": "wheel"})
-    for name, change in KINDS.items():
-        train(data, num_modes=4, model=MODEL | change, training=TRAINING, output=folder / name)
-    return data, folder
+def trained(tmp_path_factory) -> TrainedKinds:
+    """Of a body whose height is free."""
+    models = {kind: MODEL | change for kind, change in KINDS.items()}
+    return TrainedKinds.of(tmp_path_factory.mktemp("wheel"), models, scene={"kind": "wheel"})
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_rollout_is_stepping_and_needs_no_height(trained, kind) -> None:
-    data, folder = trained
-    run = data.runs("test")[0]
-    simulator = Simulator.load(folder / kind / "best.ckpt")
+    run, simulator = trained.run, trained.simulator(kind)
     assert simulator.predicts_body
     rollout = simulator.rollout(run.pose, latent_history=run.latent[:3, :4])
     assert not np.allclose(rollout.poses[3:, 2], run.pose[3:, 2])
@@ -57,9 +53,7 @@ def test_rollout_is_stepping_and_needs_no_height(trained, kind) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_copies_go_on_to_the_bit(trained, kind) -> None:
-    data, folder = trained
-    path = data.runs("test")[0].pose
-    simulator = Simulator.load(folder / kind / "best.ckpt")
+    path, simulator = trained.run.pose, trained.simulator(kind)
     simulator.reset(path)
     for pose in path[1:5]:
         simulator.step(pose)
@@ -74,9 +68,7 @@ def test_copies_go_on_to_the_bit(trained, kind) -> None:
 
 @pytest.mark.parametrize("kind", ["pose", "points"])  # the third is not told of the way
 def test_a_way_far_from_everything_is_refused_and_forgotten(trained, kind) -> None:
-    data, folder = trained
-    path = data.runs("test")[0].pose
-    simulator = Simulator.load(folder / kind / "best.ckpt")
+    path, simulator = trained.run.pose, trained.simulator(kind)
     simulator.reset(path)
     simulator.step(path[1])
     plain, far = copy.copy(simulator), path[2].copy()
@@ -95,9 +87,7 @@ def test_a_way_far_from_everything_is_refused_and_forgotten(trained, kind) -> No
 
 
 def test_points_that_fix_no_pose_are_refused(trained) -> None:
-    data, folder = trained
-    path = data.runs("test")[0].pose
-    simulator = Simulator.load(folder / "points" / "best.ckpt")
+    path, simulator = trained.run.pose, trained.simulator("points")
     line = simulator.body_points[:1] + 0.01 * np.arange(5.0)[:, None]
     for points in (simulator.body_points[:1], simulator.body_points[:2], line):
         with pytest.raises(UserError, match="lie on one line"):
@@ -106,31 +96,24 @@ def test_points_that_fix_no_pose_are_refused(trained) -> None:
 
 def test_soil_under_a_wheel_follows_the_clock(trained) -> None:
     """A wheel that rests may still sink."""
-    data, folder = trained
-    path = data.runs("test")[0].pose[:1].repeat(20, axis=0)
+    path = trained.run.pose[:1].repeat(20, axis=0)
     found, own = (
-        Simulator.load(folder / "pose" / "best.ckpt", rate_independent=follows).rollout(path)
-        for follows in (True, False)
+        trained.simulator("pose", rate_independent=follows).rollout(path) for follows in (True, False)
     )
     np.testing.assert_array_equal(found.latent, own.latent)
     assert (np.diff(found.latent, axis=0) != 0).any(axis=(1, 2)).all()
 
 
 def test_the_prescribed_part_is_kept(trained) -> None:
-    data, folder = trained
-    run = data.runs("test")[0]
-    rollout = Simulator.load(folder / "pose" / "best.ckpt").rollout(run.pose)
-    np.testing.assert_allclose(rollout.poses[:, [0, 1]], run.pose[:, [0, 1]], atol=1e-12)
-    np.testing.assert_allclose(rollout.poses[:, 3:], run.pose[:, 3:], atol=1e-12)
+    poses = trained.simulator("pose").rollout(trained.run.pose).poses
+    prescribed = [0, 1, 3, 4, 5, 6]
+    np.testing.assert_allclose(poses[:, prescribed], trained.run.pose[:, prescribed], atol=1e-12)
 
 
 def test_points_stay_rigid_or_not(trained) -> None:
-    data, folder = trained
-    run = data.runs("test")[0]
     apart = {}
     for kind in ("points", "free"):
-        simulator = Simulator.load(folder / kind / "best.ckpt")
-        points = simulator.rollout(run.pose).body_points
+        points = trained.simulator(kind).rollout(trained.run.pose).body_points
         distance = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
         apart[kind] = np.abs(distance - distance[0]).max()
     assert apart["points"] < 1e-9 < 1e-6 < apart["free"]
@@ -151,10 +134,8 @@ def test_nearest_rigid_is_exact_for_a_rigid_motion_and_best_otherwise() -> None:
 
 
 def test_wheels_and_blades_do_not_mix(trained) -> None:
-    from dataclasses import replace
-
     data, folder = trained
     runs = {split: data.runs(split) for split in ("train", "validation", "test")}
     runs["train"][0] = replace(runs["train"][0], scene={"kind": "excavation"})
     with pytest.raises(UserError, match="mix wheels"):
-        train(replace(data, _runs=runs), num_modes=4, model=MODEL, training=TRAINING, output=folder / "mixed")
+        train(replace(data, _runs=runs), num_modes=4, model=MODEL, training=BRIEF, output=folder / "mixed")

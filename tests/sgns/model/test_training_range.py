@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mpm_warp.poses import in_body_frame
 from sgns.config import UserError
 from sgns.model.training_range import NOTEWORTHY, TrainingRange, components, widths
 
@@ -14,11 +15,15 @@ def known(data) -> TrainingRange:
     return TrainingRange.of(data.runs("train"), 4, ("depth",))
 
 
-def excess(known, run, shift=0.0, points=None, latent=None, depth=None):
-    pose = run.pose + np.eye(7)[0] * shift
-    points = run.body_points + np.eye(3)[0] * shift if points is None else points
-    number = {"depth": run.scene["depth"] if depth is None else depth}
-    return known.excess(pose, points, run.latent[:, :4] if latent is None else latent, number)
+def excess(known, run, pose=None, points=None, latent=None, depth=None):
+    """Of a training run's path with some of it changed."""
+    own = in_body_frame(run.pose[0], run.body_points[0])
+    return known.excess(
+        run.pose if pose is None else pose,
+        own if points is None else own + points,
+        run.latent[:, :4] if latent is None else latent,
+        {"depth": run.scene["depth"] if depth is None else depth},
+    )
 
 
 def test_training_runs_are_inside(data, known) -> None:
@@ -33,39 +38,41 @@ def test_the_unit_is_the_width_of_the_range(data, known) -> None:
     low, high = known.low[name][0], known.high[name][0]
     run = data.runs("train")[0]
     shift = high - run.pose[-1, 0] + 2.5 * (high - low)
-    found = excess(known, run, shift)
+    found = excess(known, run, run.pose + np.eye(7)[0] * shift)
     assert found.amount[-1] == pytest.approx(2.5)
     assert found.quantity[-1] == "the tool's position (x)"
     assert found.words().startswith("from frame 0 on")
     assert "the tool's position (x) is 2.5 times its training range" in found.words()
 
 
-@pytest.mark.parametrize("what", ["turned", "deeper points", "faster", "soil", "soil runs", "context"])
-def test_every_quantity_counts(data, known, what) -> None:
+def turned(run):
+    half = np.radians(60)
+    return np.column_stack(
+        [run.pose[:, :3], np.tile([0.0, 0.0, np.sin(half), np.cos(half)], (len(run.pose), 1))]
+    )
+
+
+def away(path):
+    """Three times as far from where it began."""
+    return path[:1] + 3.0 * (path - path[:1])
+
+
+@pytest.mark.parametrize(
+    ("quantity", "change"),
+    {
+        "the tool's orientation": lambda run: {"pose": turned(run)},
+        "the tool's lowest point": lambda run: {"points": [0.0, 0.0, -0.1]},
+        "the tool's displacement per frame (x)": lambda run: {
+            "pose": np.column_stack([away(run.pose[:, 0]), run.pose[:, 1:]])
+        },
+        "the soil's state": lambda run: {"latent": run.latent[:, :4] + [[0.0, 0.0, 9.0]]},
+        "the soil's": lambda run: {"latent": away(run.latent[:, :4])},
+        "depth": lambda run: {"depth": 1.0},
+    }.items(),
+)
+def test_every_quantity_counts(data, known, quantity, change) -> None:
     run = data.runs("train")[0]
-    if what == "turned":
-        half = np.radians(60)
-        pose = run.pose.copy()
-        pose[:, 3:] = [0.0, 0.0, np.sin(half), np.cos(half)]
-        found = known.excess(pose, run.body_points, run.latent[:, :4], {"depth": run.scene["depth"]})
-        quantity = "the tool's orientation"
-    elif what == "deeper points":
-        found = excess(known, run, points=run.body_points - [0.0, 0.0, 0.1])
-        quantity = "the tool's lowest point"
-    elif what == "faster":
-        pose = run.pose.copy()
-        pose[:, 0] = run.pose[0, 0] + 3.0 * (run.pose[:, 0] - run.pose[0, 0])
-        found = known.excess(pose, run.body_points, run.latent[:, :4], {"depth": run.scene["depth"]})
-        quantity = "the tool's displacement per frame (x)"
-    elif what == "soil":
-        found = excess(known, run, latent=run.latent[:, :4] + [[0.0, 0.0, 9.0]])
-        quantity = "the soil's state"
-    elif what == "soil runs":
-        found = excess(known, run, latent=run.latent[:1, :4] + 3.0 * (run.latent[:, :4] - run.latent[:1, :4]))
-        quantity = "the soil's"
-    else:
-        found = excess(known, run, depth=1.0)
-        quantity = "depth"
+    found = excess(known, run, **change(run))
     assert found.largest > NOTEWORTHY
     assert any(name.startswith(quantity) for name in found.quantity)
 
@@ -76,10 +83,11 @@ def test_fewer_modes_are_compared_with_the_first(data, known) -> None:
 
 
 def test_the_number_of_points_counts_where_they_are_seen(data) -> None:
-    run, number = data.runs("train")[0], {"depth": data.runs("train")[0].scene["depth"]}
+    run = data.runs("train")[0]
     for seen in (True, False):
         known = TrainingRange.of(data.runs("train"), 4, ("depth",), points=seen)
-        found = known.excess(run.pose, run.body_points[:, :1], run.latent[:, :4], number)
+        one = in_body_frame(run.pose[0], run.body_points[0])[:1]
+        found = known.excess(run.pose, one, run.latent[:, :4], {"depth": run.scene["depth"]})
         assert ("the number of the tool's points" in found.quantity) == seen
         assert (found.largest == pytest.approx(14 / 15)) == seen
 

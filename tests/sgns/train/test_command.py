@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sgns.config import UserError
 from sgns.model.checkpoint import load_surrogate
-from sgns.model.network_dynamics import Path
+from sgns.model.dynamics import Path
 from sgns.reduction.reduce import reduce_dataset
 from sgns.settings import TrainingSettings
 from sgns.simulator import Simulator

@@ -1,0 +1,61 @@
+"""Files that are no checkpoint, or not one to step a bed with, are named and refused."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from sgns.config import UserError
+from sgns.model.checkpoint import load_surrogate
+
+
+@pytest.mark.parametrize("content", [None, b"", b"hello"], ids=["truncated", "empty", "text"])
+def test_other_bytes_are_named(trained_briefly, tmp_path, content) -> None:
+    whole = (trained_briefly.output / "best.ckpt").read_bytes()
+    path = tmp_path / "bad.ckpt"
+    path.write_bytes(whole[: len(whole) // 2] if content is None else content)
+    with pytest.raises(UserError, match=r"bad\.ckpt"):
+        load_surrogate(path)
+
+
+def test_an_absent_one_says_how_to_train_one() -> None:
+    with pytest.raises(UserError, match="no checkpoint"):
+        load_surrogate("absent.ckpt")
+
+
+def with_a_mesh(content) -> None:
+    content["hyper_parameters"]["format_version"] = 1  # older ones are read
+    content["hyper_parameters"]["scene"]["tool"] = {"shape": "mesh", "file": "/etc/passwd"}
+
+
+def with_nan(content) -> None:
+    name = next(name for name in content["state_dict"] if name.endswith("weight"))
+    content["state_dict"][name][0] = float("nan")
+
+
+def saying(key, value):
+    return lambda content: content["hyper_parameters"].update({key: value})
+
+
+@pytest.mark.parametrize(
+    ("line", "spoil"),
+    [
+        ("not a checkpoint of sgns", saying("format", None)),
+        ("not a checkpoint of sgns", lambda content: content.pop("state_dict")),
+        ("newer", saying("format_version", 99)),
+        ("names a mesh file without the digest", with_a_mesh),
+        ("fit together", lambda content: content["state_dict"].pop("surrogate.basis_modes")),
+        ("not finite", with_nan),
+        *[("frame rate is", saying("frame_rate", rate)) for rate in (float("inf"), float("nan"), 0.0, -60.0)],
+        ("the slowest travel is nan", saying("slowest_travel", float("nan"))),
+        ("fit together", saying("slowest_travel", None)),
+        ("fit together", saying("training_range", None)),
+        ("fit together", saying("training_range", {"low": {}, "high": {}})),
+    ],
+)
+def test_what_is_wrong_with_it_is_said(trained_briefly, tmp_path, line, spoil) -> None:
+    content = torch.load(trained_briefly.output / "best.ckpt", weights_only=True)
+    spoil(content)
+    torch.save(content, tmp_path / "bad.ckpt")
+    with pytest.raises(UserError, match=line):
+        load_surrogate(tmp_path / "bad.ckpt")
