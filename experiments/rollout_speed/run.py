@@ -26,6 +26,7 @@ from common import training_settings, write_rows
 from torch import Tensor
 
 from sgns.evaluate.costs import cpu_model
+from sgns.model import network as formulas
 from sgns.model.features import BodyTrack
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.settings import ModelSettings
@@ -87,11 +88,11 @@ def in_turn(
 @contextmanager
 def onednn(allowed: bool) -> Iterator[None]:
     """oneDNN's products allowed or not."""
-    before, network._AVAILABLE = network._AVAILABLE, allowed and network._AVAILABLE
+    before, formulas._AVAILABLE = formulas._AVAILABLE, allowed and formulas._AVAILABLE
     try:
         yield
     finally:
-        network._AVAILABLE = before
+        formulas._AVAILABLE = before
 
 
 def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[Row]:
