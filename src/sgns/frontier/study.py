@@ -1,4 +1,4 @@
-"""A study: which points of which scenes are measured, how they are timed, and where they are kept."""
+"""A study: which points of which scenes are measured, how they are timed, and the folder that keeps them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
@@ -29,38 +28,12 @@ from sgns.config import UserError, parse_yaml
 from sgns.data.files import read_json, read_text, write_whole
 from sgns.evaluate.costs import command_line, cpu_model
 from sgns.frontier.observation import Observation, read_observation
-from sgns.frontier.point import ERRORS, SHARED, Point
+from sgns.frontier.point import ERRORS, Point, core_time
+from sgns.rollout import single_thread
 from sgns.simulate.scene import scene_from_config
 
-# --- Wall times that can be compared: one core, warm, medians, beside a workload that is always the same
-# The reference workload is the default scene of `sgns simulate` (the paper's bin at 20 mm, 4 particles per cell, half
-# of it computed) while the plate cuts. Its time is taken just before and just after what is measured, on the same
-# core, so that ratios to it hold on a machine whose speed changes.
-
-FRAMES = 8  # of one measurement of the workload
-STRETCHES = 2  # of which the median is taken, before and after each
-
-
-@contextmanager
-def one_core(last: bool = False) -> Iterator[None]:
-    """This process on the first (or last) core it may use, and torch on one thread; as before afterwards."""
-    threads = torch.get_num_threads()
-    cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
-    try:
-        torch.set_num_threads(1)
-        if cores:
-            os.sched_setaffinity(0, {max(cores) if last else min(cores)})
-        yield
-    finally:
-        torch.set_num_threads(threads)
-        if cores:
-            os.sched_setaffinity(0, cores)
-
-
-def stopwatch() -> Callable[[], tuple[float, float]]:
-    """A function that tells the wall and the processor time since now [s]."""
-    began, clock = time.perf_counter(), time.process_time()
-    return lambda: (elapsed(began, time.perf_counter()), elapsed(clock, time.process_time()))
+AXES = ("solver", "reduction", "surrogate")
+"""Groups of points that one command, or one process of several, measures."""
 
 
 def composed(command: str, overrides: Sequence[str]) -> DictConfig:
@@ -77,96 +50,155 @@ def composed_scene(overrides: Sequence[str]) -> tuple[Scene, DictConfig]:
     return scene_from_config(cfg), cfg
 
 
-class Workload:
-    """The reference workload, warm."""
-
-    def __init__(self) -> None:
-        self._frames: Iterator[Frame] = iter(())
-
-    @cached_property
-    def _scene(self) -> Scene:
-        return composed_scene(["scene=excavation"])[0]
-
-    def measure(self) -> list[float]:
-        """Wall seconds per simulated second of each of a few stretches; processor seconds where the core was shared."""
-        found = []
-        for _ in range(STRETCHES):
-            if next(self._frames, None) is None:
-                self._frames = Solver(self._scene, effects_for(self._scene)[0]).frames()
-                for _ in range(2):  # the first frame loads kernels, the second is the first that computes
-                    next(self._frames)
-            watch = stopwatch()
-            done = sum(1 for _ in zip(range(FRAMES), self._frames, strict=False))
-            if done == FRAMES:
-                wall, processor = watch()
-                seconds = processor if wall > SHARED * processor else wall
-                found.append(seconds * self._scene.frame_rate / FRAMES)
-        return found or self.measure()
-
-
-def cost_fields(
-    rates: Sequence[float], workload: Sequence[float], processor_rate: float = float("nan")
-) -> dict[str, Any]:
-    """The columns of `Point` that say what it costs, for the CPU.
-
-    From wall seconds per simulated second, of each repeat and of the reference workload before and after, and processor
-    seconds per simulated second.
-    """
-    median, reference = statistics.median(rates), statistics.median(workload)
-    cost = processor_rate if median > SHARED * processor_rate else median
-    return {
-        "wall_s_per_simulated_s": median,
-        "wall_s_per_simulated_s_low": min(rates),
-        "wall_s_per_simulated_s_high": max(rates),
-        "processor_s_per_simulated_s": processor_rate,
-        "repeats": float(len(rates)),
-        "workload_wall_s_per_simulated_s": reference,
-        "ratio": cost / reference,
-        "processor": cpu_model(),
-        "threads": 1.0,
-        "device": "cpu",
-    }
-
-
-def made_here() -> dict[str, str]:
-    """The columns of `Point` that say how and where it is measured; the command without its output folder."""
-    words = shlex.split(command_line())
-    return {
-        "command": shlex.join(word for word in words if not word.startswith("output=")),
-        "machine": cpu_model(),
-        "version": __version__,
-        "commit": commit(),
-    }
-
-
-@cache
-def commit() -> str:
-    """Short name of the commit this package runs from; empty if it is no checkout."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return ""
-
-
-# --- Points in a folder, one file each, so that a study goes on where it stopped ------------------------
-# <output>/points/<scene>_<kind>_<label>.json                 one point without its errors; written last, whole
-# <output>/observations/<scene>_<kind>_<label>_<case>.npz     its runs
+# --- What a study measures: its scenes, the cases each scene is judged on, and the points of its axes ---
 
 
 @dataclass(frozen=True)
-class Store:
-    """The folder of a study."""
+class PointSettings:
+    """One entry of an axis in conf/study: what makes a point."""
 
+    axis: str
+    label: str
+    set: tuple[str, ...] = ()  # overrides: of `sgns simulate` for the solver, of `sgns train` for surrogates
+    paper: bool = False  # it is an operating point of the paper
+    centring: Any = None  # of a reduction
+    modes: Any = None  # of a reduction: the numbers r, a point each
+
+    @classmethod
+    def from_dict(cls, data: Any, where: str) -> PointSettings:
+        """From an entry of conf/study.
+
+        Raises:
+            UserError: it has no axis or no label, or a key that is not known.
+        """
+        if not isinstance(data, Mapping) or not data.get("axis") or not data.get("label"):
+            raise UserError(f"{where} holds {data!r}; every point needs axis and label, and set: [overrides]")
+        known = [field.name for field in fields(cls)]
+        if unknown := [key for key in data if key not in known]:
+            raise UserError(
+                f"{where}, {data['label']!r} has the unknown key {unknown[0]!r}; allowed: {', '.join(known)}"
+            )
+        return cls(**{**data, "set": tuple(map(str, data.get("set") or ()))})
+
+
+@dataclass(frozen=True)
+class StudyScene:
+    """One figure: a kind of scene, and the runs that every point of it is judged on."""
+
+    name: str
+    settings: Mapping[str, Any]
+
+    @property
+    def dataset(self) -> str:
+        """Option of the group `dataset` that surrogates learn from; the cases are among its test runs."""
+        return str(self.settings["dataset"])
+
+    @property
+    def bands(self) -> dict[str, float]:
+        """Column of errors → how wrong the reference itself may be; no point can be shown to be better."""
+        return {key: float(value) for key, value in (self.settings.get("bands") or {}).items()}
+
+    @property
+    def cases(self) -> dict[str, list[str]]:
+        """Case → overrides of `sgns simulate` that make it with the settings of the dataset."""
+        return {
+            name: [f"scene={self.settings['scene']}", *map(str, changes)]
+            for name, changes in self.settings["cases"].items()
+        }
+
+    @property
+    def free_body(self) -> bool:
+        """Whether the soil carries the body."""
+        return composed_scene(next(iter(self.cases.values())))[0].axle is not None
+
+    @cached_property
+    def reference(self) -> PointSettings:
+        """The most accurate run."""
+        entry = {"axis": "reference"} | dict(self.settings["reference"])
+        return PointSettings.from_dict(entry, f"study.scenes.{self.name}.reference")
+
+    def points(self, axis: str) -> list[PointSettings]:
+        """Points of an axis, in the order in which they are measured."""
+        where = f"study.scenes.{self.name}.{axis}"
+        found = [PointSettings.from_dict(entry, where) for entry in self.settings.get(axis) or ()]
+        labels = [point.label for point in found]
+        if twice := {label for label in labels if labels.count(label) > 1}:
+            raise UserError(f"{where} has two points with the label {min(twice)!r}")
+        return found
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study and the folder of its points, a file each, so that it goes on where it stopped:
+
+    - points/<scene>_<kind>_<label>.json: a point without its errors; written last, whole
+    - observations/<scene>_<kind>_<label>_<case>.npz: its runs
+    - study.yaml: what the points were asked for with
+    """
+
+    name: str
+    scenes: tuple[StudyScene, ...]
     folder: Path
 
-    def file(self, scene: str, kind: str, label: str) -> Path:
-        """Where a point is; it is there when it is complete."""
-        return self.folder / "points" / f"{name_of(scene, kind, label)}.json"
+    @classmethod
+    def from_settings(cls, settings: Any, folder: Path) -> Study:
+        """From conf/study.
 
-    def has(self, scene: str, kind: str, label: str) -> bool:
-        """Whether a point has been measured."""
-        return self.file(scene, kind, label).exists()
+        Raises:
+            UserError: a scene lacks what it needs, or has a key that is not known.
+        """
+        scenes = settings.get("scenes")
+        if not isinstance(scenes, Mapping) or not scenes or not settings.get("name"):
+            raise UserError("study needs name and scenes; see conf/study/quick.yaml")
+        needed = ("scene", "dataset", "cases", "reference")
+        for name, scene in scenes.items():
+            for key in needed:
+                if not isinstance(scene, Mapping) or not scene.get(key):
+                    raise UserError(f"study.scenes.{name}.{key} is missing; see conf/study/quick.yaml")
+            for where, keys, allowed in (
+                (f"study.scenes.{name}", scene, (*needed, "bands", *AXES)),
+                (f"study.scenes.{name}.bands", scene.get("bands") or {}, tuple(ERRORS)),
+            ):
+                if wrong := [key for key in keys if key not in allowed]:
+                    raise UserError(f"{where} has no key {wrong[0]!r}; allowed: {', '.join(allowed)}")
+        return cls(str(settings["name"]), tuple(StudyScene(n, s) for n, s in scenes.items()), folder)
+
+    def record(self) -> None:
+        """Write what is asked for into the folder's study.yaml.
+
+        Raises:
+            UserError: the folder has a point of the same label that was asked for otherwise, so its results would be
+                taken for this study's.
+        """
+        file = self.folder / "study.yaml"
+        advice = "give another output"
+        try:
+            there = os.path.lexists(file)
+            known = parse_yaml(read_text(file, "no text of a study", advice)) if there else {}
+        except ValueError:
+            known = None
+        if not isinstance(known, dict):
+            raise UserError(f"{file} does not say what was measured; {advice}")
+        asked = {}  # all that results depend on, by scene and label
+        for scene in self.scenes:
+            for key in ("scene", "dataset", "cases", "reference"):
+                asked[f"{scene.name}, {key}"] = scene.settings[key]
+            for axis in AXES:
+                for entry, point in zip(scene.settings.get(axis) or (), scene.points(axis), strict=True):
+                    asked[f"{scene.name}, {axis}: {point.label}"] = entry
+        # Of what was never measured nothing can be taken for something else.
+        measured = any((self.folder / "points").glob("*.json"))
+        for key in known.keys() & asked.keys():
+            if measured and known[key] != asked[key]:
+                raise UserError(
+                    f"{self.folder} holds {key} measured with {known[key]}, and {asked[key]} is asked for now; give "
+                    "another output, or another label"
+                )
+        write_whole(file, yaml.safe_dump(known | asked, sort_keys=False, allow_unicode=True))
+
+    def file(self, scene: str, kind: str, label: str) -> Path:
+        """Where a point is; it is there when it has been measured."""
+        return self.folder / "points" / f"{name_of(scene, kind, label)}.json"
 
     def save(self, point: Point, observations: Mapping[str, Observation]) -> None:
         """Keep a point with its run of every case; none for a point that left the range (say so in its note)."""
@@ -211,153 +243,95 @@ def name_of(scene: str, kind: str, label: str) -> str:
     return "_".join(re.sub(r"([^\w.+-]|_)+", "-", part) for part in (scene, kind, label))
 
 
-# --- What a study measures: its scenes, the cases each scene is judged on, and the points of its axes ---
+# --- Wall times that can be compared: one core, warm, medians, beside a workload that is always the same
+# The reference workload is the default scene of `sgns simulate` (the paper's bin at 20 mm, 4 particles per cell, half
+# of it computed) while the plate cuts. Its time is taken just before and just after what is measured, on the same
+# core, so that ratios to it hold on a machine whose speed changes.
 
-AXES = ("solver", "reduction", "surrogate")
-"""Groups of points that one command, or one process of several, measures."""
-
-
-@dataclass(frozen=True)
-class PointSettings:
-    """One entry of an axis in conf/study: what makes a point."""
-
-    axis: str
-    label: str
-    set: tuple[str, ...] = ()  # overrides: of `sgns simulate` for the solver, of `sgns train` for surrogates
-    paper: bool = False  # it is an operating point of the paper
-    more: Mapping[str, Any] = field(default_factory=dict)  # further keys that only one axis knows
-
-    @classmethod
-    def from_dict(cls, data: Any, where: str) -> PointSettings:
-        """From an entry of conf/study.
-
-        Raises:
-            UserError: it has no axis or no label.
-        """
-        if not isinstance(data, Mapping) or not data.get("axis") or not data.get("label"):
-            raise UserError(f"{where} holds {data!r}; every point needs axis and label, and set: [overrides]")
-        known = {key: data[key] for key in ("axis", "label", "paper") if key in data}
-        changes = tuple(map(str, data.get("set") or ()))
-        more = {key: value for key, value in data.items() if key not in (*known, "set")}
-        return cls(**known, set=changes, more=more)
+FRAMES = 8  # of one stretch of the workload
+STRETCHES = 2  # of which the median is taken, before and after each
 
 
-@dataclass(frozen=True)
-class StudyScene:
-    """One figure: a kind of scene, and the runs that every point of it is judged on."""
+@contextmanager
+def one_core(last: bool = False) -> Iterator[None]:
+    """This process on the first (or last) core it may use, and torch on one thread; as before afterwards."""
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
+    try:
+        if cores:
+            os.sched_setaffinity(0, {max(cores) if last else min(cores)})
+        with single_thread():
+            yield
+    finally:
+        if cores:
+            os.sched_setaffinity(0, cores)
 
-    name: str
-    settings: Mapping[str, Any]
 
-    @property
-    def dataset(self) -> str:
-        """Option of the group `dataset` that surrogates learn from; the cases are among its test runs."""
-        return str(self.settings["dataset"])
+def stopwatch() -> Callable[[], tuple[float, float]]:
+    """A function that tells the wall and the processor time since now [s]."""
+    began, clock = time.perf_counter(), time.process_time()
+    return lambda: (elapsed(began, time.perf_counter()), elapsed(clock, time.process_time()))
 
-    @property
-    def bands(self) -> dict[str, float]:
-        """Column of errors → how wrong the reference itself may be; no point can be shown to be better."""
-        return {key: float(value) for key, value in (self.settings.get("bands") or {}).items()}
 
-    @property
-    def cases(self) -> dict[str, list[str]]:
-        """Case → overrides of `sgns simulate` that make it with the settings of the dataset."""
-        return {
-            name: [f"scene={self.settings['scene']}", *map(str, changes)]
-            for name, changes in self.settings["cases"].items()
-        }
+class Workload:
+    """The reference workload, warm."""
 
-    def case_scene(self, case: str) -> Scene:
-        """The scene of a case as in the dataset."""
-        return composed_scene(self.cases[case])[0]
+    def __init__(self) -> None:
+        self._scene = composed_scene(["scene=excavation"])[0]
+        self._frames: Iterator[Frame] = iter(())
 
-    @cached_property
-    def free_body(self) -> bool:
-        """Whether the soil carries the body."""
-        return self.case_scene(next(iter(self.cases))).axle is not None
-
-    @cached_property
-    def reference(self) -> PointSettings:
-        """The most accurate run."""
-        entry = {"axis": "reference"} | dict(self.settings["reference"])
-        return PointSettings.from_dict(entry, f"study.scenes.{self.name}.reference")
-
-    def points(self, axis: str) -> list[PointSettings]:
-        """Points of an axis, in the order in which they are measured."""
-        where = f"study.scenes.{self.name}.{axis}"
-        found = [PointSettings.from_dict(entry, where) for entry in self.settings.get(axis) or ()]
-        labels = [point.label for point in found]
-        if twice := {label for label in labels if labels.count(label) > 1}:
-            raise UserError(f"{where} has two points with the label {min(twice)!r}")
+    def measure(self) -> list[float]:
+        """Seconds of one core per simulated second, of each of a few stretches."""
+        found: list[float] = []
+        while len(found) < STRETCHES:
+            watch = stopwatch()
+            done = sum(1 for _ in zip(range(FRAMES), self._frames, strict=False))
+            seconds = core_time(*watch())
+            if done == FRAMES:
+                found.append(seconds * self._scene.frame_rate / FRAMES)
+            else:
+                self._frames = Solver(self._scene, effects_for(self._scene)[0]).frames()
+                for _ in range(2):  # the first frame loads kernels, the second is the first that computes
+                    next(self._frames)
         return found
 
 
-@dataclass(frozen=True)
-class Study:
-    """A study and the folder of its points."""
+def cost_fields(rates: Sequence[float], workload: Sequence[float], processor_rate: float) -> dict[str, Any]:
+    """The columns of `Point` that say what it costs, for the CPU.
 
-    name: str
-    scenes: tuple[StudyScene, ...]
-    folder: Path
+    From wall seconds per simulated second, of each repeat and of the reference workload before and after, and processor
+    seconds per simulated second.
+    """
+    median, reference = statistics.median(rates), statistics.median(workload)
+    return {
+        "wall_s_per_simulated_s": median,
+        "wall_s_per_simulated_s_low": min(rates),
+        "wall_s_per_simulated_s_high": max(rates),
+        "processor_s_per_simulated_s": processor_rate,
+        "repeats": float(len(rates)),
+        "workload_wall_s_per_simulated_s": reference,
+        "ratio": core_time(median, processor_rate) / reference,
+        "processor": cpu_model(),
+        "threads": 1.0,
+        "device": "cpu",
+    }
 
-    @classmethod
-    def from_settings(cls, settings: Mapping[str, Any], folder: Path) -> Study:
-        """From conf/study.
 
-        Raises:
-            UserError: a scene lacks what it needs.
-        """
-        scenes = settings.get("scenes")
-        if not isinstance(scenes, Mapping) or not scenes or not settings.get("name"):
-            raise UserError("study needs name and scenes; see conf/study/quick.yaml")
-        for name, scene in scenes.items():
-            for key in ("scene", "dataset", "cases", "reference"):
-                if not isinstance(scene, Mapping) or not scene.get(key):
-                    raise UserError(f"study.scenes.{name}.{key} is missing; see conf/study/quick.yaml")
-            if wrong := set(scene.get("bands") or ()) - set(ERRORS):
-                raise UserError(
-                    f"study.scenes.{name}.bands has no key {min(wrong)!r}; allowed: {', '.join(ERRORS)}"
-                )
-        return cls(str(settings["name"]), tuple(StudyScene(n, s) for n, s in scenes.items()), folder)
+def made_here() -> dict[str, str]:
+    """The columns of `Point` that say how and where it is measured; the command without its output folder."""
+    words = shlex.split(command_line())
+    return {
+        "command": shlex.join(word for word in words if not word.startswith("output=")),
+        "machine": cpu_model(),
+        "version": __version__,
+        "commit": commit(),
+    }
 
-    @property
-    def store(self) -> Store:
-        """Where points are kept."""
-        return Store(self.folder)
 
-    def record(self) -> None:
-        """Write what is asked for into the folder's study.yaml.
-
-        Raises:
-            UserError: the folder has a point of the same label that was asked for otherwise, so its results would be
-                taken for this study's.
-        """
-        file, asked = self.folder / "study.yaml", self._asked()
-        advice = "give another output"
-        try:
-            there = os.path.lexists(file)
-            known = parse_yaml(read_text(file, "no text of a study", advice)) if there else {}
-        except ValueError:
-            known = None
-        if not isinstance(known, dict):
-            raise UserError(f"{file} does not say what was measured; {advice}")
-        # Of what was never measured nothing can be taken for something else.
-        measured = any((self.folder / "points").glob("*.json"))
-        for key in known.keys() & asked.keys():
-            if measured and known[key] != asked[key]:
-                raise UserError(
-                    f"{self.folder} holds {key} measured with {known[key]}, and {asked[key]} is asked for now; give "
-                    "another output, or another label"
-                )
-        write_whole(file, yaml.safe_dump(known | asked, sort_keys=False, allow_unicode=True))
-
-    def _asked(self) -> dict[str, Any]:
-        """Everything that results depend on, by scene and label."""
-        found = {}
-        for scene in self.scenes:
-            for key in ("scene", "dataset", "cases", "training", "reference"):
-                found[f"{scene.name}, {key}"] = scene.settings.get(key)
-            for axis in AXES:
-                for entry, point in zip(scene.settings.get(axis) or (), scene.points(axis), strict=True):
-                    found[f"{scene.name}, {axis}: {point.label}"] = entry
-        return found
+@cache
+def commit() -> str:
+    """Short name of the commit this package runs from; empty if it is no checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""
