@@ -91,8 +91,8 @@ def draw_points(axes: Axes, points: Sequence[Point], column: str) -> None:
         axes.errorbar(
             column_of(chosen, "cost"),
             column_of(chosen, column),
-            xerr=np.array([bar(p, "wall_s_per_simulated_s") for p in chosen]).T,
-            yerr=np.array([bar(p, column) for p in chosen]).T if has_cases else None,
+            xerr=bars(chosen, "wall_s_per_simulated_s") * [not p.shared for p in chosen],
+            yerr=bars(chosen, column) if has_cases else None,
             fmt="*" if paper else marker,
             ms=15 if paper else 6,
             color=colour,
@@ -105,12 +105,10 @@ def draw_points(axes: Axes, points: Sequence[Point], column: str) -> None:
         )
 
 
-def bar(point: Point, column: str) -> tuple[float, float]:
-    """How far the bar reaches below and above; nothing where it is not known."""
-    if column == "wall_s_per_simulated_s" and point.shared:
-        return 0.0, 0.0
-    middle, low, high = (getattr(point, f"{column}{end}") for end in ("", "_low", "_high"))
-    return float(np.fmax(middle - low, 0.0)), float(np.fmax(high - middle, 0.0))
+def bars(points: Sequence[Point], column: str) -> np.ndarray:
+    """How far bars reach below and above, shape (2, points); nothing where it is not known."""
+    middle, low, high = (np.array(column_of(points, f"{column}{end}")) for end in ("", "_low", "_high"))
+    return np.fmax([middle - low, high - middle], 0.0)
 
 
 @plain_text

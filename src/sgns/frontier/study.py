@@ -9,7 +9,7 @@ import shlex
 import statistics
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
@@ -53,6 +53,12 @@ def composed_scene(overrides: Sequence[str]) -> tuple[Scene, DictConfig]:
 # --- What a study measures: its scenes, the cases each scene is judged on, and the points of its axes ---
 
 
+def require_known(keys: Iterable[str], allowed: Collection[str], words: str) -> None:
+    """Refuses keys that are not allowed."""
+    if wrong := [key for key in keys if key not in allowed]:
+        raise UserError(f"{words} {wrong[0]!r}; allowed: {', '.join(allowed)}")
+
+
 @dataclass(frozen=True)
 class PointSettings:
     """One entry of an axis in conf/study: what makes a point."""
@@ -74,10 +80,7 @@ class PointSettings:
         if not isinstance(data, Mapping) or not data.get("axis") or not data.get("label"):
             raise UserError(f"{where} holds {data!r}; every point needs axis and label, and set: [overrides]")
         known = [field.name for field in fields(cls)]
-        if unknown := [key for key in data if key not in known]:
-            raise UserError(
-                f"{where}, {data['label']!r} has the unknown key {unknown[0]!r}; allowed: {', '.join(known)}"
-            )
+        require_known(data, known, f"{where}, {data['label']!r} has the unknown key")
         return cls(**{**data, "set": tuple(map(str, data.get("set") or ()))})
 
 
@@ -152,15 +155,12 @@ class Study:
             raise UserError("study needs name and scenes; see conf/study/quick.yaml")
         needed = ("scene", "dataset", "cases", "reference")
         for name, scene in scenes.items():
+            where = f"study.scenes.{name}"
             for key in needed:
                 if not isinstance(scene, Mapping) or not scene.get(key):
-                    raise UserError(f"study.scenes.{name}.{key} is missing; see conf/study/quick.yaml")
-            for where, keys, allowed in (
-                (f"study.scenes.{name}", scene, (*needed, "bands", *AXES)),
-                (f"study.scenes.{name}.bands", scene.get("bands") or {}, tuple(ERRORS)),
-            ):
-                if wrong := [key for key in keys if key not in allowed]:
-                    raise UserError(f"{where} has no key {wrong[0]!r}; allowed: {', '.join(allowed)}")
+                    raise UserError(f"{where}.{key} is missing; see conf/study/quick.yaml")
+            require_known(scene, (*needed, "bands", *AXES), f"{where} has no key")
+            require_known(scene.get("bands") or (), ERRORS, f"{where}.bands has no key")
         return cls(str(settings["name"]), tuple(StudyScene(n, s) for n, s in scenes.items()), folder)
 
     def record(self) -> None:
@@ -198,7 +198,8 @@ class Study:
 
     def file(self, scene: str, kind: str, label: str) -> Path:
         """Where a point is; it is there when it has been measured."""
-        return self.folder / "points" / f"{name_of(scene, kind, label)}.json"
+        name = "_".join(re.sub(r"([^\w.+-]|_)+", "-", part) for part in (scene, kind, label))
+        return self.folder / "points" / f"{name}.json"
 
     def save(self, point: Point, observations: Mapping[str, Observation]) -> None:
         """Keep a point with its run of every case; none for a point that left the range (say so in its note)."""
@@ -220,14 +221,12 @@ class Study:
             advice = "remove it to make it again"
             content = read_json(file, "no operating point", advice)
             try:
-                point, cases = content["point"], content["cases"]
-                if not isinstance(point, dict) or not isinstance(cases, list):
-                    raise TypeError("its point is no group of keys, or its cases are no list")
-                if wrong := [c for c in cases if not isinstance(c, str) or set(c) & {"/", os.sep, "\0"}]:
-                    raise ValueError(f"{wrong[0]!r:.40} is no name of a case")
-                found.append((Point.from_row(point), cases))
+                point, cases = Point.from_row(dict(content["point"])), list(content["cases"])
+                if set("".join(cases)) & {"/", os.sep, "\0"}:
+                    raise ValueError(f"{cases!r:.40} are no names of cases")
             except (ValueError, KeyError, TypeError, UserError) as error:
                 raise UserError(f"{file} is no operating point ({error}); {advice}") from None
+            found.append((point, cases))
         return found
 
     def observation(self, point: Point, case: str) -> Observation:
@@ -235,12 +234,8 @@ class Study:
         return read_observation(self._observation(point, case))
 
     def _observation(self, point: Point, case: str) -> Path:
-        return self.folder / "observations" / f"{name_of(point.scene, point.kind, point.label)}_{case}.npz"
-
-
-def name_of(scene: str, kind: str, label: str) -> str:
-    """A file name for a point."""
-    return "_".join(re.sub(r"([^\w.+-]|_)+", "-", part) for part in (scene, kind, label))
+        name = self.file(point.scene, point.kind, point.label).stem
+        return self.folder / "observations" / f"{name}_{case}.npz"
 
 
 # --- Wall times that can be compared: one core, warm, medians, beside a workload that is always the same

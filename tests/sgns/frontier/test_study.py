@@ -153,6 +153,12 @@ def test_points_of_a_shipped_study_compose(name: str) -> None:
         made, _ = composed_scene([*case, *changes.values()])
         assert made.duration == composed_scene(case)[0].duration
         assert set(scene.bands) and sum(point.paper for point in points) <= 1
+        by_groups: dict[tuple, dict] = {}
+        for point in scene.points("surrogate"):
+            groups = tuple(change for change in point.set if "." not in change.split("=")[0])
+            by_groups.setdefault(groups, {}).update({change.split("=")[0]: change for change in point.set})
+        for changes in by_groups.values():
+            measure.training_settings(scene.dataset, *changes.values())
 
 
 def test_cases_are_held_out_runs_of_the_dataset() -> None:
@@ -166,7 +172,7 @@ def test_cases_are_held_out_runs_of_the_dataset() -> None:
             campaign = plan(dataset, base.to_dict(), asked_effects(cfg), "float32", seed=0)
             assert set(campaign.split.values()) == set(SPLITS)
             for case in scene.cases:
-                wanted = scene.case_scene(case)
+                wanted, _ = composed_scene(scene.cases[case])
                 same = [name for name, found in campaign.scenes.items() if found == wanted]
                 assert [campaign.split[name] for name in same] == ["test"]
 
