@@ -109,7 +109,7 @@ class StudyScene:
             for name, changes in self.settings["cases"].items()
         }
 
-    @property
+    @cached_property
     def free_body(self) -> bool:
         """Whether the soil carries the body."""
         return composed_scene(next(iter(self.cases.values())))[0].axle is not None

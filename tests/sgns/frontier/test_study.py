@@ -18,7 +18,7 @@ from sgns.config import UserError
 from sgns.data.dataset import SPLITS
 from sgns.frontier import measure
 from sgns.frontier import study as timing
-from sgns.frontier.command import axes_of, main, points_with_errors, with_errors
+from sgns.frontier.command import axes_of, main, points_with_errors, scene_figures, with_errors
 from sgns.frontier.point import Point, read_points
 from sgns.frontier.study import AXES, Study, composed, composed_scene
 from sgns.simulate.campaign import plan
@@ -108,6 +108,16 @@ def test_points_that_did_not_finish_have_no_errors(folder: Path) -> None:
     study.save(lost, {"deep": replace(runs["deep"], moved=moved)})
     assert with_errors(study, scene, lost, ["deep"], runs).note == "left the range: not finite"
     study.file("cut", "solver", "lost").unlink()
+
+
+def test_reductions_and_trainings_have_figures_of_their_own() -> None:
+    (scene,) = Study.from_settings(TINY, Path("x")).scenes
+    known = {"wall_s_per_simulated_s": 0.1, "own_position_rmse_mm": 3.0, "modes": 4.0}
+    points = [
+        Point("tiny", "cut", "reduction", "r", "r 4", **known),
+        Point("tiny", "cut", "surrogate", "r", "net", training_s=30.0, own_force_nrmse=0.5, **known),
+    ]
+    assert [figure.name for figure in scene_figures(scene, points)] == ["cut_training", "cut_reduction"]
 
 
 def test_a_solver_that_stops_is_a_point_without_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
