@@ -26,7 +26,6 @@ ERRORS = {
     "surface": ("surface_rmse_mm", 1e3, "surface at the end", " mm"),
     "sinkage": ("sinkage_error_mm", 1e3, "sinkage", " mm"),
 }
-OWN = {key: f"own_{column}" for key, (column, *_) in ERRORS.items()}
 
 
 @dataclass(frozen=True)
@@ -34,26 +33,30 @@ class Wish:
     """What a person needs."""
 
     scene: str  # whose points are looked at
-    errors: Mapping[str, float]  # column of `Point` → largest error, in the column's unit
+    limits: Mapping[str, float]  # key of `error` → largest error, in the unit of the column
     time: float | None  # longest wall time of a step of `STEP` [s], or None
     particles: bool  # whether the positions of all particles are wanted in every step
+    own: bool  # judge by the errors against the solver that made the training runs
     bands: Mapping[str, float]  # column → how wrong the reference itself may be
-    columns: Mapping[str, str]  # key of `error` → the column it is about
+
+    def column(self, key: str) -> str:
+        """The column of a key of `error`."""
+        return f"own_{ERRORS[key][0]}" if self.own else ERRORS[key][0]
 
     def step_time(self, point: Point) -> float:
         """Wall time of a step of a point [s]; NaN if it is not known."""
         return STEP * (point.decoded_cost if self.particles else point.cost)
 
-    def error(self, point: Point, column: str) -> float:
+    def error(self, point: Point, key: str) -> float:
         """What counts: of a surrogate the larger of its error and of that against the solver that made its training
         runs, since a surrogate that is nearer to the reference than to what it learned from is so by luck."""
-        found = effective_error(point, column, self.bands)
-        own = getattr(point, f"own_{column.removeprefix('own_')}", math.nan)
+        found = effective_error(point, self.column(key), self.bands)
+        own = getattr(point, f"own_{ERRORS[key][0]}")
         return found if math.isnan(own) else max(found, own)
 
     def excess(self, point: Point) -> float:
         """The largest of what a point does over what is allowed; 1 or less: it is good enough."""
-        shares = [self.error(point, column) / limit for column, limit in self.errors.items()]
+        shares = [self.error(point, key) / limit for key, limit in self.limits.items()]
         if self.time is not None:
             shares.append(self.step_time(point) / self.time)
         return math.nan if any(map(math.isnan, shares)) else max(shares)
@@ -83,61 +86,56 @@ def chosen(points: Sequence[Point], wish: Wish) -> tuple[Point, bool]:
             f"in points.csv"
         )
     good = [p for p in candidates if wish.excess(p) <= 1.0]
-    if good and wish.errors:
+    if not good:
+        return min(candidates, key=lambda p: (wish.excess(p), wish.step_time(p))), False
+    if wish.limits:
         return min(good, key=wish.step_time), True
-    if good:
-        force = wish.columns["force"]
-        with_force = [p for p in good if not math.isnan(wish.error(p, force))] or good
-        return min(with_force, key=lambda p: (wish.error(p, force), wish.step_time(p))), True
-    return min(candidates, key=lambda p: (wish.excess(p), wish.step_time(p))), False
+    with_force = [p for p in good if not math.isnan(wish.error(p, "force"))] or good
+    return min(with_force, key=lambda p: (wish.error(p, "force"), wish.step_time(p))), True
 
 
 def advice(points: Sequence[Point], wish: Wish) -> list[str]:
     """The answer in lines."""
     point, met = chosen(points, wish)
-    lines = [f"{'use' if met else 'nothing meets this; closest'}: {point.kind}, {point.label}"]
-    lines += [f"  {line}" for line in commands(point)]
     step = wish.step_time(point)
     soil = "" if point.kind == "solver" else ", all particles decoded" if wish.particles else ", none decoded"
-    lines.append(
+    lines = [
+        f"{'use' if met else 'nothing meets this; closest'}: {point.kind}, {point.label}",
+        *(f"  {line}" for line in commands(point)),
         f"  costs {1e3 * step:.3g} ms per step of 1/60 s{soil}, on one core of {point.machine}: up to "
-        f"{1.0 / step:.3g} steps a second"
-    )
+        f"{1.0 / step:.3g} steps a second",
+    ]
     for key, (_, _, words, unit) in ERRORS.items():
-        column = wish.columns[key]
+        column = wish.column(key)
         value = effective_error(point, column, wish.bands)
         if math.isnan(value):
             continue
-        limit, band = wish.errors.get(column), wish.bands.get(column, 0.0)
+        limit, band = wish.limits.get(key), wish.bands.get(column, 0.0)
+        low, high = (getattr(point, f"{column}{end}", math.nan) for end in ("_low", "_high"))
         said = f"  {words}: {value:.3g}{unit}"
         if value <= band:
             said += " or less (within the reference's own error)"
-        elif (low := getattr(point, f"{column}_low", math.nan)) < (
-            high := getattr(point, f"{column}_high", 0.0)
-        ):
+        elif low < high:
             said += f" ({low:.3g} to {high:.3g} from case to case)"
-        said += f", asked for {limit:.3g}{unit}" if limit is not None else ""
-        lines.append(said)
+        lines.append(said if limit is None else f"{said}, asked for {limit:.3g}{unit}")
         if limit is not None and limit < band:
             lines.append(
                 f"    the reference itself is only known to {band:g}{unit}: nothing can be shown to be better"
             )
-    if point.kind == "surrogate" and wish.columns != OWN and not math.isnan(point.own_force_nrmse):
+    if point.kind == "surrogate" and not wish.own and not math.isnan(point.own_force_nrmse):
         lines.append(
             f"  against the solver that made its training runs: force NRMSE {point.own_force_nrmse:.3g}, particles "
             f"{point.own_position_rmse_mm:.3g} mm; the larger error counts"
         )
     reference = next((p for p in points if p.scene == wish.scene and p.axis == "reference"), None)
-    against = f"against the solver at {reference.label}" if reference else "against the study's reference"
-    if wish.columns == OWN:
-        against = "against the solver that made the training runs, over its test runs"
+    against = f"the solver at {reference.label}" if reference else "the study's reference"
+    if wish.own:
+        against = "the solver that made the training runs, over its test runs"
     measured = f"version {point.version}" + (f", commit {point.commit}" if point.commit else "")
     lines.append(
-        f"  rests on study {point.study}, scene {point.scene}: errors {against}; measured with {measured}"
+        f"  rests on study {point.study}, scene {point.scene}: errors against {against}; measured with {measured}"
     )
-    if point.note:
-        lines.append(f"  note: {point.note}")
-    return lines
+    return lines + ([f"  note: {point.note}"] if point.note else [])
 
 
 def commands(point: Point) -> list[str]:
@@ -167,38 +165,37 @@ def table(asked: str | None) -> Path:
     return Path(asked) if asked else Path(str(files("sgns.frontier").joinpath("table.csv")))
 
 
-def wished(cfg: Mapping[str, Any], points: Sequence[Point]) -> Wish:
+def wished(cfg: Any, points: Sequence[Point]) -> Wish:
     """The wish in the settings of the command.
 
     Raises:
         UserError: a limit is no number above 0, nothing is asked for, or the table has no such scene.
     """
+    task, errors, against, particles = (cfg[key] for key in ("task", "error", "against", "particles"))
     scenes = list(dict.fromkeys(p.scene for p in points))
-    if cfg["task"] not in scenes:
-        raise UserError(f"task is {cfg['task']!r}; the table has {', '.join(scenes) or 'none'}")
-    if not isinstance(cfg["error"], Mapping):
-        raise UserError(f"error is {cfg['error']!r}; give one of its keys, as error.force=0.3")
-    if wrong := set(cfg["error"]) - set(ERRORS):
+    if task not in scenes:
+        raise UserError(f"task is {task!r}; the table has {', '.join(scenes) or 'none'}")
+    if not isinstance(errors, Mapping):
+        raise UserError(f"error is {errors!r}; give one of its keys, as error.force=0.3")
+    if wrong := set(errors) - set(ERRORS):
         raise UserError(f"error has no key {min(wrong)!r}; allowed: {', '.join(ERRORS)}")
-    if cfg["against"] not in ("reference", "training"):
-        raise UserError(f"against is {cfg['against']!r}; allowed: reference, training")
-    if not isinstance(cfg["particles"], bool):
-        raise UserError(f"particles is {cfg['particles']!r}; allowed: true, false")
-    own = cfg["against"] == "training"
-    columns = OWN if own else {key: error[0] for key, error in ERRORS.items()}
-    limits = {}
-    for key, value in cfg["error"].items():
-        if value is not None:
-            limits[columns[key]] = ERRORS[key][1] * positive(f"error.{key}", value)
+    if against not in ("reference", "training"):
+        raise UserError(f"against is {against!r}; allowed: reference, training")
+    if not isinstance(particles, bool):
+        raise UserError(f"particles is {particles!r}; allowed: true, false")
+    limits = {
+        key: ERRORS[key][1] * positive(f"error.{key}", value)
+        for key, value in errors.items()
+        if value is not None
+    }
     time = None if cfg["time"] is None else positive("time", cfg["time"])
     if not limits and time is None:
         raise UserError(
             "nothing is asked for; give error.force=0.2, error.position=0.005 (m), time=0.01 (s), ..."
         )
-    study = next(p.study for p in points if p.scene == cfg["task"])
-    return Wish(
-        cfg["task"], limits, time, cfg["particles"], {} if own else bands(study, cfg["task"]), columns
-    )
+    own = against == "training"
+    study = next(p.study for p in points if p.scene == task)
+    return Wish(task, limits, time, particles, own, {} if own else bands(study, task))
 
 
 def positive(key: str, value: Any) -> float:

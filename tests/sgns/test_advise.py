@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,25 +26,21 @@ POINTS = [
 ]  # fmt: skip
 
 
-@pytest.fixture
-def own_table(tmp_path: Path) -> Path:
-    write_points(tmp_path / "points.csv", POINTS)
-    return tmp_path / "points.csv"
-
-
 def asked(*overrides: str) -> dict:
     with initialize_config_module("sgns.conf", version_base="1.3"):
         return OmegaConf.to_container(compose("advise", list(overrides)))
 
 
-def answer(*overrides: str) -> list[str]:
-    return advice(POINTS, wished(asked(*overrides), POINTS))
+def answer(*overrides: str, more: Sequence[Point] = ()) -> list[str]:
+    points = [*POINTS, *more]
+    return advice(points, wished(asked(*overrides), points))
 
 
 def test_the_fastest_that_is_good_enough_is_named_with_its_command() -> None:
     lines = answer("error.force=0.25")
     assert lines[0] == "use: solver, coarse"
     assert "sgns simulate scene=quick_excavation output=run.h5" in lines[1]
+    assert "study full" in lines[-1] and "the solver at finest" in lines[-1]
     surrogate = answer("error.force=0.4")
     assert surrogate[0] == "use: surrogate, r = 8"
     assert any("its training runs: force NRMSE 0.26" in line for line in surrogate)
@@ -55,27 +52,21 @@ def test_time_is_that_of_a_step() -> None:
     assert answer("time=0.1")[0] == "use: solver, coarse"  # the smallest error within the time
     closest = answer("error.force=0.25", "time=0.001")
     assert closest[0].startswith("nothing meets this; closest: surrogate")
+    decoded = answer("error.force=0.4", "time=0.001", "particles=true")
+    assert decoded[0].startswith("nothing meets this")
 
 
-def test_a_surrogate_is_not_taken_for_its_luck() -> None:
-    lucky = replace(
-        POINTS[3], label="lucky", force_nrmse=0.2, own_force_nrmse=0.5, wall_s_per_simulated_s=0.01
-    )
-    points = [*POINTS, lucky]
-    assert advice(points, wished(asked("error.force=0.4"), points))[0] == "use: surrogate, r = 8"
-    assert advice(points, wished(asked("time=0.001"), points))[0] == "use: surrogate, r = 8"
-
-
-def test_a_surrogate_that_no_command_makes_is_not_named() -> None:
-    study = replace(
-        POINTS[3], label="9 runs", force_nrmse=0.3, wall_s_per_simulated_s=0.01, note="trained on 9 runs"
-    )
-    points = [*POINTS, study]
-    assert advice(points, wished(asked("error.force=0.4"), points))[0] == "use: surrogate, r = 8"
-
-
-def test_particles_cost_their_decoding() -> None:
-    assert answer("error.force=0.4", "time=0.001", "particles=true")[0].startswith("nothing meets this")
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"label": "lucky", "force_nrmse": 0.2, "own_force_nrmse": 0.5},  # nearer than to what it learned from
+        {"label": "9 runs", "force_nrmse": 0.3, "note": "trained on 9 runs"},  # no command makes it
+    ],
+)
+def test_some_surrogates_are_not_named(change: dict) -> None:
+    other = replace(POINTS[3], wall_s_per_simulated_s=0.01, **change)
+    for wish in ("error.force=0.4", "time=0.001"):
+        assert answer(wish, more=[other])[0] == "use: surrogate, r = 8"
 
 
 def test_nothing_claims_to_be_better_than_the_reference_is_known() -> None:
@@ -88,11 +79,6 @@ def test_nothing_claims_to_be_better_than_the_reference_is_known() -> None:
 def test_surrogates_can_be_judged_against_their_training_runs() -> None:
     lines = answer("error.force=0.3", "against=training")
     assert lines[0] == "use: surrogate, r = 8" and "over its test runs" in lines[-1]
-
-
-def test_the_answer_says_what_it_rests_on() -> None:
-    last = answer("error.force=0.25")[-1]
-    assert "study full" in last and "the solver at finest" in last
 
 
 @pytest.mark.parametrize(
@@ -114,13 +100,13 @@ def test_bad_input_gives_one_line(overrides: list[str], line: str) -> None:
         answer(*overrides)
 
 
-def test_the_command_reads_a_table_of_one_s_own(own_table: Path) -> None:
-    assert main(OmegaConf.create(asked("error.force=0.25", f"table='{own_table}'"))) == pytest.approx(
-        3.0 / 60
-    )
+def test_the_command_reads_a_table_of_one_s_own(tmp_path: Path) -> None:
+    write_points(tmp_path / "points.csv", POINTS)
+    cfg = OmegaConf.create(asked("error.force=0.25", f"table='{tmp_path / 'points.csv'}'"))
+    assert main(cfg) == pytest.approx(3.0 / 60)
 
 
-def test_the_table_that_ships_is_the_committed_study() -> None:
+def test_the_table_that_ships_is_the_committed_study_and_answers() -> None:
     committed = Path(__file__).parents[2] / "experiments" / "accuracy_vs_time" / "full" / "points.csv"
     assert table(None).read_bytes() == committed.read_bytes()
     points = read_points(table(None))
@@ -128,12 +114,7 @@ def test_the_table_that_ships_is_the_committed_study() -> None:
     references = [p for p in points if p.axis == "reference"]
     assert len(references) == len({p.scene for p in points})
     assert not any("/" in p.command for p in points)  # no folder of the machine that made it
-
-
-def test_the_table_that_ships_answers() -> None:
-    points = read_points(table(None))
-    lines = advice(points, wished(asked("error.force=0.6", "time=0.01"), points))
-    assert lines[0].startswith("use: ")
+    assert advice(points, wished(asked("error.force=0.6", "time=0.01"), points))[0].startswith("use: ")
 
 
 @pytest.mark.parametrize("study", ["../train", "x" * 300, "a/b", "$"])

@@ -38,10 +38,9 @@ from sgns.data.published import read_published
 from sgns.data.run import Run
 from sgns.evaluate.command import read_log
 from sgns.evaluate.costs import network_costs
-from sgns.frontier.measure import read_record
 from sgns.frontier.observation import read_observation
 from sgns.frontier.point import read_points
-from sgns.frontier.study import Store
+from sgns.frontier.study import Study
 from sgns.model.checkpoint import load_surrogate
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, read_reduced, reduce_dataset
@@ -592,8 +591,7 @@ READERS = {
     "tensorboard/events.out.tfevents.1.x": (lambda path: read_log(path.parent), UserError, "tfevents"),
     "points.csv": (read_points, UserError, r"points\.csv"),
     "observed.npz": (read_observation, UserError, "observed"),
-    "timed.json": (read_record, UserError, r"timed\.json"),
-    "points/a.json": (lambda path: Store(path.parents[1]).points(), UserError, r"a\.json"),
+    "points/a.json": (lambda path: Study("x", (), path.parents[1]).points(), UserError, r"a\.json"),
     "valid.tfrecord": (lambda path: read_published(path.parent), UserError, None),
 }
 """What is read -> how, how it is refused, and in which words."""

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -38,16 +39,11 @@ def main(cfg: DictConfig) -> None:
     if axes:
         with file_lock(folder / "study.yaml", wait=True):  # what it says is read and added to
             study.record()
-        from sgns.frontier import measure  # training takes seconds to import
+        from sgns.frontier.measure import measure  # training takes seconds to import
 
-        functions = {
-            "solver": measure.measure_solver,
-            "reduction": measure.measure_reduction,
-            "surrogate": measure.measure_surrogates,
-        }
         for axis in axes:
-            functions[axis](study)
-        if not any(study.store.has(s.name, "solver", s.reference.label) for s in study.scenes):
+            measure(study, axis)
+        if not any(study.file(s.name, "solver", s.reference.label).exists() for s in study.scenes):
             # Another process is still at it; what was measured here is kept.
             log.info("no reference is there yet, so nothing can be judged; later: sgns frontier axis=none")
             return
@@ -65,9 +61,6 @@ def axes_of(asked: str | None) -> tuple[str, ...]:
     return (asked,)
 
 
-# --- Errors of the points that are there ----------------------------------------------------------------
-
-
 def points_with_errors(study: Study) -> list[Point]:
     """All points of a study with their errors against the reference of their scene, fastest last.
 
@@ -75,23 +68,21 @@ def points_with_errors(study: Study) -> list[Point]:
         UserError: no reference has been measured.
     """
     found: list[Point] = []
-    measured = study.store.points()
+    measured = study.points()
     for scene in study.scenes:
         points = [(point, cases) for point, cases in measured if point.scene == scene.name]
-        if not points:
-            continue
         label = scene.reference.label
-        if not study.store.has(scene.name, "solver", label):
+        reference = next((p for p, _ in points if (p.kind, p.label) == ("solver", label)), None)
+        if reference:
+            runs = {case: study.observation(reference, case) for case in scene.cases}
+            compared = [with_errors(study, scene, point, cases, runs) for point, cases in points]
+            found += sorted(compared, key=lambda p: (-math.inf if math.isnan(p.cost) else -p.cost, p.label))
+        elif points:
             log.warning(
                 "%s: the reference (%s) is not there yet, so nothing can be judged; sgns frontier axis=solver",
                 scene.name,
                 label,
             )
-            continue
-        reference = Point(study.name, scene.name, "solver", "reference", label)
-        runs = {case: study.store.observation(reference, case) for case in scene.cases}
-        compared = [with_errors(study, scene, point, cases, runs) for point, cases in points]
-        found += sorted(compared, key=lambda p: (-math.inf if math.isnan(p.cost) else -p.cost, p.label))
     if not found:
         raise UserError(
             f"{study.folder} holds no points with a reference; measure some: sgns frontier "
@@ -104,15 +95,14 @@ def with_errors(
     study: Study, scene: StudyScene, point: Point, cases: Iterable[str], reference: Mapping[str, Observation]
 ) -> Point:
     """A point with its errors; without any if it is the reference or did not finish."""
-    if point.axis == "reference":
-        return point
-    runs = {case: study.store.observation(point, case) for case in cases if case in reference}
-    if not runs or point.note.startswith("stopped"):
+    runs = {case: study.observation(point, case) for case in cases if case in reference}
+    if point.axis == "reference" or not runs or point.note.startswith("stopped"):
         return point
     if not all(run.finite for run in runs.values()):
         return replace(point, note=point.note or "left the range: not finite")
     compared = [compare(run, reference[case]) for case, run in runs.items()]
-    return replace(point, **errors(compared, free_body=scene.free_body))
+    columns: dict[str, Any] = errors(compared, free_body=scene.free_body)
+    return replace(point, **columns)
 
 
 # --- The gathered study as a table, figures, and one HTML page that needs nothing from outside ----------
@@ -158,12 +148,6 @@ def write_study(study: Study, points: Sequence[Point]) -> Path:
 def scene_figures(scene: StudyScene, points: Sequence[Point]) -> list[ReportFigure]:
     """The pictures of a scene; those that would be empty are left out."""
     name = scene.name
-    best = {
-        id(p): p for column in ("force_nrmse", "position_rmse_mm") for p in front(points, column, scene.bands)
-    }
-    through_time = [p for p in best.values() if not math.isnan(p.force_nrmse_q4)][:MOST_THROUGH_TIME]
-    trained = [p for p in points if p.training_s > 0 and not math.isnan(p.own_force_nrmse)]
-    reduced = [p for p in points if p.kind == "reduction" and p.own_position_rmse_mm > 0]
     drawn = [
         (
             column.removesuffix("_mm"),
@@ -174,38 +158,33 @@ def scene_figures(scene: StudyScene, points: Sequence[Point]) -> list[ReportFigu
         for column, words in ERRORS.items()
         if known(points, column)
     ]
-    for suffix, shown, draw, title, words, caption in (
-        (
-            "through_time",
-            through_time,
-            through_time_figure,
-            "errors through the run, points of the fronts",
-            "error through time",
-            "Force: in each quarter. Soil: at the end of each quarter, where errors have added up.",
-        ),
-        (
-            "training",
-            trained,
-            training_figure,
-            "what training buys",
-            "error against training time",
-            "Errors against the solver that made the training runs, on its held-out runs, over training time.",
-        ),
-        (
-            "reduction",
-            reduced,
-            reduction_figure,
-            "what r modes leave out",
-            "reduction alone",
-            "No simulation: held-out runs projected onto the modes. No surrogate with r modes is better.",
-        ),
-    ):
-        if shown:
-            drawn.append((suffix, words, caption, draw(shown, f"{name}: {title}")))
+    best = on_fronts(scene, points, ("force_nrmse", "position_rmse_mm"))
+    if through_time := [p for p in best if not math.isnan(p.force_nrmse_q4)][:MOST_THROUGH_TIME]:
+        caption = "Force: in each quarter. Soil: at the end of each quarter, where errors have added up."
+        image = through_time_figure(through_time, f"{name}: errors through the run, points of the fronts")
+        drawn.append(("through_time", "error through time", caption, image))
+    if trained := [p for p in points if p.training_s > 0 and not math.isnan(p.own_force_nrmse)]:
+        caption = (
+            "Errors against the solver that made the training runs, on its held-out runs, over training time."
+        )
+        image = training_figure(trained, f"{name}: what training buys")
+        drawn.append(("training", "error against training time", caption, image))
+    if reduced := [p for p in points if p.kind == "reduction" and p.own_position_rmse_mm > 0]:
+        caption = (
+            "No simulation: held-out runs projected onto the modes. No surrogate with r modes is better."
+        )
+        image = reduction_figure(reduced, f"{name}: what r modes leave out")
+        drawn.append(("reduction", "reduction alone", caption, image))
     return [
         ReportFigure(f"{name}_{suffix}", f"{name}: {words}", caption, image)
         for suffix, words, caption, image in drawn
     ]
+
+
+def on_fronts(scene: StudyScene, points: Sequence[Point], columns: Iterable[str]) -> list[Point]:
+    """The points that are on the front of one of these errors, each once."""
+    found = [point for column in columns for point in front(points, column, scene.bands)]
+    return list(dict.fromkeys(found))
 
 
 def scene_table(scene: StudyScene, points: Sequence[Point]) -> tuple[list[str], list[tuple[bool, list[str]]]]:
@@ -218,13 +197,12 @@ def scene_table(scene: StudyScene, points: Sequence[Point]) -> tuple[list[str], 
         "ratio": [digits(p.ratio) for p in points],
     }
     more = {heading: [digits(factor * getattr(p, name)) for p in points] for heading, name, factor in TABLE}
-    more["note"] = [p.note for p in points]
-    columns |= {
-        heading: cells for heading, cells in more.items() if any(cell not in ("", "–") for cell in cells)
-    }
-    best = {id(p) for column in ERRORS for p in front(points, column, scene.bands)}
+    for heading, cells in (more | {"note": [p.note for p in points]}).items():
+        if any(cell not in ("", "–") for cell in cells):
+            columns[heading] = cells
+    best = on_fronts(scene, points, ERRORS)
     rows = zip(*columns.values(), strict=True)
-    return list(columns), [(id(p) in best, list(row)) for p, row in zip(points, rows, strict=True)]
+    return list(columns), [(p in best, list(row)) for p, row in zip(points, rows, strict=True)]
 
 
 def made(study: Study, points: Sequence[Point]) -> dict[str, str]:

@@ -77,7 +77,7 @@ def scene_figure(points: Sequence[Point], column: str, bands: Mapping[str, float
         labels.append((point.cost, max(band, low * 1.3), f"reference: {point.label}"))
     axes.legend(loc="lower left", fontsize=8)
     fix_layout(figure)
-    place_labels(axes, *zip(*labels, strict=True), line=stairs)
+    place_labels(axes, labels, line=stairs)
     return png(figure)
 
 
@@ -91,8 +91,8 @@ def draw_points(axes: Axes, points: Sequence[Point], column: str) -> None:
         axes.errorbar(
             column_of(chosen, "cost"),
             column_of(chosen, column),
-            xerr=np.array([bar(p, "wall_s_per_simulated_s") for p in chosen]).T,
-            yerr=np.array([bar(p, column) for p in chosen]).T if has_cases else None,
+            xerr=bars(chosen, "wall_s_per_simulated_s") * [not p.shared for p in chosen],
+            yerr=bars(chosen, column) if has_cases else None,
             fmt="*" if paper else marker,
             ms=15 if paper else 6,
             color=colour,
@@ -105,12 +105,10 @@ def draw_points(axes: Axes, points: Sequence[Point], column: str) -> None:
         )
 
 
-def bar(point: Point, column: str) -> tuple[float, float]:
-    """How far the bar reaches below and above; nothing where it is not known."""
-    if column == "wall_s_per_simulated_s" and point.shared:
-        return 0.0, 0.0
-    middle, low, high = (getattr(point, f"{column}{end}") for end in ("", "_low", "_high"))
-    return tuple(0.0 if math.isnan(reach) else max(reach, 0.0) for reach in (middle - low, high - middle))
+def bars(points: Sequence[Point], column: str) -> np.ndarray:
+    """How far bars reach below and above, shape (2, points); nothing where it is not known."""
+    middle, low, high = (np.array(column_of(points, f"{column}{end}")) for end in ("", "_low", "_high"))
+    return np.fmax([middle - low, high - middle], 0.0)
 
 
 @plain_text
@@ -139,7 +137,6 @@ def reduction_figure(points: Sequence[Point], title: str) -> bytes:
         xlabel="encoding and decoding every frame, seconds of one core per simulated second",
         ylabel="particle positions, RMSE on held-out runs [mm]",
     )
-    errors = column_of(points, "own_position_rmse_mm")
     for number, axis in enumerate(dict.fromkeys(p.axis for p in points)):
         line = sorted((p for p in points if p.axis == axis), key=lambda p: p.modes)
         x, y = column_of(line, "cost"), column_of(line, "own_position_rmse_mm")
@@ -150,7 +147,7 @@ def reduction_figure(points: Sequence[Point], title: str) -> bytes:
     axes.legend(fontsize=8, title="numbers: r")
     fix_layout(figure)
     axes.autoscale(False)
-    place_labels(axes, column_of(points, "cost"), errors, [f"{p.modes:g}" for p in points])
+    place_labels(axes, [(p.cost, p.own_position_rmse_mm, f"{p.modes:g}") for p in points])
     return png(figure)
 
 
@@ -159,20 +156,11 @@ def training_figure(points: Sequence[Point], title: str) -> bytes:
     """What training time buys: errors against the solver that made the runs, over processor time, as PNG."""
     figure = new_figure(13, 5.5, dpi=DPI)
     figure.suptitle(title, fontsize=10)
+    panels = figure.subplots(1, 2)
+    force = "own_force_nrmse", "force, NRMSE [-]", "mean_force_nrmse", "the mean force of the training runs"
+    soil = "own_position_rmse_mm", "particle positions, RMSE [mm]", "frozen_rmse_mm", "nothing moves"
     labels = []
-    for axes, (column, words, baseline, baseline_words) in zip(
-        figure.subplots(1, 2),
-        (
-            (
-                "own_force_nrmse",
-                "force, NRMSE [-]",
-                "mean_force_nrmse",
-                "the mean force of the training runs",
-            ),
-            ("own_position_rmse_mm", "particle positions, RMSE [mm]", "frozen_rmse_mm", "nothing moves"),
-        ),
-        strict=True,
-    ):
+    for axes, (column, words, baseline, baseline_words) in zip(panels, (force, soil), strict=True):
         shown = [p for p in points if p.training_s > 0 and getattr(p, column) > 0]
         if not shown:
             continue
@@ -184,10 +172,10 @@ def training_figure(points: Sequence[Point], title: str) -> bytes:
             axes.axhline(line[0], color="0.5", ls=":", lw=1)
             axes.text(min(x) / 1.4, line[0], f" {baseline_words}", fontsize=7, va="bottom", color="0.35")
         axes.set(xlim=(min(x) / 1.5, max(x) * 3.0), ylim=(min(y) / 1.5, max([*y, *line]) * 1.5))
-        labels.append((axes, x, y, [p.label for p in shown]))
+        labels.append((axes, [(p.training_s, getattr(p, column), p.label) for p in shown]))
     fix_layout(figure)
-    for label in labels:
-        place_labels(*label, size=6.0)
+    for axes, of_points in labels:
+        place_labels(axes, of_points, size=6.0)
     return png(figure)
 
 
@@ -220,13 +208,12 @@ def fix_layout(figure: Figure) -> None:
 
 def place_labels(
     axes: Axes,
-    x: Sequence[float],
-    y: Sequence[float],
-    texts: Sequence[str],
+    labels: Sequence[tuple[float, float, str]],
     size: float = 7.0,
     line: Sequence[tuple[float, float]] = (),
 ) -> np.ndarray:
-    """Write a text beside each point, where it covers no other, no point and no line and stays within the border.
+    """Write a text beside each point (x, y, text), where it covers no other, no point and no line and stays within the
+    border.
 
     The limits and scales of the axes must not change afterwards. Points whose surroundings are crowded choose last
     but are given the room further away. Points and the corners of a line to keep off are in data coordinates; empty
@@ -235,30 +222,26 @@ def place_labels(
     Returns:
         The box of each text in pixels: x0, y0, x1, y1; shape (texts, 4).
     """
-    renderer = axes.figure.canvas.get_renderer()
-    border = axes.get_window_extent(renderer)
-    points = axes.transData.transform(np.column_stack([x, y]).astype(float))
-    corners = axes.transData.transform(np.array(line, dtype=float)) if len(line) else points[:0]
+    border = np.array(axes.get_window_extent().get_points())
+    points = axes.transData.transform([label[:2] for label in labels])
+    corners = axes.transData.transform(line) if line else points[:0]
     # Boxes to keep off: of points, of labels, and without a size along lines.
     taken = [np.hstack([points - 4.0, points + 4.0]), *map(along, corners[:-1], corners[1:])]
     ways = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
     boxes: dict[int, np.ndarray] = {}
     crowd = np.hypot(*(points[:, None] - points).T).T < 60.0
     for index in np.argsort(crowd.sum(axis=1), kind="stable"):
-        if not texts[index]:
+        if not (words := labels[index][2]):
             continue
-        text = axes.text(
-            0, 0, texts[index], fontsize=size, transform=None, va="center", ha="center", zorder=6
-        )
+        text = axes.text(0, 0, words, fontsize=size, transform=None, va="center", ha="center", zorder=6)
         text.set_path_effects([withStroke(linewidth=2.0, foreground="white")])
-        extent = text.get_window_extent(renderer)
-        half = np.array([extent.width / 2 + 2, extent.height / 2 + 1])
+        half = np.array(text.get_window_extent().size) / 2 + (2, 1)
         shift = half * np.sign(np.round(ways, 6)) * np.minimum(1.0, 2 * np.abs(ways))
         centres = (points[index] + DISTANCES[:, None, None] * ways + shift).reshape(-1, 2)
         low, high = centres - half, centres + half
         others = np.concatenate(taken)
         hits = ((low[:, None] < others[:, 2:]) & (high[:, None] > others[:, :2])).all(axis=2).sum(axis=1)
-        inside = ((low >= border.min + 2) & (high <= border.max - 2)).all(axis=1)
+        inside = ((low >= border[0] + 2) & (high <= border[1] - 2)).all(axis=1)
         # The nearest that covers nothing; where there is none, the one that covers the fewest.
         centre = centres[np.argmin(np.where(inside, hits, len(others)))]
         text.set_position(tuple(centre))

@@ -9,7 +9,6 @@ from dataclasses import dataclass, fields
 from functools import reduce
 from operator import add
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -42,6 +41,9 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "moved": ("K", "P", 3),
     "surface": ("K", "nx", "ny"),
 }
+
+Seen = tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""A frame: time [s], force [N] and torque [N m] by the soil on the body, its pose, the particles (n, 3) [m]."""
 
 
 @dataclass(frozen=True)
@@ -94,36 +96,29 @@ def observed_frames(frame_count: int, frame_rate: float) -> np.ndarray:
     return np.union1d(np.arange(0, frame_count, every), frame_count - 1)
 
 
-class Observer:
-    """Collects an observation of a scene frame by frame, from where the particles are at time 0 [m], shape (n, 3)."""
+def observe(scene: Scene, frames: Iterable[Seen]) -> Observation:
+    """The observation of a run of a scene: of all its frames, one after the other.
 
-    def __init__(self, scene: Scene, start: np.ndarray) -> None:
-        self._start = np.asarray(start, dtype=np.float64)
-        size = np.asarray(scene.bed.size)
-        self._weights = lattice_weights(self._start, size)
-        x, y = (np.linspace(0.0, edge, max(1, round(edge / COLUMN)) + 1) for edge in size[:2])
-        self._columns = SurfaceGrid(x, y)
-        # Half the edge of the cube that belongs to one particle, whatever share of them is here.
-        self._above = 0.5 * (scene.soil_volume / len(self._start)) ** (1.0 / 3.0)
-        self._frames: dict[str, list[Any]] = {f.name: [] for f in fields(Observation)}
-
-    def add(self, time: float, force: np.ndarray, torque: np.ndarray, pose: np.ndarray) -> None:
-        """A frame: its time [s], force [N], torque [N m] and the pose of the body."""
-        for key, value in (("time", time), ("force", force), ("torque", torque), ("pose", pose)):
-            self._frames[key].append(np.array(value, dtype=np.float64))
-
-    def add_soil(self, time: float, position: np.ndarray) -> None:
-        """The particles in a frame in which the soil is to be observed [m], shape (n, 3)."""
-        position = np.asarray(position, dtype=np.float64)
-        with np.errstate(invalid="ignore"):  # no particle is near: NaN
-            moved = self._weights @ (position - self._start) / self._weights.sum(axis=1)[:, None]
-        self._frames["soil_time"].append(time)
-        self._frames["moved"].append(moved.astype(np.float32))
-        self._frames["surface"].append(height_map(position, self._columns) + self._above)
-
-    def finish(self) -> Observation:
-        """All that was seen."""
-        return Observation(**{key: np.array(values) for key, values in self._frames.items()})
+    Displacements are from the undisturbed bed, not from frame 0 of the run: what a reduction leaves out of the bed at
+    rest would be left out of every error.
+    """
+    start = np.asarray(scene.initial_positions(), dtype=np.float64)
+    weights = lattice_weights(start, np.asarray(scene.bed.size))
+    x, y = (np.linspace(0.0, edge, max(1, round(edge / COLUMN)) + 1) for edge in scene.bed.size[:2])
+    # Half the edge of the cube that belongs to one particle, whatever share of them is here.
+    above = 0.5 * (scene.soil_volume / len(start)) ** (1.0 / 3.0)
+    wanted = set(observed_frames(scene.frame_count, scene.frame_rate).tolist())
+    series, soil = [], []
+    for index, (time, force, torque, pose, position) in enumerate(frames):
+        series.append((time, force, torque, pose))
+        if index in wanted:
+            position = np.asarray(position, dtype=np.float64)
+            with np.errstate(invalid="ignore"):  # no particle is near: NaN
+                moved = weights @ (position - start) / weights.sum(axis=1)[:, None]
+            surface = height_map(position, SurfaceGrid(x, y)) + above
+            soil.append((time, moved.astype(np.float32), surface))
+    columns = [np.array(values, dtype=np.float64) for values in zip(*series, strict=True)]
+    return Observation(*columns, *map(np.array, zip(*soil, strict=True)))
 
 
 def lattice_weights(start: np.ndarray, size: np.ndarray) -> csr_array:
@@ -141,29 +136,6 @@ def lattice_weights(start: np.ndarray, size: np.ndarray) -> csr_array:
     return csr_array(entries, shape=(int(np.prod(counts)), len(start)))
 
 
-def observe_arrays(
-    scene: Scene,
-    start: np.ndarray,
-    time: np.ndarray,
-    force: np.ndarray,
-    torque: np.ndarray,
-    pose: np.ndarray,
-    frames: np.ndarray,
-    positions: Iterable[np.ndarray],
-) -> Observation:
-    """The observation of a run that is in memory: frames as in `Observation`, the particles (n, 3) [m] in some of them.
-
-    `start` is where the particles are in an undisturbed bed [m], shape (n, 3). Not a frame of the run: what a reduction
-    leaves out of the bed at rest would be left out of every error. `frames` are `observed_frames`, the first of them 0.
-    """
-    observer = Observer(scene, start)
-    for frame, position in zip(frames, positions, strict=True):
-        observer.add_soil(float(time[frame]), position)
-    for values in zip(time, force, torque, pose, strict=True):
-        observer.add(*values)
-    return observer.finish()
-
-
 # --- How far observed runs are from reference runs of the same scenes, on whatever particles --------------
 # Definitions are those of docs/conventions.md where it has them. Frame 0, at rest, does not count. Forces,
 # torques and poses of a run with another frame rate are interpolated in time at the reference's frames, its
@@ -174,21 +146,17 @@ def observe_arrays(
 class Comparison:
     """One run beside its reference."""
 
-    force: tuple[VectorErrors, ...]  # by quarter of the run, four `VectorErrors` [N]
+    force: tuple[VectorErrors, ...]  # by quarter of the run [N]
     torque: VectorErrors  # of the whole run [N m]
     # mean-square difference of displacement at every observed time but the first [m²], shape (K - 1,)
     position: np.ndarray
     surface: float  # mean-square difference of the last surface [m²]
     sinkage: float  # mean absolute difference of the body's height [m]
 
-    @property
-    def whole_force(self) -> VectorErrors:
-        """Of all quarters."""
-        return reduce(add, self.force)
 
-    def position_at(self, quarter: int) -> float:
-        """Mean-square difference of displacement at the end of a quarter of the run, 1 to 4 [m²]."""
-        return float(self.position[max(0, round(len(self.position) * quarter / 4) - 1)])
+def pooled(errors: Iterable[VectorErrors]) -> VectorErrors:
+    """Errors of several runs, or parts of one, together."""
+    return reduce(add, errors)
 
 
 def compare(run: Observation, reference: Observation) -> Comparison:
@@ -197,50 +165,36 @@ def compare(run: Observation, reference: Observation) -> Comparison:
     Raises:
         UserError: the two are not of one scene, or one is longer than the other.
     """
-    if (
-        run.moved.shape[1:] != reference.moved.shape[1:]
-        or run.surface.shape[1:] != reference.surface.shape[1:]
-    ):
+    if any(getattr(run, k).shape[1:] != getattr(reference, k).shape[1:] for k in ("moved", "surface")):
         raise UserError("two runs in bins of different sizes cannot be compared")
     if run.time[-1] < reference.time[-1] - 1.5 / 60.0:
         raise UserError(
             f"a run that ends at {run.time[-1]:.3f} s cannot be compared with one that ends at "
             f"{reference.time[-1]:.3f} s"
         )
-    time = reference.time[1:]
-    force, torque = (resampled(run.time, values, time) for values in (run.force, run.torque))
-    quarters = np.array_split(np.arange(len(time)), 4)
-    heights = resampled(run.time, run.pose[:, 2:3], time)[:, 0]
+    force, torque, pose = (
+        resampled(run.time, values, reference.time) for values in (run.force, run.torque, run.pose)
+    )
+    quarters = np.array_split(np.arange(1, len(reference.time)), 4)
+    # Points that hold soil in only one of the two beds do not count.
+    both = ~np.isnan(reference.moved[0]) & ~np.isnan(run.moved[0])
+    moved = resampled(run.soil_time, run.moved[:, both].astype(np.float64), reference.soil_time)
     return Comparison(
-        force=tuple(VectorErrors.compare(reference.force[1:][part], force[part]) for part in quarters),
-        torque=VectorErrors.compare(reference.torque[1:], torque),
-        position=mean_squares(run, reference),
+        force=tuple(VectorErrors.compare(reference.force[part], force[part]) for part in quarters),
+        torque=VectorErrors.compare(reference.torque[1:], torque[1:]),
+        position=((moved[1:] - reference.moved[1:, both]) ** 2).mean(axis=1),
         surface=height_error(run.surface[-1], reference.surface[-1]),
-        sinkage=float(np.abs(heights - reference.pose[1:, 2]).mean()),
+        sinkage=float(np.abs(pose[1:, 2] - reference.pose[1:, 2]).mean()),
     )
 
 
 def resampled(time: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Values (T, k) at other times, interpolated linearly; the first and last hold beyond the ends."""
-    if len(time) == len(wanted) + 1 and np.allclose(time[1:], wanted):
-        return values[1:]
-    return np.stack([np.interp(wanted, time, column) for column in values.T], axis=1)
-
-
-def mean_squares(run: Observation, reference: Observation) -> np.ndarray:
-    """Mean-square difference of displacements over lattice points and axes, shape (K - 1,) [m²].
-
-    Points that hold soil in only one of the two beds do not count.
-    """
-    moved = run.moved
-    if len(run.soil_time) != len(reference.soil_time) or not np.allclose(
-        run.soil_time, reference.soil_time, atol=1e-6
-    ):
-        flat = resampled(run.soil_time, moved.reshape(len(moved), -1), reference.soil_time)
-        moved = flat.reshape(len(reference.soil_time), *moved.shape[1:])
-    both = ~np.isnan(reference.moved[0]) & ~np.isnan(run.moved[0])
-    difference = moved[1:, both].astype(np.float64) - reference.moved[1:, both]
-    return (difference**2).mean(axis=1)
+    """Values (T, ...) at other times, interpolated linearly; the first and last hold beyond the ends."""
+    place = np.interp(wanted, time, np.arange(len(time)))
+    before = place.astype(int)
+    after = np.minimum(before + 1, len(time) - 1)
+    share = (place - before).reshape(-1, *[1] * (values.ndim - 1))
+    return values[before] + share * (values[after] - values[before])
 
 
 def errors(comparisons: Sequence[Comparison], *, free_body: bool = False) -> dict[str, float]:
@@ -248,30 +202,26 @@ def errors(comparisons: Sequence[Comparison], *, free_body: bool = False) -> dic
 
     Squares are summed over the cases before the root is taken; low and high are those of the best and the worst case.
     """
-
-    def pooled(squares: Iterable[float]) -> float:
-        return rms_mm(float(np.mean(list(squares))))
-
-    force = reduce(add, (c.whole_force for c in comparisons))
-    torque = reduce(add, (c.torque for c in comparisons))
+    forces = [pooled(c.force) for c in comparisons]
+    force, torque = pooled(forces), pooled(c.torque for c in comparisons)
+    by_case = [one.overall_nrmse for one in forces]
     found = {
         "force_nrmse": force.overall_nrmse,
+        "force_nrmse_low": min(by_case),
+        "force_nrmse_high": max(by_case),
         "draft_nrmse": float(force.nrmse[0]),
         "draft_mean_error": float(force.mpe[0]) / 100.0,
         "vertical_nrmse": float(force.nrmse[2]),
         "vertical_mean_error": float(force.mpe[2]) / 100.0,
         "torque_nrmse": torque.overall_nrmse,
-        "position_rmse_mm": pooled(c.position.mean() for c in comparisons),
-        "surface_rmse_mm": pooled(c.surface for c in comparisons),
         "sinkage_error_mm": 1e3 * float(np.mean([c.sinkage for c in comparisons])) if free_body else math.nan,
     }
+    squares = [c.position.mean() for c in comparisons], [c.surface for c in comparisons]
+    for name, values in zip(("position_rmse_mm", "surface_rmse_mm"), squares, strict=True):
+        for end, pool in (("", np.mean), ("_low", min), ("_high", max)):
+            found[name + end] = rms_mm(float(pool(values)))
     for q in range(1, 5):
-        found[f"force_nrmse_q{q}"] = reduce(add, (c.force[q - 1] for c in comparisons)).overall_nrmse
-        found[f"position_rmse_mm_q{q}"] = pooled(c.position_at(q) for c in comparisons)
-    for name, values in (
-        ("force_nrmse", [c.whole_force.overall_nrmse for c in comparisons]),
-        ("position_rmse_mm", [rms_mm(c.position.mean()) for c in comparisons]),
-        ("surface_rmse_mm", [rms_mm(c.surface) for c in comparisons]),
-    ):
-        found |= {f"{name}_low": min(values), f"{name}_high": max(values)}
+        found[f"force_nrmse_q{q}"] = pooled(c.force[q - 1] for c in comparisons).overall_nrmse
+        ends = [c.position[max(0, round(len(c.position) * q / 4) - 1)] for c in comparisons]
+        found[f"position_rmse_mm_q{q}"] = rms_mm(float(np.mean(ends)))
     return found

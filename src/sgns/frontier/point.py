@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -121,8 +121,8 @@ class Point:
 
     @property
     def cost(self) -> float:
-        """Seconds of one core per simulated second: wall time, or processor time where the core was shared."""
-        return self.processor_s_per_simulated_s if self.shared else self.wall_s_per_simulated_s
+        """Seconds of one core per simulated second, see `core_time`."""
+        return core_time(self.wall_s_per_simulated_s, self.processor_s_per_simulated_s)
 
     @property
     def decoded_cost(self) -> float:
@@ -150,14 +150,13 @@ class Point:
             given = row.get(field.name)
             if given is None or given == "":
                 continue
+            divides = field.name in _DIVISORS
             try:
                 values[field.name] = value = _READERS[str(field.type)](given)
-                if isinstance(value, float) and (
-                    math.isinf(value) or (field.name in _ABOVE_ZERO and value <= 0.0)
-                ):
+                if isinstance(value, float) and (math.isinf(value) or (divides and value <= 0.0)):
                     raise ValueError
             except (ValueError, KeyError, TypeError) as error:
-                kind = "float above 0" if field.name in _ABOVE_ZERO else field.type
+                kind = "float above 0" if divides else field.type
                 raise UserError(f"{field.name} is {given!r:.40}, which is not a {kind}") from error
         try:
             return cls(**values)
@@ -165,9 +164,17 @@ class Point:
             raise UserError(f"a row of operating points lacks columns: {error}") from None
 
 
-_ABOVE_ZERO = ("wall_s_per_simulated_s", "processor_s_per_simulated_s", "decoded_wall_s_per_simulated_s")
-"""Columns that others are divided by."""
-_READERS = {"str": str, "float": float, "bool": lambda v: {"True": True, "False": False}[str(v)]}
+_DIVISORS = ("wall_s_per_simulated_s", "processor_s_per_simulated_s", "decoded_wall_s_per_simulated_s")
+_READERS: dict[str, Callable[[Any], Any]] = {
+    "str": str,
+    "float": float,
+    "bool": lambda v: {"True": True, "False": False}[str(v)],
+}
+
+
+def core_time(wall: float, processor: float) -> float:
+    """Wall time, or the processor's where other work had the core for more than a tenth of the time."""
+    return processor if wall > SHARED * processor else wall
 
 
 def write_points(file: Path, points: Iterable[Point]) -> None:

@@ -1,4 +1,4 @@
-"""A study: which points of which scenes are measured, how they are timed, and where they are kept."""
+"""A study: which points of which scenes are measured, how they are timed, and the folder that keeps them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import shlex
 import statistics
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
@@ -29,38 +28,12 @@ from sgns.config import UserError, parse_yaml
 from sgns.data.files import read_json, read_text, write_whole
 from sgns.evaluate.costs import command_line, cpu_model
 from sgns.frontier.observation import Observation, read_observation
-from sgns.frontier.point import ERRORS, SHARED, Point
+from sgns.frontier.point import ERRORS, Point, core_time
+from sgns.rollout import single_thread
 from sgns.simulate.scene import scene_from_config
 
-# --- Wall times that can be compared: one core, warm, medians, beside a workload that is always the same
-# The reference workload is the default scene of `sgns simulate` (the paper's bin at 20 mm, 4 particles per cell, half
-# of it computed) while the plate cuts. Its time is taken just before and just after what is measured, on the same
-# core, so that ratios to it hold on a machine whose speed changes.
-
-FRAMES = 8  # of one measurement of the workload
-STRETCHES = 2  # of which the median is taken, before and after each
-
-
-@contextmanager
-def one_core(last: bool = False) -> Iterator[None]:
-    """This process on the first (or last) core it may use, and torch on one thread; as before afterwards."""
-    threads = torch.get_num_threads()
-    cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
-    try:
-        torch.set_num_threads(1)
-        if cores:
-            os.sched_setaffinity(0, {max(cores) if last else min(cores)})
-        yield
-    finally:
-        torch.set_num_threads(threads)
-        if cores:
-            os.sched_setaffinity(0, cores)
-
-
-def stopwatch() -> Callable[[], tuple[float, float]]:
-    """A function that tells the wall and the processor time since now [s]."""
-    began, clock = time.perf_counter(), time.process_time()
-    return lambda: (elapsed(began, time.perf_counter()), elapsed(clock, time.process_time()))
+AXES = ("solver", "reduction", "surrogate")
+"""Groups of points that one command, or one process of several, measures."""
 
 
 def composed(command: str, overrides: Sequence[str]) -> DictConfig:
@@ -77,144 +50,13 @@ def composed_scene(overrides: Sequence[str]) -> tuple[Scene, DictConfig]:
     return scene_from_config(cfg), cfg
 
 
-class Workload:
-    """The reference workload, warm."""
-
-    def __init__(self) -> None:
-        self._frames: Iterator[Frame] = iter(())
-
-    @cached_property
-    def _scene(self) -> Scene:
-        return composed_scene(["scene=excavation"])[0]
-
-    def measure(self) -> list[float]:
-        """Wall seconds per simulated second of each of a few stretches; processor seconds where the core was shared."""
-        found = []
-        for _ in range(STRETCHES):
-            if next(self._frames, None) is None:
-                self._frames = Solver(self._scene, effects_for(self._scene)[0]).frames()
-                for _ in range(2):  # the first frame loads kernels, the second is the first that computes
-                    next(self._frames)
-            watch = stopwatch()
-            done = sum(1 for _ in zip(range(FRAMES), self._frames, strict=False))
-            if done == FRAMES:
-                wall, processor = watch()
-                seconds = processor if wall > SHARED * processor else wall
-                found.append(seconds * self._scene.frame_rate / FRAMES)
-        return found or self.measure()
-
-
-def cost_fields(
-    rates: Sequence[float], workload: Sequence[float], processor_rate: float = float("nan")
-) -> dict[str, Any]:
-    """The columns of `Point` that say what it costs, for the CPU.
-
-    From wall seconds per simulated second, of each repeat and of the reference workload before and after, and processor
-    seconds per simulated second.
-    """
-    median, reference = statistics.median(rates), statistics.median(workload)
-    cost = processor_rate if median > SHARED * processor_rate else median
-    return {
-        "wall_s_per_simulated_s": median,
-        "wall_s_per_simulated_s_low": min(rates),
-        "wall_s_per_simulated_s_high": max(rates),
-        "processor_s_per_simulated_s": processor_rate,
-        "repeats": float(len(rates)),
-        "workload_wall_s_per_simulated_s": reference,
-        "ratio": cost / reference,
-        "processor": cpu_model(),
-        "threads": 1.0,
-        "device": "cpu",
-    }
-
-
-def made_here() -> dict[str, str]:
-    """The columns of `Point` that say how and where it is measured; the command without its output folder."""
-    words = shlex.split(command_line())
-    return {
-        "command": shlex.join(word for word in words if not word.startswith("output=")),
-        "machine": cpu_model(),
-        "version": __version__,
-        "commit": commit(),
-    }
-
-
-@cache
-def commit() -> str:
-    """Short name of the commit this package runs from; empty if it is no checkout."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return ""
-
-
-# --- Points in a folder, one file each, so that a study goes on where it stopped ------------------------
-# <output>/points/<scene>_<kind>_<label>.json                 one point without its errors; written last, whole
-# <output>/observations/<scene>_<kind>_<label>_<case>.npz     its runs
-
-
-@dataclass(frozen=True)
-class Store:
-    """The folder of a study."""
-
-    folder: Path
-
-    def file(self, scene: str, kind: str, label: str) -> Path:
-        """Where a point is; it is there when it is complete."""
-        return self.folder / "points" / f"{name_of(scene, kind, label)}.json"
-
-    def has(self, scene: str, kind: str, label: str) -> bool:
-        """Whether a point has been measured."""
-        return self.file(scene, kind, label).exists()
-
-    def save(self, point: Point, observations: Mapping[str, Observation]) -> None:
-        """Keep a point with its run of every case; none for a point that left the range (say so in its note)."""
-        for case, observation in observations.items():
-            observation.save(self._observation(point, case))
-        content = {"point": point.row(), "cases": list(observations)}
-        file = self.file(point.scene, point.kind, point.label)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(file, json.dumps(content, indent=1, ensure_ascii=False))
-
-    def points(self) -> list[tuple[Point, list[str]]]:
-        """All points with the names of their cases, in the order of their files' names.
-
-        Raises:
-            UserError: a file is damaged.
-        """
-        found = []
-        for file in sorted((self.folder / "points").glob("*.json")):
-            advice = "remove it to make it again"
-            content = read_json(file, "no operating point", advice)
-            try:
-                point, cases = content["point"], content["cases"]
-                if not isinstance(point, dict) or not isinstance(cases, list):
-                    raise TypeError("its point is no group of keys, or its cases are no list")
-                if wrong := [c for c in cases if not isinstance(c, str) or set(c) & {"/", os.sep, "\0"}]:
-                    raise ValueError(f"{wrong[0]!r:.40} is no name of a case")
-                found.append((Point.from_row(point), cases))
-            except (ValueError, KeyError, TypeError, UserError) as error:
-                raise UserError(f"{file} is no operating point ({error}); {advice}") from None
-        return found
-
-    def observation(self, point: Point, case: str) -> Observation:
-        """The run of a case of a point."""
-        return read_observation(self._observation(point, case))
-
-    def _observation(self, point: Point, case: str) -> Path:
-        return self.folder / "observations" / f"{name_of(point.scene, point.kind, point.label)}_{case}.npz"
-
-
-def name_of(scene: str, kind: str, label: str) -> str:
-    """A file name for a point."""
-    return "_".join(re.sub(r"([^\w.+-]|_)+", "-", part) for part in (scene, kind, label))
-
-
 # --- What a study measures: its scenes, the cases each scene is judged on, and the points of its axes ---
 
-AXES = ("solver", "reduction", "surrogate")
-"""Groups of points that one command, or one process of several, measures."""
+
+def require_known(keys: Iterable[str], allowed: Collection[str], words: str) -> None:
+    """Refuses keys that are not allowed."""
+    if wrong := [key for key in keys if key not in allowed]:
+        raise UserError(f"{words} {wrong[0]!r}; allowed: {', '.join(allowed)}")
 
 
 @dataclass(frozen=True)
@@ -225,21 +67,21 @@ class PointSettings:
     label: str
     set: tuple[str, ...] = ()  # overrides: of `sgns simulate` for the solver, of `sgns train` for surrogates
     paper: bool = False  # it is an operating point of the paper
-    more: Mapping[str, Any] = field(default_factory=dict)  # further keys that only one axis knows
+    centring: Any = None  # of a reduction
+    modes: Any = None  # of a reduction: the numbers r, a point each
 
     @classmethod
     def from_dict(cls, data: Any, where: str) -> PointSettings:
         """From an entry of conf/study.
 
         Raises:
-            UserError: it has no axis or no label.
+            UserError: it has no axis or no label, or a key that is not known.
         """
         if not isinstance(data, Mapping) or not data.get("axis") or not data.get("label"):
             raise UserError(f"{where} holds {data!r}; every point needs axis and label, and set: [overrides]")
-        known = {key: data[key] for key in ("axis", "label", "paper") if key in data}
-        changes = tuple(map(str, data.get("set") or ()))
-        more = {key: value for key, value in data.items() if key not in (*known, "set")}
-        return cls(**known, set=changes, more=more)
+        known = [field.name for field in fields(cls)]
+        require_known(data, known, f"{where}, {data['label']!r} has the unknown key")
+        return cls(**{**data, "set": tuple(map(str, data.get("set") or ()))})
 
 
 @dataclass(frozen=True)
@@ -267,14 +109,10 @@ class StudyScene:
             for name, changes in self.settings["cases"].items()
         }
 
-    def case_scene(self, case: str) -> Scene:
-        """The scene of a case as in the dataset."""
-        return composed_scene(self.cases[case])[0]
-
     @cached_property
     def free_body(self) -> bool:
         """Whether the soil carries the body."""
-        return self.case_scene(next(iter(self.cases))).axle is not None
+        return composed_scene(next(iter(self.cases.values())))[0].axle is not None
 
     @cached_property
     def reference(self) -> PointSettings:
@@ -294,36 +132,36 @@ class StudyScene:
 
 @dataclass(frozen=True)
 class Study:
-    """A study and the folder of its points."""
+    """A study and the folder of its points, a file each, so that it goes on where it stopped:
+
+    - points/<scene>_<kind>_<label>.json: a point without its errors; written last, whole
+    - observations/<scene>_<kind>_<label>_<case>.npz: its runs
+    - study.yaml: what the points were asked for with
+    """
 
     name: str
     scenes: tuple[StudyScene, ...]
     folder: Path
 
     @classmethod
-    def from_settings(cls, settings: Mapping[str, Any], folder: Path) -> Study:
+    def from_settings(cls, settings: Any, folder: Path) -> Study:
         """From conf/study.
 
         Raises:
-            UserError: a scene lacks what it needs.
+            UserError: a scene lacks what it needs, or has a key that is not known.
         """
         scenes = settings.get("scenes")
         if not isinstance(scenes, Mapping) or not scenes or not settings.get("name"):
             raise UserError("study needs name and scenes; see conf/study/quick.yaml")
+        needed = ("scene", "dataset", "cases", "reference")
         for name, scene in scenes.items():
-            for key in ("scene", "dataset", "cases", "reference"):
+            where = f"study.scenes.{name}"
+            for key in needed:
                 if not isinstance(scene, Mapping) or not scene.get(key):
-                    raise UserError(f"study.scenes.{name}.{key} is missing; see conf/study/quick.yaml")
-            if wrong := set(scene.get("bands") or ()) - set(ERRORS):
-                raise UserError(
-                    f"study.scenes.{name}.bands has no key {min(wrong)!r}; allowed: {', '.join(ERRORS)}"
-                )
+                    raise UserError(f"{where}.{key} is missing; see conf/study/quick.yaml")
+            require_known(scene, (*needed, "bands", *AXES), f"{where} has no key")
+            require_known(scene.get("bands") or (), ERRORS, f"{where}.bands has no key")
         return cls(str(settings["name"]), tuple(StudyScene(n, s) for n, s in scenes.items()), folder)
-
-    @property
-    def store(self) -> Store:
-        """Where points are kept."""
-        return Store(self.folder)
 
     def record(self) -> None:
         """Write what is asked for into the folder's study.yaml.
@@ -332,7 +170,7 @@ class Study:
             UserError: the folder has a point of the same label that was asked for otherwise, so its results would be
                 taken for this study's.
         """
-        file, asked = self.folder / "study.yaml", self._asked()
+        file = self.folder / "study.yaml"
         advice = "give another output"
         try:
             there = os.path.lexists(file)
@@ -341,6 +179,13 @@ class Study:
             known = None
         if not isinstance(known, dict):
             raise UserError(f"{file} does not say what was measured; {advice}")
+        asked = {}  # all that results depend on, by scene and label
+        for scene in self.scenes:
+            for key in ("scene", "dataset", "cases", "reference"):
+                asked[f"{scene.name}, {key}"] = scene.settings[key]
+            for axis in AXES:
+                for entry, point in zip(scene.settings.get(axis) or (), scene.points(axis), strict=True):
+                    asked[f"{scene.name}, {axis}: {point.label}"] = entry
         # Of what was never measured nothing can be taken for something else.
         measured = any((self.folder / "points").glob("*.json"))
         for key in known.keys() & asked.keys():
@@ -351,13 +196,137 @@ class Study:
                 )
         write_whole(file, yaml.safe_dump(known | asked, sort_keys=False, allow_unicode=True))
 
-    def _asked(self) -> dict[str, Any]:
-        """Everything that results depend on, by scene and label."""
-        found = {}
-        for scene in self.scenes:
-            for key in ("scene", "dataset", "cases", "training", "reference"):
-                found[f"{scene.name}, {key}"] = scene.settings.get(key)
-            for axis in AXES:
-                for entry, point in zip(scene.settings.get(axis) or (), scene.points(axis), strict=True):
-                    found[f"{scene.name}, {axis}: {point.label}"] = entry
+    def file(self, scene: str, kind: str, label: str) -> Path:
+        """Where a point is; it is there when it has been measured."""
+        name = "_".join(re.sub(r"([^\w.+-]|_)+", "-", part) for part in (scene, kind, label))
+        return self.folder / "points" / f"{name}.json"
+
+    def save(self, point: Point, observations: Mapping[str, Observation]) -> None:
+        """Keep a point with its run of every case; none for a point that left the range (say so in its note)."""
+        for case, observation in observations.items():
+            observation.save(self._observation(point, case))
+        content = {"point": point.row(), "cases": list(observations)}
+        file = self.file(point.scene, point.kind, point.label)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(file, json.dumps(content, indent=1, ensure_ascii=False))
+
+    def points(self) -> list[tuple[Point, list[str]]]:
+        """All points with the names of their cases, in the order of their files' names.
+
+        Raises:
+            UserError: a file is damaged.
+        """
+        found = []
+        for file in sorted((self.folder / "points").glob("*.json")):
+            advice = "remove it to make it again"
+            content = read_json(file, "no operating point", advice)
+            try:
+                point, cases = Point.from_row(dict(content["point"])), list(content["cases"])
+                if set("".join(cases)) & {"/", os.sep, "\0"}:
+                    raise ValueError(f"{cases!r:.40} are no names of cases")
+            except (ValueError, KeyError, TypeError, UserError) as error:
+                raise UserError(f"{file} is no operating point ({error}); {advice}") from None
+            found.append((point, cases))
         return found
+
+    def observation(self, point: Point, case: str) -> Observation:
+        """The run of a case of a point."""
+        return read_observation(self._observation(point, case))
+
+    def _observation(self, point: Point, case: str) -> Path:
+        name = self.file(point.scene, point.kind, point.label).stem
+        return self.folder / "observations" / f"{name}_{case}.npz"
+
+
+# --- Wall times that can be compared: one core, warm, medians, beside a workload that is always the same
+# The reference workload is the default scene of `sgns simulate` (the paper's bin at 20 mm, 4 particles per cell, half
+# of it computed) while the plate cuts. Its time is taken just before and just after what is measured, on the same
+# core, so that ratios to it hold on a machine whose speed changes.
+
+FRAMES = 8  # of one stretch of the workload
+STRETCHES = 2  # of which the median is taken, before and after each
+
+
+@contextmanager
+def one_core(last: bool = False) -> Iterator[None]:
+    """This process on the first (or last) core it may use, and torch on one thread; as before afterwards."""
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
+    try:
+        if cores:
+            os.sched_setaffinity(0, {max(cores) if last else min(cores)})
+        with single_thread():
+            yield
+    finally:
+        if cores:
+            os.sched_setaffinity(0, cores)
+
+
+def stopwatch() -> Callable[[], tuple[float, float]]:
+    """A function that tells the wall and the processor time since now [s]."""
+    began, clock = time.perf_counter(), time.process_time()
+    return lambda: (elapsed(began, time.perf_counter()), elapsed(clock, time.process_time()))
+
+
+class Workload:
+    """The reference workload, warm."""
+
+    def __init__(self) -> None:
+        self._scene = composed_scene(["scene=excavation"])[0]
+        self._frames: Iterator[Frame] = iter(())
+
+    def measure(self) -> list[float]:
+        """Seconds of one core per simulated second, of each of a few stretches."""
+        found: list[float] = []
+        while len(found) < STRETCHES:
+            watch = stopwatch()
+            done = sum(1 for _ in zip(range(FRAMES), self._frames, strict=False))
+            seconds = core_time(*watch())
+            if done == FRAMES:
+                found.append(seconds * self._scene.frame_rate / FRAMES)
+            else:
+                self._frames = Solver(self._scene, effects_for(self._scene)[0]).frames()
+                for _ in range(2):  # the first frame loads kernels, the second is the first that computes
+                    next(self._frames)
+        return found
+
+
+def cost_fields(rates: Sequence[float], workload: Sequence[float], processor_rate: float) -> dict[str, Any]:
+    """The columns of `Point` that say what it costs, for the CPU.
+
+    From wall seconds per simulated second, of each repeat and of the reference workload before and after, and processor
+    seconds per simulated second.
+    """
+    median, reference = statistics.median(rates), statistics.median(workload)
+    return {
+        "wall_s_per_simulated_s": median,
+        "wall_s_per_simulated_s_low": min(rates),
+        "wall_s_per_simulated_s_high": max(rates),
+        "processor_s_per_simulated_s": processor_rate,
+        "repeats": float(len(rates)),
+        "workload_wall_s_per_simulated_s": reference,
+        "ratio": core_time(median, processor_rate) / reference,
+        "processor": cpu_model(),
+        "threads": 1.0,
+        "device": "cpu",
+    }
+
+
+def made_here() -> dict[str, str]:
+    """The columns of `Point` that say how and where it is measured; the command without its output folder."""
+    words = shlex.split(command_line())
+    return {
+        "command": shlex.join(word for word in words if not word.startswith("output=")),
+        "machine": cpu_model(),
+        "version": __version__,
+        "commit": commit(),
+    }
+
+
+@cache
+def commit() -> str:
+    """Short name of the commit this package runs from; empty if it is no checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""

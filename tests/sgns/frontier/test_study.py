@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import logging
+import math
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from hydra import initialize_config_module
 from omegaconf import OmegaConf
 
+from mpm_warp import SolverStopped
 from sgns.cli.help import options_of
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
 from sgns.frontier import measure
 from sgns.frontier import study as timing
-from sgns.frontier.command import axes_of, main
-from sgns.frontier.point import read_points
+from sgns.frontier.command import axes_of, main, points_with_errors, scene_figures, with_errors
+from sgns.frontier.point import Point, read_points
 from sgns.frontier.study import AXES, Study, composed, composed_scene
 from sgns.simulate.campaign import plan
 from sgns.simulate.scene import asked_effects
@@ -34,6 +37,7 @@ scenes:
       - {axis: dx, label: base}
       - {axis: precision, label: float64, set: [solver.precision=float64]}
 """)
+CUT = TINY["scenes"]["cut"]
 
 
 def settings(output: Path, axis: str = "solver"):
@@ -49,18 +53,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return output
 
 
-def test_an_axis_may_be_done_before_the_reference(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.INFO):
-        main(settings(tmp_path, "reduction"))
-    assert "no reference is there yet" in caplog.text
-    with pytest.raises(UserError, match="no points"):
-        main(settings(tmp_path, "none"))
-
-
 def test_a_study_gives_a_table_figures_and_a_page(folder: Path) -> None:
     points = {p.label: p for p in read_points(folder / "points.csv")}
     assert set(points) == {"finer", "base", "float64"}
-    assert points["finer"].axis == "reference" and points["finer"].force_nrmse != points["finer"].force_nrmse
+    assert points["finer"].axis == "reference" and math.isnan(points["finer"].force_nrmse)
     base = points["base"]
     assert base.force_nrmse > 0.0 and base.wall_s_per_simulated_s > 0.0
     assert base.ratio == pytest.approx(base.cost / base.workload_wall_s_per_simulated_s, rel=1e-3)
@@ -73,30 +69,66 @@ def test_a_study_gives_a_table_figures_and_a_page(folder: Path) -> None:
     assert points["float64"].force_nrmse == pytest.approx(base.force_nrmse, rel=0.2)
 
 
-def test_what_is_there_is_not_measured_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise AssertionError("measured again")
-
-    monkeypatch.setattr(measure, "solver_point", refuse)
-    before = (folder / "points.csv").read_bytes()
-    main(settings(folder))
-    assert (folder / "points.csv").read_bytes() == before
-
-
 def test_only_a_missing_point_is_measured(
     folder: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(timing, "FRAMES", 1)
-    next((folder / "points").glob("*float64*")).unlink()
-    with caplog.at_level(logging.INFO):
-        main(settings(folder))
-    measured = [r.getMessage() for r in caplog.records if "solver:" in r.getMessage()]
+    before = (folder / "points.csv").read_text().splitlines()
+    (folder / "points" / "cut_solver_float64.json").unlink()
+    caplog.set_level("INFO")
+    main(settings(folder))
+    measured = [line for line in caplog.messages if "solver:" in line]
     assert len(measured) == 1 and "float64" in measured[0]
+    after = (folder / "points.csv").read_text().splitlines()
+    assert {line for line in before if "float64" not in line} < set(after)
 
 
-def test_an_empty_folder_cannot_be_gathered(tmp_path: Path) -> None:
+def test_without_a_reference_nothing_can_be_judged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    main(settings(tmp_path, "reduction"))
+    assert "no reference is there yet" in caplog.text
     with pytest.raises(UserError, match="holds no points"):
         main(settings(tmp_path, "none"))
+    study = Study.from_settings(TINY, tmp_path)
+    study.save(Point("tiny", "cut", "solver", "dx", "base"), {})
+    with pytest.raises(UserError, match="holds no points"):
+        points_with_errors(study)
+    assert "cut: the reference (finer) is not there yet" in caplog.text
+
+
+def test_points_that_did_not_finish_have_no_errors(folder: Path) -> None:
+    study = Study.from_settings(TINY, folder)
+    (scene,) = study.scenes
+    base = Point("tiny", "cut", "solver", "dx", "base")
+    runs = {"deep": study.observation(base, "deep")}
+    stopped = replace(base, note="stopped: it went wrong")
+    assert with_errors(study, scene, stopped, ["deep"], runs) is stopped
+    lost = replace(base, label="lost")
+    moved = np.full_like(runs["deep"].moved, np.nan)
+    study.save(lost, {"deep": replace(runs["deep"], moved=moved)})
+    assert with_errors(study, scene, lost, ["deep"], runs).note == "left the range: not finite"
+    study.file("cut", "solver", "lost").unlink()
+
+
+def test_reductions_and_trainings_have_figures_of_their_own() -> None:
+    (scene,) = Study.from_settings(TINY, Path("x")).scenes
+    known = {"wall_s_per_simulated_s": 0.1, "own_position_rmse_mm": 3.0, "modes": 4.0}
+    points = [
+        Point("tiny", "cut", "reduction", "r", "r 4", **known),
+        Point("tiny", "cut", "surrogate", "r", "net", training_s=30.0, own_force_nrmse=0.5, **known),
+    ]
+    assert [figure.name for figure in scene_figures(scene, points)] == ["cut_training", "cut_reduction"]
+
+
+def test_a_solver_that_stops_is_a_point_without_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*_: object) -> None:
+        raise SolverStopped("it went\nwrong")
+
+    monkeypatch.setattr(measure, "observe", stop)
+    monkeypatch.setattr(timing.Workload, "measure", lambda _: [1.0])
+    study = Study.from_settings(TINY, tmp_path)
+    measure.measure(study, "solver")
+    assert {(point.note, *cases) for point, cases in study.points()} == {("stopped: it went wrong",)}
 
 
 @pytest.mark.parametrize(
@@ -131,6 +163,12 @@ def test_points_of_a_shipped_study_compose(name: str) -> None:
         made, _ = composed_scene([*case, *changes.values()])
         assert made.duration == composed_scene(case)[0].duration
         assert set(scene.bands) and sum(point.paper for point in points) <= 1
+        by_groups: dict[tuple, dict] = {}
+        for point in scene.points("surrogate"):
+            groups = tuple(change for change in point.set if "." not in change.split("=")[0])
+            by_groups.setdefault(groups, {}).update({change.split("=")[0]: change for change in point.set})
+        for changes in by_groups.values():
+            measure.training_settings(scene.dataset, *changes.values())
 
 
 def test_cases_are_held_out_runs_of_the_dataset() -> None:
@@ -144,7 +182,7 @@ def test_cases_are_held_out_runs_of_the_dataset() -> None:
             campaign = plan(dataset, base.to_dict(), asked_effects(cfg), "float32", seed=0)
             assert set(campaign.split.values()) == set(SPLITS)
             for case in scene.cases:
-                wanted = scene.case_scene(case)
+                wanted, _ = composed_scene(scene.cases[case])
                 same = [name for name, found in campaign.scenes.items() if found == wanted]
                 assert [campaign.split[name] for name in same] == ["test"]
 
@@ -154,6 +192,14 @@ def test_cases_are_held_out_runs_of_the_dataset() -> None:
     [
         ({"name": None}, "needs name and scenes"),
         ({"scenes": {"cut": {"scene": "excavation"}}}, r"cut\.dataset is missing"),
+        (
+            {"scenes": {"cut": CUT | {"training": {}}}},
+            "scenes.cut has no key 'training'; allowed: scene, dataset",
+        ),
+        (
+            {"scenes": {"cut": CUT | {"bands": {"force": 1}}}},
+            "bands has no key 'force'; allowed: force_nrmse",
+        ),
     ],
 )
 def test_a_study_that_lacks_something_is_refused(change: dict, line: str) -> None:
@@ -161,13 +207,20 @@ def test_a_study_that_lacks_something_is_refused(change: dict, line: str) -> Non
         Study.from_settings(TINY | change, Path("x"))
 
 
-def test_two_points_of_one_name_are_refused() -> None:
-    scene = TINY["scenes"]["cut"] | {"solver": [{"axis": "dx", "label": "a"}] * 2}
-    study = Study.from_settings(TINY | {"scenes": {"cut": scene}}, Path("x"))
-    with pytest.raises(UserError, match="two points with the label 'a'"):
-        study.scenes[0].points("solver")
-    scene["solver"] = [{"label": "a"}]
-    with pytest.raises(UserError, match="needs axis and label"):
+@pytest.mark.parametrize(
+    ("entries", "line"),
+    [
+        ([{"axis": "dx", "label": "a"}] * 2, "two points with the label 'a'"),
+        ([{"label": "a"}], "needs axis and label"),
+        (
+            [{"axis": "r", "label": "a", "seconds": 4}],
+            "'a' has the unknown key 'seconds'; allowed: axis, label, set",
+        ),
+    ],
+)
+def test_bad_points_are_refused(entries: list, line: str) -> None:
+    study = Study.from_settings(TINY | {"scenes": {"cut": CUT | {"solver": entries}}}, Path("x"))
+    with pytest.raises(UserError, match=line):
         study.scenes[0].points("solver")
 
 
