@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from sgns.config import UserError
 from sgns.frontier.point import Point, effective_error, read_points, usable
+from sgns.settings import Advise
 
 log = logging.getLogger(__name__)
 
@@ -166,43 +167,24 @@ def table(asked: str | None) -> Path:
 
 
 def wished(cfg: Any, points: Sequence[Point]) -> Wish:
-    """The wish in the settings of the command.
+    """The wish in the settings of the command, as plain data.
 
     Raises:
-        UserError: a limit is no number above 0, nothing is asked for, or the table has no such scene.
+        UserError: a value is not allowed, nothing is asked for, or the table has no such scene.
     """
-    task, errors, against, particles = (cfg[key] for key in ("task", "error", "against", "particles"))
+    asked = Advise.from_dict(cfg)
     scenes = list(dict.fromkeys(p.scene for p in points))
-    if task not in scenes:
-        raise UserError(f"task is {task!r}; the table has {', '.join(scenes) or 'none'}")
-    if not isinstance(errors, Mapping):
-        raise UserError(f"error is {errors!r}; give one of its keys, as error.force=0.3")
-    if wrong := set(errors) - set(ERRORS):
-        raise UserError(f"error has no key {min(wrong)!r}; allowed: {', '.join(ERRORS)}")
-    if against not in ("reference", "training"):
-        raise UserError(f"against is {against!r}; allowed: reference, training")
-    if not isinstance(particles, bool):
-        raise UserError(f"particles is {particles!r}; allowed: true, false")
-    limits = {
-        key: ERRORS[key][1] * positive(f"error.{key}", value)
-        for key, value in errors.items()
-        if value is not None
-    }
-    time = None if cfg["time"] is None else positive("time", cfg["time"])
-    if not limits and time is None:
+    if asked.task not in scenes:
+        raise UserError(f"task is {asked.task!r}; the table has {', '.join(scenes) or 'none'}")
+    given = ((key, value) for key, value in asked.error.to_dict().items() if value is not None)
+    limits = {key: ERRORS[key][1] * value for key, value in given}
+    if not limits and asked.time is None:
         raise UserError(
             "nothing is asked for; give error.force=0.2, error.position=0.005 (m), time=0.01 (s), ..."
         )
-    own = against == "training"
-    study = next(p.study for p in points if p.scene == task)
-    return Wish(task, limits, time, particles, own, {} if own else bands(study, task))
-
-
-def positive(key: str, value: Any) -> float:
-    """A number above 0."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
-        raise UserError(f"{key} is {value!r}; it must be a number above 0")
-    return float(value)
+    own = asked.against == "training"
+    study = next(p.study for p in points if p.scene == asked.task)
+    return Wish(asked.task, limits, asked.time, asked.particles, own, {} if own else bands(study, asked.task))
 
 
 def shipped(study: str, scene: str) -> dict[str, Any]:

@@ -146,7 +146,7 @@ HOSTILE: dict[str, list[Callable[[dict[str, Any], Touch], bytes]]] = {
     f"{UNREADABLE}.*overlap": [lambda good, _: overlapping()],
     "claims more values": [lambda good, _: with_weights(good, "surrogate.x", torch.zeros(1).expand(10**12))],
     "do not fit together": [
-        lambda good, _, key=key: with_card(good, model=good["hyper_parameters"]["model"] | {key: 10**12})
+        lambda good, _, key=key: with_card(good, model=good["hyper_parameters"]["model"] | {key: 90})
         for key in ("message_passing_steps", "hidden_width", "history")
     ],
     ODD_CARD: [

@@ -10,7 +10,6 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns.cli.help import options_of
-from sgns.config import UserError
 from sgns.simulate import command as simulate
 from sgns.simulate.campaign import plan, run_cost
 
@@ -74,8 +73,3 @@ def test_the_command_line_comes_after_what_the_dataset_changes(planned):
     assert recorded() == 5
     assert recorded("scene.bed.store_every=2") == 2
     assert recorded("dataset.change={bed.store_every: 4}") == 4
-
-
-def test_a_change_that_is_no_group_is_refused(planned):
-    with pytest.raises(UserError, match=r"dataset\.change is 3; it must be a group"):
-        planned("desktop_excavation", "dataset.change=3")
