@@ -21,8 +21,8 @@ from tqdm import tqdm
 from mpm_warp.poses import in_body_frame
 from sgns.clock import elapsed
 from sgns.config import UserError
+from sgns.data.check import scene_problems
 from sgns.data.files import only_here, require_replaceable
-from sgns.data.layout import scene_problems
 from sgns.data.run import Run
 from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory, provenance
 from sgns.evaluate.figures import read_log

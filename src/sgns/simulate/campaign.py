@@ -19,7 +19,7 @@ from mpm_warp import Decision, Effects, Scene, SceneError, substeps_per_frame
 from sgns.config import UserError, flattened
 from sgns.data.dataset import SPLITS, read_description
 from sgns.data.files import file_lock, write_whole
-from sgns.simulate.scene import decided
+from sgns.simulate.scene import decided, plain
 
 # --- What runs cost in work, time and disk, before and while they are made ------------------------------
 
@@ -242,14 +242,14 @@ def plan(
     grids: dict[int, list[str]] = {}
     for index in chosen:
         grid, values = combinations[index]
-        data = OmegaConf.create(dict(base))
+        changed = OmegaConf.create(dict(base))
         for key, value in values.items():
-            OmegaConf.update(data, key, value, force_add=True)
-        plain = OmegaConf.to_container(data, resolve=True)
-        if isinstance(plain.get("tool"), dict):
-            plain["tool"].pop("digest", None)  # `draw` may name another file; these are the person's settings
+            OmegaConf.update(changed, key, value, force_add=True)
+        data = plain(changed)
+        if isinstance(data.get("tool"), dict):
+            data["tool"].pop("digest", None)  # `draw` may name another file; these are the person's settings
         name = f"{index:04d}_" + "_".join(f"{key.split('.')[-1]}-{value}" for key, value in values.items())
-        scenes[name] = Scene.from_dict(plain)
+        scenes[name] = Scene.from_dict(data)
         grids.setdefault(grid, []).append(name)
     return Campaign(
         name=settings["name"],

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from mpm_warp import Effects, Scene, Solver, SolverStopped, State
@@ -17,7 +16,7 @@ from mpm_warp.batch import all_together
 from mpm_warp.launch import Work
 from sgns.clock import elapsed
 from sgns.config import UserError
-from sgns.data.run import Run, read_state
+from sgns.data.run import Run
 from sgns.data.writer import RunWriter
 
 # --- Going on with a run whose solver stopped -----------------------------------------------------------
@@ -73,13 +72,13 @@ class Restart:
         """For the run file: at which frames the solver went on, and with what changed."""
         return [*self.earlier, {"frame": self.state.frame, "changed": dict(self.changes)}]
 
-    def frames(self) -> Iterator[tuple[np.ndarray, ...]]:
+    def frames(self) -> Iterator[tuple[Any, ...]]:
         """The frames that are there, as `RunWriter.append` takes them."""
         with Run(self.path) as run:
             small = (run.body_points, run.pose, run.force, run.torque)
             for index, time in enumerate(run.time):
                 soil = run.positions(index)[0], run.velocities(index)[0]
-                yield (time, *soil, *(series[index] for series in small))
+                yield time, *soil, *(series[index] for series in small)
 
 
 def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
@@ -93,15 +92,16 @@ def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
     with Run(path) as run:
         if run.stopped is None:
             raise UserError(f"continue_from: {path} is a whole run; there is nothing to go on with")
-        scene, mesh, reasons, extra = run.scene, run.mesh, run.effects, run.extra
-        seed, count, wall_time = run.seed, run.frame_count, run.wall_time_s
-    if any(o.lstrip("+").startswith(f"{_FILE}=") for o in overrides):
-        raise UserError(f"{path} brings its own tool; leave out {_FILE}")
+        if any(o.lstrip("+").startswith(f"{_FILE}=") for o in overrides):
+            raise UserError(f"{path} brings its own tool; leave out {_FILE}")
+        scene, mesh, state = run.scene, run.mesh, run.state
     if mesh is None and isinstance(tool := scene.get("tool"), dict) and tool.get("shape") == "mesh":
         raise UserError(f"{path} does not hold the mesh of its tool; repeat the run")
-    state = read_state(path)
-    if state.frame != count - 1:
-        raise UserError(f"{path} holds {count} frames but the state of frame {state.frame}; repeat the run")
+    if state.frame != run.frame_count - 1:
+        raise UserError(
+            f"{path} holds {run.frame_count} frames but the state of frame {state.frame}; repeat the run"
+        )
+    reasons, extra = run.effects, run.extra
     effects, earlier = _effects(reasons, path), _earlier(extra, path)
     changes = {key: value for one in earlier for key, value in one["changed"].items()} | asked
     if effects.nonlocality and "bed.headroom" in changes:
@@ -112,8 +112,18 @@ def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
     precision = cfg.solver.precision
     if not any(o.startswith("solver.precision=") for o in overrides):
         precision = str(extra.get("precision", precision))
-    scene = Scene.from_dict(scene, mesh)
-    return Restart(path, scene, changes, effects, reasons, precision, seed, state, wall_time, earlier)
+    return Restart(
+        path,
+        Scene.from_dict(scene, mesh),
+        changes,
+        effects,
+        reasons,
+        precision,
+        run.seed,
+        state,
+        run.wall_time_s,
+        earlier,
+    )
 
 
 def _effects(reasons: Mapping[str, Any], path: Path) -> Effects:
@@ -188,7 +198,7 @@ def scene_stages(
     seed: int = 0,
     device: str = "cpu",
     precision: str = "float32",
-    progress: Any = None,
+    progress: Callable[[], object] | None = None,
     restart: Restart | None = None,
 ) -> Generator[Timing | Work, None, None]:
     """Compute a scene and write its run file, with the particles that `scene.bed.store_every` leaves in it.

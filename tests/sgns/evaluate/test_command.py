@@ -13,7 +13,6 @@ import torch
 from mpm_warp.poses import in_body_frame, in_world_frame
 from sgns.config import UserError
 from sgns.data.check import check_run
-from sgns.data.layout import write_text
 from sgns.data.run import Run
 from sgns.evaluate import command as evaluate_module
 from sgns.evaluate.command import full_basis, single_thread, training_means
@@ -171,7 +170,7 @@ def test_scenes_without_numbers_are_refused_before_anything_is_rolled_out(
 ):
     odd = make_run(tmp_path / "odd.h5", frames=20, n=120)
     with h5py.File(odd, "r+") as file:
-        write_text(file, "scene", json.dumps(scene))
+        file.attrs["scene"] = json.dumps(scene)
     splits = dataset.splits | {"test": [odd]}
     with pytest.raises(UserError, match=re.escape(words)):
         evaluate(simulator(dataset, basis), replace(dataset, splits=splits), tmp_path / "out")

@@ -27,10 +27,12 @@ from mpm_warp import mesh as mesh_file
 from mpm_warp.batch import all_together
 from sgns.config import UserError
 from sgns.data.check import check_run
-from sgns.data.run import Run, read_state, stopped_path
+from sgns.data.run import Run
+from sgns.data.writer import stopped_path
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.run import restart_from, simulate_scene
 from sgns.simulate.scene import recorded
+from sgns_testing.campaigns import job
 from sgns_testing.commands import SHORT, refusal, sgns
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
@@ -86,9 +88,9 @@ def test_the_frames_before_are_kept(stopped):
         assert run.frame_count == LAST + 1
         assert "particle 51 at (" in run.stopped  # 11 of the half that is computed
         assert run.positions(0)[0].shape == (len(small().stored), 3)
+        assert run.state.frame == LAST
     (problem,) = check_run(kept)
     assert problem.startswith("the run stopped after 4 good frames: particle 51 at (")
-    assert read_state(kept).frame == LAST
 
 
 def test_check_names_it(stopped):
@@ -147,8 +149,8 @@ def test_it_may_stop_again(stopped, monkeypatch):
         assert "stops it again" in run.stopped
         assert run.extra["continued"] == [{"frame": LAST, "changed": {"courant": 0.3}}]
         took = run.wall_time_s
+        assert run.state.frame == LAST + 1
     assert took > first  # the frames before the first stop included
-    assert read_state(kept).frame == LAST + 1
     cfg.scene = {"bed": {"headroom": 0.5}}
     third = restart_from(cfg, ["scene.bed.headroom=0.5"])
     assert third.changes == {"courant": 0.3, "bed.headroom": 0.5}  # those of before as well
@@ -158,10 +160,7 @@ def test_it_may_stop_again(stopped, monkeypatch):
 def test_a_campaign_says_where_its_run_is_kept(stops, tmp_path, monkeypatch):
     monkeypatch.setattr(campaign_runs, "_frames_done", [0])
     output = tmp_path / "runs" / "1.h5"
-    task = campaign_runs._make(
-        0, (small().to_dict(), None), output, Effects(), Effects().described(), 0, "cpu", "float32"
-    )
-    ((_, (kind, words)),) = all_together([task], 1, "cpu")
+    ((_, (kind, words)),) = all_together([campaign_runs._make(job(small(), output))], 1, "cpu")
     assert kind == "failed"
     assert f"continue_from={stopped_path(output)}" in words
     assert check_run(stopped_path(output))[0].startswith("the run stopped after 4 good frames")
@@ -193,19 +192,20 @@ def test_what_cannot_be_gone_on_with(tmp_path, stopped):
     with h5py.File(kept, "r+") as file:
         del file["state/position"]
         file["state/position"] = "text"
-    with pytest.raises(UserError, match="does not hold numbers"):
-        read_state(kept)
+    with Run(kept) as run, pytest.raises(UserError, match="does not hold numbers"):
+        _ = run.state
     with h5py.File(kept, "r+") as file:
         del file["state"]
-    with pytest.raises(UserError, match="holds no state to go on from"):
-        read_state(kept)
+    with Run(kept) as run, pytest.raises(UserError, match="holds no state to go on from"):
+        _ = run.state
 
 
 def test_a_bed_without_a_body_can_go_on(stops, tmp_path):
     scene = Scene(bed=Bed(size=(0.2, 0.2, 0.1), spacing=0.04), duration=0.1)
     with pytest.raises(SolverStopped, match="continue_from="):
         simulate_scene(scene, tmp_path / "bed.h5", effects=Effects())
-    assert read_state(tmp_path / "bed.stopped.h5").frame == LAST
+    with Run(tmp_path / "bed.stopped.h5") as run:
+        assert run.state.frame == LAST
 
 
 def pushed(file) -> Push:

@@ -173,7 +173,7 @@ def test_time_left_follows_from_the_work_left_and_the_speed_seen(tmp_path):
         assert workers._left() == "10 min"
         # Then an hour at half that speed, with three of the workers busy: the estimate says so.
         for _ in range(60):
-            workers._see(0.9 * per_frame, elapsed=60.0, busy=3)
+            workers._see(0.9 * per_frame, seconds=60.0, busy=3)
         assert workers._left() == "20 min"
         # Four runs have only one step left (frames 0 to 2 are there), two have not begun.
         workers._frames_done[:] = [3, 3, 3, 3, 0, 0]
