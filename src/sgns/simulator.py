@@ -20,13 +20,12 @@ import torch
 from torch import Tensor
 
 from mpm_warp.poses import fitted_poses, in_world_frame
-from sgns.arrays import check_pose, check_poses, finite_array, first_pose, is_whole, real_array
-from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step
 from sgns.model.features import BodyTrack, ToolMotion, body_track, context_of, markers, step_frames
 from sgns.model.training_range import Excess, TrainingRange
+from sgns.numbers import check_pose, check_poses, elapsed, finite_array, first_pose, is_whole, real_array
 from sgns.states import Rollout, Rollouts, State
 
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from mpm_warp import Effects
-from sgns.clock import elapsed
 from sgns.data.run import Run
 from sgns.evaluate import costs as full_space_cost
+from sgns.numbers import elapsed
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import run_cost
 from sgns.simulate.run import simulate_scene

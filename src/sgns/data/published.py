@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from mpm_warp.inputs import open_file, read_text
 from mpm_warp.poses import fitted_poses
-from sgns.arrays import is_whole
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
 from sgns.data.files import parse_json
+from sgns.numbers import is_whole
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, ReducedRun
 

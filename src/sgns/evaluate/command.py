@@ -19,7 +19,6 @@ import torch
 from tqdm import tqdm
 
 from mpm_warp.poses import in_body_frame
-from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.data.check import scene_problems
 from sgns.data.files import only_here, require_replaceable
@@ -40,6 +39,7 @@ from sgns.evaluate.results import (
 from sgns.evaluate.tables import write_tables
 from sgns.evaluate.words import describe, forward_name, short_names
 from sgns.model.settings import ModelSettings, model_settings
+from sgns.numbers import elapsed
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout
 

@@ -19,8 +19,6 @@ import torch
 from omegaconf import OmegaConf
 
 from mpm_warp import Scene, Solver, SolverStopped
-from sgns.arrays import is_whole
-from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
 from sgns.data.files import file_lock, read_json, read_table, write_whole
@@ -44,6 +42,7 @@ from sgns.frontier.study import (
     stopwatch,
 )
 from sgns.model.settings import ModelSettings, model_settings
+from sgns.numbers import elapsed, is_whole
 from sgns.reduction.basis import CENTRINGS, Basis, reconstruction_curve
 from sgns.reduction.reduce import ReducedDataset, ReducedRun, fit_runs, reduce_dataset
 from sgns.rollout import finite_frames, single_thread

@@ -24,12 +24,12 @@ from omegaconf import DictConfig
 
 from mpm_warp import Frame, Scene, Solver, effects_for
 from sgns import __version__
-from sgns.clock import elapsed
 from sgns.config import UserError, parse_yaml
 from sgns.data.files import read_json, read_text, write_whole
 from sgns.evaluate.costs import command_line, cpu_model
 from sgns.frontier.observation import Observation, read_observation
 from sgns.frontier.point import ERRORS, SHARED, Point
+from sgns.numbers import elapsed
 from sgns.simulate.scene import scene_from_config
 
 # --- Wall times that can be compared: one core, warm, medians, beside a workload that is always the same

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from sgns.arrays import is_whole
 from sgns.config import UserError
 from sgns.model.features import BodyTrack
 from sgns.model.network import Standardiser
 from sgns.model.settings import ModelSettings, PolynomialSettings
+from sgns.numbers import is_whole
 
 # No latent position goes further than this from its mean, in deviations; training runs stay within about half of it. It
 # keeps a rollout finite that has left everything the dynamics know.

@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from sgns.arrays import require_shapes
 from sgns.config import UserError, check_fields
 from sgns.data.dataset import SPLITS, Dataset
 from sgns.data.files import parse_json, require_replaceable
 from sgns.data.hdf5 import BROKEN, new_hdf5, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
+from sgns.numbers import require_shapes
 from sgns.reduction.basis import CENTRINGS, Basis, reconstruction_curve
 from sgns.reduction.pca import IncrementalPCA, checked_device
 

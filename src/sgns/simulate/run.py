@@ -14,10 +14,10 @@ from omegaconf import DictConfig, OmegaConf
 from mpm_warp import Effects, Scene, Solver, SolverStopped, State
 from mpm_warp.batch import all_together
 from mpm_warp.launch import Work
-from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.data.writer import RunWriter
+from sgns.numbers import elapsed
 
 # --- Going on with a run whose solver stopped -----------------------------------------------------------
 

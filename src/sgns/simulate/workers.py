@@ -23,10 +23,10 @@ from tqdm import tqdm
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
 from mpm_warp.batch import all_together
 from mpm_warp.launch import Work
-from sgns.clock import elapsed
 from sgns.config import UserError, flattened
 from sgns.data.files import file_lock, remove_abandoned
 from sgns.data.run import Run
+from sgns.numbers import elapsed
 from sgns.simulate.campaign import (
     Campaign,
     RunCost,

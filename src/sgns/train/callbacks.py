@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
-from sgns.clock import elapsed
 from sgns.model.dynamics import Dynamics
 from sgns.model.features import BodyTrack, body_track, context_of
+from sgns.numbers import elapsed
 from sgns.train.windows import filled, pad_start, require_finite
 
 if TYPE_CHECKING:

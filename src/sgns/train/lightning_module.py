@@ -23,12 +23,12 @@ import torch
 from lightning.pytorch.plugins import TorchCheckpointIO
 from torch import Tensor
 
-from sgns.clock import elapsed
 from sgns.config import UserError, check_fields
 from sgns.model.checkpoint import Surrogate, load_surrogate, read_checkpoint, write_checkpoint
 from sgns.model.features import BodyTrack, moves_freely, varying_context
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.settings import ModelSettings
+from sgns.numbers import elapsed
 from sgns.train import Fit, Fitted, Task
 from sgns.train.callbacks import RolloutValidation, StepProgress, ValidationRollouts
 from sgns.train.windows import (

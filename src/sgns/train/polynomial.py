@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate
 from sgns.model.features import moves_freely, varying_context
 from sgns.model.network import Standardiser
 from sgns.model.polynomial import PolynomialDynamics, normalised
 from sgns.model.settings import FitSettings, PolynomialSettings
+from sgns.numbers import elapsed
 from sgns.train import Fit, Fitted, Task
 from sgns.train.callbacks import RolloutScore, ValidationRollouts
 from sgns.train.windows import Batch, TrainingWindows, generator, random_walk
