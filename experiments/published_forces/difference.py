@@ -64,7 +64,7 @@ def main() -> None:
     parser.add_argument("redrawn", type=Path, nargs="?", help="the same with another seed")
     options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    published = sorted(read_published(options.published, Scene().bed.size), key=lambda run: run.case)
+    published = sorted(read_published(options.published), key=lambda run: run.case)
     rows = []
     figure = plt.figure(figsize=(13, 4), layout="constrained")
     spectra, phases = figure.subplots(1, 2)

@@ -84,7 +84,7 @@ def main() -> None:
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     options.runs = options.runs or f"data/{options.scene}_level"
-    published, campaign = campaign_of(options, excavation_case, "published_excavation", options.cases)
+    published, campaign = campaign_of(options, excavation_case, options.cases)
     campaign.path.mkdir(parents=True, exist_ok=True)
     cuts = campaign.scenes
     scenes = {name: level(cut, campaign.path / f"blade_{cut.rake:g}.obj") for name, cut in cuts.items()}

@@ -58,7 +58,6 @@ def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
 def campaign_of(
     options: argparse.Namespace,
     values_of: Callable[[int], dict[str, float | str]],
-    published_scene: str,
     cases: list[int] | None = None,
 ) -> tuple[list[PublishedRun], Campaign]:
     """The published runs in the order of their cases, and the campaign that makes them with `options.scene`.
@@ -66,13 +65,11 @@ def campaign_of(
     Args:
         options: published, scene, runs and overrides of the command line.
         values_of: the scene's keys of a case.
-        published_scene: whose bin the published coordinates belong to.
         cases: only these; None: all.
     """
     with initialize_config_module("sgns.conf", version_base="1.3"):
         config = compose("simulate", [f"scene={options.scene}", *options.overrides])
-        theirs = compose("simulate", [f"scene={published_scene}"])
-    published = read_published(options.published, scene_from_config(theirs).bed.size)
+    published = read_published(options.published)
     published = sorted((r for r in published if not cases or r.case in cases), key=lambda run: run.case)
     scenes = {}
     for run in published:
@@ -107,7 +104,7 @@ def main() -> None:
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
-    published, campaign = campaign_of(options, excavation_case, "published_excavation", options.cases)
+    published, campaign = campaign_of(options, excavation_case, options.cases)
     simulate_campaign(campaign, device="cpu", workers=options.workers)
     suffix = "" if options.scene == "published_excavation" else f"_{options.scene}"
 

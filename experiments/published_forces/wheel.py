@@ -72,7 +72,7 @@ def main() -> None:
 
     if options.scene == "wheel":
         options.overrides = [*THEIR_WHEEL, *options.overrides]
-    published, campaign = campaign_of(options, wheel_case, "published_wheel", options.cases)
+    published, campaign = campaign_of(options, wheel_case, options.cases)
     simulate_campaign(campaign, device="cpu", workers=options.workers)
     stem = "wheel" if options.scene == "published_wheel" else "wheel_reference"
 

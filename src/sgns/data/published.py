@@ -60,8 +60,6 @@ class PublishedRun:
 
     kind: str
     """excavation or wheel."""
-    case: int | None
-    """Number of the run among all of its kind, from 1; None where metadata.json does not say."""
     body_points: np.ndarray
     """Nodes of the rigid body [m], shape (T, M, 3)."""
     latent: np.ndarray
@@ -71,6 +69,8 @@ class PublishedRun:
     context: np.ndarray
     """Of a wheel: gravity [m/s^2], friction angle [degrees] and load [N] in every frame, shape (T, 3); of a blade:
     shape (T, 0)."""
+    case: int | None = None
+    """Number of the run among all of its kind, from 1; None where metadata.json does not say."""
 
 
 def _case(kind: str, case: int, **values: tuple[Any, ...]) -> dict[str, Any]:
@@ -108,14 +108,8 @@ def published_files(folder: str | Path) -> list[str]:
     return found
 
 
-def read_published(
-    folder: str | Path, bin_size: tuple[float, float, float] | None = None, split: str = "valid"
-) -> list[PublishedRun]:
-    """The runs of one folder with `<split>.tfrecord` and `metadata.json`.
-
-    Args:
-        bin_size: Lx, Ly, Lz of the soil bin [m]; None: the authors' own.
-    """
+def read_published(folder: str | Path, split: str = "valid") -> list[PublishedRun]:
+    """The runs of one folder with `<split>.tfrecord` and `metadata.json`."""
     folder = Path(folder)
     try:
         metadata = parse_json(read_text(folder / "metadata.json", _MOST_METADATA))
@@ -128,22 +122,23 @@ def read_published(
         raise UserError(f"{folder}: metadata.json does not name the {split} runs by their numbers")
     try:
         with open_file(folder / f"{split}.tfrecord", _MOST_BYTES) as file:
-            size = os.fstat(file.fileno()).st_size
-            count = sum(1 for _ in _lengths(file, size))
-            if cases is not None and len(cases) != count:
+            records = _records(file)
+            if cases is not None and len(cases) != len(records):
                 raise UserError(
-                    f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {count}"
+                    f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {len(records)}"
                 )
-            if not count:
+            if not records:
                 raise UserError(f"{folder}/{split}.tfrecord holds no run")
-            file.seek(0)
-            runs = [_run(None, file.read(length), bin_size) for length in _lengths(file, size)]
+            runs = []
+            for start, length in records:
+                file.seek(start)
+                runs.append(_run(file.read(length)))
     except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
         raise UserError(f"{folder}/{split}.tfrecord is not a file of published runs: {error}") from None
     return [replace(run, case=case) for run, case in zip(runs, cases or [None] * len(runs), strict=True)]
 
 
-def _run(case: int | None, record: bytes, bin_size: tuple[float, float, float] | None) -> PublishedRun:
+def _run(record: bytes) -> PublishedRun:
     about, frames = _sequence_example(record)
     types = np.frombuffer(about["particle_type"], dtype="<i8")
     nodes = _series(frames["position"], 3 * len(types)).reshape(-1, len(types), 3)[1:]
@@ -156,10 +151,10 @@ def _run(case: int | None, record: bytes, bin_size: tuple[float, float, float] |
         raise ValueError("a run has no frames, or values that are not finite")
     soil = types == _SUBSPACE
     kind = "wheel" if bool((types == _FREE).any()) else "excavation"
-    lx, _, lz = bin_size or _BINS[kind]
+    lx, _, lz = _BINS[kind]
     x, y, z = np.moveaxis(nodes[:, ~soil], -1, 0)
     body = np.stack([_MARGIN + lx - x, z - _MARGIN, y - _MARGIN - lz], axis=-1)
-    return PublishedRun(kind, case, body, nodes[:, soil], force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0], context)
+    return PublishedRun(kind, body, nodes[:, soil], force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0], context)
 
 
 def _series(frames: Sequence[bytes], values: int) -> np.ndarray:
@@ -169,22 +164,19 @@ def _series(frames: Sequence[bytes], values: int) -> np.ndarray:
     return np.frombuffer(b"".join(frames), dtype="<f4").astype(float).reshape(-1, values)
 
 
-def _lengths(file: BinaryIO, size: int) -> Iterator[int]:
-    """Lengths of the payloads of a TFRecord file: length (8), check sum (4), payload, check sum (4).
-
-    The file stands at the beginning of each payload when its length is given.
-    """
-    at = 0
+def _records(file: BinaryIO) -> list[tuple[int, int]]:
+    """Start and length of the runs in a TFRecord file: each is length (8), check sum (4), run, check sum (4)."""
+    size, at, records = os.fstat(file.fileno()).st_size, 0, []
     while at < size:
+        file.seek(at)
         (length,) = struct.unpack("<Q", file.read(8))
         if at + 16 + length > size:
             raise ValueError("the file is cut short")
         if not 0 < length <= _MOST_OF_RUN:
             raise ValueError(f"a run has {length} bytes; allowed: 1 to {_MOST_OF_RUN}")
-        file.seek(at + 12)
-        yield length
+        records.append((at + 12, length))
         at += 16 + length
-        file.seek(at)
+    return records
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, bytes]]:

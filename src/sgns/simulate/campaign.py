@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 import yaml
-from omegaconf import OmegaConf
 
 from mpm_warp import Decision, Effects, Scene, SceneError, substeps_per_frame
 from sgns.config import UserError, flattened
 from sgns.data.dataset import SPLITS, read_description
 from sgns.data.files import file_lock, write_whole
-from sgns.simulate.scene import decided, plain
+from sgns.simulate.scene import decided, replaced
 
 # --- What runs cost in work, time and disk, before and while they are made ------------------------------
 
@@ -242,10 +241,7 @@ def plan(
     grids: dict[int, list[str]] = {}
     for index in chosen:
         grid, values = combinations[index]
-        changed = OmegaConf.create(dict(base))
-        for key, value in values.items():
-            OmegaConf.update(changed, key, value, force_add=True)
-        data = plain(changed)
+        data = replaced(base, values)
         if isinstance(data.get("tool"), dict):
             data["tool"].pop("digest", None)  # `draw` may name another file; these are the person's settings
         name = f"{index:04d}_" + "_".join(f"{key.split('.')[-1]}-{value}" for key, value in values.items())

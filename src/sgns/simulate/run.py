@@ -18,6 +18,7 @@ from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.data.writer import RunWriter
 from sgns.numbers import elapsed
+from sgns.simulate.scene import replaced
 
 # --- Going on with a run whose solver stopped -----------------------------------------------------------
 
@@ -58,14 +59,7 @@ class Restart:
     @property
     def changed_scene(self) -> Scene:
         """What is computed from here on."""
-        data = self.scene.to_dict()
-        for key, value in self.changes.items():
-            *groups, last = key.split(".")
-            place = data
-            for group in groups:
-                place = place[group]
-            place[last] = value
-        return Scene.from_dict(data, self.scene.mesh)
+        return Scene.from_dict(replaced(self.scene.to_dict(), self.changes), self.scene.mesh)
 
     @property
     def record(self) -> list[dict[str, Any]]:

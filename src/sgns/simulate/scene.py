@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import io
 from collections import Counter
@@ -13,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mpm_warp import Decision, Effects, Scene, Tolerances, effects_for
 from mpm_warp.inputs import read_text
-from sgns.config import UserError, check_fields
+from sgns.config import UserError, check_fields, flattened
 
 # --- From conf to a scene of mpm_warp -------------------------------------------------------------------
 
@@ -32,6 +33,20 @@ def scene_from_config(cfg: DictConfig) -> Scene:
 def plain(group: DictConfig) -> dict[str, Any]:
     """A group of settings as plain data."""
     return cast(dict[str, Any], OmegaConf.to_container(group, resolve=True))
+
+
+def replaced(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of nested settings with other values at some dotted keys."""
+    found = copy.deepcopy(dict(data))
+    for key, value in flattened(changes).items():
+        *groups, last = key.split(".")
+        place = found
+        for group in groups:
+            if not isinstance(place.get(group), dict):
+                place[group] = {}
+            place = place[group]
+        place[last] = value
+    return found
 
 
 def read_path(file: Path) -> list[list[float]]:
