@@ -65,22 +65,13 @@ def run_cost(scene: Scene) -> RunCost:
     per_frame = (
         stored * _BYTES_PER_PARTICLE + len(scene.body_points()) * _BYTES_PER_BODY_POINT + _BYTES_PER_FRAME
     )
-    return RunCost(
-        particles=particles,
-        substeps=substeps,
-        frames=scene.frame_count,
-        size=scene.frame_count * per_frame + _BYTES_PER_FILE,
-    )
+    frames = scene.frame_count
+    return RunCost(particles, substeps, frames, size=frames * per_frame + _BYTES_PER_FILE)
 
 
 def finishing_time(waiting: Sequence[float], running: Sequence[float], workers: int) -> float:
-    """When the last job ends if every worker that becomes free takes the next one, in the unit of the jobs' lengths.
-
-    Args:
-        waiting: lengths of the jobs not begun, in their order.
-        running: what is left of the jobs under way, at most one for each worker.
-        workers: how many jobs go on at once.
-    """
+    """When the last job ends if every worker that becomes free takes the next one, in the unit of the jobs' lengths:
+    those waiting, in their order, and what is left of those running, at most one for each worker."""
     free_at = [*running, *[0.0] * (workers - len(running))]
     heapq.heapify(free_at)
     for length in waiting:
@@ -89,11 +80,7 @@ def finishing_time(waiting: Sequence[float], running: Sequence[float], workers: 
 
 
 def require_space(folder: Path, size: int) -> None:
-    """Refuses to begin what the disk cannot take.
-
-    Args:
-        folder: where files will be written; it need not exist yet.
-        size: of the files [bytes].
+    """Refuses to begin what the disk cannot take: files of this size [bytes] in a folder that need not exist yet.
 
     Raises:
         UserError: less than that is free.
@@ -174,9 +161,8 @@ class Campaign:
         file = self.path / "dataset.yaml"
         try:
             if not file.exists():
-                with file_lock(
-                    file, wait=True
-                ):  # of two campaigns that begin at once the second finds the first's
+                # Of two campaigns that begin at once the second finds the first's.
+                with file_lock(file, wait=True):
                     if not file.exists():
                         write_whole(file, yaml.safe_dump(self.describe(), sort_keys=False))
                         return
