@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -17,7 +17,7 @@ import numpy as np
 from omegaconf import OmegaConf
 from scipy.spatial import cKDTree
 
-from mpm_warp.poses import rotation_matrices
+from mpm_warp.poses import in_body_frame, rotation_matrices
 from sgns.config import UserError, parse_yaml
 from sgns.data.files import one_line
 from sgns.data.hdf5 import BROKEN, own_dataset, own_object, own_view
@@ -77,26 +77,24 @@ def check_run(path: str | os.PathLike[str]) -> list[str]:
     return problems
 
 
-def _check_h5md(file: h5py.File) -> list[str]:
-    problems = []
+def _check_h5md(file: h5py.File) -> Iterator[str]:
     h5md = own_object(file, "h5md")
     if not isinstance(h5md, h5py.Group):
-        return ["group /h5md is missing"]
+        yield "group /h5md is missing"
+        return
     if tuple(np.atleast_1d(h5md.attrs.get("version", ()))) != (1, 1):
-        problems.append("attribute version of /h5md is not (1, 1)")
+        yield "attribute version of /h5md is not (1, 1)"
     for group, key in (("author", "name"), ("creator", "name"), ("creator", "version")):
         found = own_object(h5md, group)
         if found is None or key not in found.attrs:
-            problems.append(f"attribute {key} of /h5md/{group} is missing")
+            yield f"attribute {key} of /h5md/{group} is missing"
     for group in ("soil", "body"):
         box = own_object(file, f"particles/{group}/box")
         if box is None or "dimension" not in box.attrs or "boundary" not in box.attrs:
-            problems.append(f"group /particles/{group}/box with dimension and boundary is missing")
-    return problems
+            yield f"group /particles/{group}/box with dimension and boundary is missing"
 
 
-def _check_attributes(file: h5py.File) -> list[str]:
-    problems = []
+def _check_attributes(file: h5py.File) -> Iterator[str]:
     values = read_attributes(file)
     for name in ("scene", "effects", "extra"):
         if not isinstance(text := values.get(name), str):
@@ -104,24 +102,23 @@ def _check_attributes(file: h5py.File) -> list[str]:
         try:
             data = parse_yaml(text)
         except ValueError as error:
-            problems.append(f"root attribute {name!r} is not YAML ({one_line(error)})")
+            yield f"root attribute {name!r} is not YAML ({one_line(error)})"
             continue
         if not isinstance(data, dict):
-            problems.append(f"root attribute {name!r} is not a group of keys")
+            yield f"root attribute {name!r} is not a group of keys"
         elif name == "scene":
-            problems += scene_problems(data)
+            yield from scene_problems(data)
             try:
                 require_mesh_was_read(data)
             except ValueError as error:
-                problems.append(f"root attribute 'scene': {one_line(error)}")
+                yield f"root attribute 'scene': {one_line(error)}"
         elif name == "effects":
             for key, effect in data.items():
                 if not (isinstance(effect, dict) and type(effect.get("on")) is bool and effect.get("reason")):
-                    problems.append(f"effect {key!r} does not say whether it is on and why")
+                    yield f"effect {key!r} does not say whether it is on and why"
     producer = values.get("producer")
     if isinstance(producer, str) and producer not in PRODUCERS:
-        problems.append(f"producer is {producer!r}; allowed: {', '.join(PRODUCERS)}")
-    return problems
+        yield f"producer is {producer!r}; allowed: {', '.join(PRODUCERS)}"
 
 
 def scene_problems(scene: Mapping[str, Any]) -> list[str]:
@@ -139,116 +136,109 @@ def scene_problems(scene: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _check_stopped(file: h5py.File) -> list[str]:
-    reason = read_attributes(file).get(STOPPED)
-    if reason is None:
-        return []
-    return [f"the run stopped after {len(series(file, 'position'))} good frames: {one_line(reason)}"]
+def _check_stopped(file: h5py.File) -> Iterator[str]:
+    if (reason := read_attributes(file).get(STOPPED)) is not None:
+        yield f"the run stopped after {len(series(file, 'position'))} good frames: {one_line(reason)}"
 
 
-def _check_times(file: h5py.File) -> list[str]:
-    problems = []
+def _check_times(file: h5py.File) -> Iterator[str]:
     time, step = (series(file, "position", part)[...] for part in ("time", "step"))
     for name, recorded in SERIES.items():
         for part, expected in (("time", time), ("step", step)):
             if not np.array_equal(series(file, name, part)[...], expected, equal_nan=part == "time"):
-                problems.append(f"dataset /{recorded.path}/{part} differs from that of the soil positions")
+                yield f"dataset /{recorded.path}/{part} differs from that of the soil positions"
     if (frame := _first(~np.isfinite(time))) is not None:
-        return [*problems, f"time is not finite at frame {frame}"]
+        yield f"time is not finite at frame {frame}"
+        return
     if (frame := _first(np.diff(step) <= 0)) is not None:
-        problems.append(f"step does not increase at frame {frame + 1}")
+        yield f"step does not increase at frame {frame + 1}"
     interval, rate = np.diff(time), float(file.attrs["frame_rate"])
     if (frame := _first(interval <= 0)) is not None:
-        return [*problems, f"time does not increase at frame {frame + 1}"]
-    if (frame := _first(~(np.abs(interval * rate - 1.0) <= INTERVAL_TOLERANCE))) is not None:
-        problems.append(
+        yield f"time does not increase at frame {frame + 1}"
+    elif (frame := _first(~(np.abs(interval * rate - 1.0) <= INTERVAL_TOLERANCE))) is not None:
+        yield (
             f"time before frame {frame + 1} advances by {interval[frame]:.6g} s, "
             f"not by 1 / frame_rate = {1.0 / rate:.6g} s"
         )
-    return problems
 
 
-def _check_body(file: h5py.File) -> list[str]:
-    problems = []
-    data = {
-        name: series(file, name)[...].astype(float) for name in ("pose", "force", "torque", "body_points")
-    }
-    for name, values in data.items():
+def _check_body(file: h5py.File) -> Iterator[str]:
+    names = ("pose", "force", "torque", "body_points")
+    pose, force, torque, points = (series(file, name)[...].astype(float) for name in names)
+    good = True
+    for name, values in zip(names, (pose, force, torque, points), strict=True):
         frame = _first(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
         if frame is not None:
-            problems.append(f"{name} is not finite at frame {frame}")
-    if problems:
-        return problems
-    pose, points = data["pose"], data["body_points"]
+            yield f"{name} is not finite at frame {frame}"
+            good = False
+    if not good:
+        return
     length = np.linalg.norm(pose[:, 3:], axis=1)
     if (frame := _first(~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE))) is not None:
-        return [f"the quaternion of frame {frame} has length {length[frame]:.6g}, not 1"]
-    rotation = rotation_matrices(pose[:, 3:])  # (T, 3, 3)
-    body_frame = (points - pose[:, None, :3]) @ rotation  # rows times R = R^T applied to each point
-    error = np.linalg.norm(body_frame - body_frame[:1], axis=2)
-    if (frame := _first(~(error <= RIGID_TOLERANCE).all(axis=1))) is None:
-        return []
-    point = int(error[frame].argmax())
-    return [
-        f"body point {point} of frame {frame} is {error[frame, point]:.3g} m from where the pose puts it "
-        f"(allowed {RIGID_TOLERANCE:g} m)"
-    ]
+        yield f"the quaternion of frame {frame} has length {length[frame]:.6g}, not 1"
+        return
+    # Rows times R are R^T applied to each point.
+    nodes = (points - pose[:, None, :3]) @ rotation_matrices(pose[:, 3:])
+    error = np.linalg.norm(nodes - nodes[:1], axis=2)
+    if (frame := _first(~(error <= RIGID_TOLERANCE).all(axis=1))) is not None:
+        point = int(error[frame].argmax())
+        yield (
+            f"body point {point} of frame {frame} is {error[frame, point]:.3g} m from where the pose puts it "
+            f"(allowed {RIGID_TOLERANCE:g} m)"
+        )
 
 
-def _check_mesh(file: h5py.File) -> list[str]:
+def _check_mesh(file: h5py.File) -> Iterator[str]:
     """That the tool's mesh is one, and that the body points are vertices of it."""
     try:
         mesh = read_mesh(file)
     except BROKEN as error:
-        return [f"the tool's mesh is damaged ({one_line(error)})"]
-    if mesh is None:
-        return []
-    pose, points = (series(file, name)[0].astype(float) for name in ("pose", "body_points"))
-    nodes = (points - pose[:3]) @ rotation_matrices(pose[None, 3:])[0]
-    away, _ = cKDTree(mesh[0]).query(nodes)
-    if (point := _first(~(away <= RIGID_TOLERANCE))) is None:
-        return []
-    return [
-        f"body point {point} is {away[point]:.3g} m from the nearest vertex of the tool's mesh (allowed "
-        f"{RIGID_TOLERANCE:g} m): the mesh is of another tool"
-    ]
+        yield f"the tool's mesh is damaged ({one_line(error)})"
+        return
+    if mesh is not None:
+        pose, points = (series(file, name)[0].astype(float) for name in ("pose", "body_points"))
+        away, _ = cKDTree(mesh[0]).query(in_body_frame(pose, points))
+        if (point := _first(~(away <= RIGID_TOLERANCE))) is not None:
+            yield (
+                f"body point {point} is {away[point]:.3g} m from the nearest vertex of the tool's mesh (allowed "
+                f"{RIGID_TOLERANCE:g} m): the mesh is of another tool"
+            )
 
 
-def _check_view(file: h5py.File) -> list[str]:
+def _check_view(file: h5py.File) -> Iterator[str]:
     """Where /VTKHDF does not fit the H5MD arrays; the values behind it are compared by `_check_frames`."""
     group = own_object(file, "VTKHDF")
     if not isinstance(group, h5py.Group):
-        return ["group /VTKHDF is missing: ParaView cannot open the file"]
-    problems = []
+        yield "group /VTKHDF is missing: ParaView cannot open the file"
+        return
     for name, value in VIEW_ATTRIBUTES.items():
         if not np.array_equal(np.asarray(group.attrs.get(name)), np.asarray(value)):
             wanted = value.decode() if isinstance(value, bytes) else tuple(value.tolist())
-            problems.append(f"attribute {name} of /VTKHDF is not {wanted}")
+            yield f"attribute {name} of /VTKHDF is not {wanted}"
     frames, particles, _ = series(file, "position").shape
     times = series(file, "position", "time")[...]
     for name, values in (view_arrays(frames, particles) | {"Steps/Values": times}).items():
         try:
             stored = own_dataset(group, name)
         except KeyError:
-            problems.append(f"dataset /VTKHDF/{name} is missing")
+            yield f"dataset /VTKHDF/{name} is missing"
             continue
         if stored.shape != values.shape or not np.array_equal(stored[...], values):
-            problems.append(f"dataset /VTKHDF/{name} does not fit {frames} frames of {particles} particles")
+            yield f"dataset /VTKHDF/{name} does not fit {frames} frames of {particles} particles"
+    expected = (frames * particles, 3)
     for name in VIEWS.values():
         found = own_object(group, name)
         if not isinstance(found, h5py.Dataset):
-            problems.append(f"dataset /VTKHDF/{name} is missing")
-        elif found.shape != (frames * particles, 3):
-            expected = (frames * particles, 3)
-            problems.append(f"dataset /VTKHDF/{name} has shape {found.shape}, expected {expected}")
+            yield f"dataset /VTKHDF/{name} is missing"
+        elif found.shape != expected:
+            yield f"dataset /VTKHDF/{name} has shape {found.shape}, expected {expected}"
         elif not found.is_virtual:
-            problems.append(f"dataset /VTKHDF/{name} is a copy, not a view")
+            yield f"dataset /VTKHDF/{name} is a copy, not a view"
         else:
             own_view(group, name)
-    return problems
 
 
-def _check_frames(file: h5py.File) -> list[str]:
+def _check_frames(file: h5py.File) -> Iterator[str]:
     """Finite soil, the same numbers through /VTKHDF, and the content hash; memory for a frame only."""
     small = {name: series(file, name)[...] for name in SERIES if name not in VIEWS}
     small["time"] = series(file, "position", "time")[...]
@@ -268,9 +258,9 @@ def _check_frames(file: h5py.File) -> list[str]:
                 if not np.array_equal(seen, soil, equal_nan=True):
                     found.setdefault(f"{name} view", f"/VTKHDF shows another {name} at frame {frame}")
         content.update(arrays)
+    yield from found.values()
     if content.hexdigest() != read_attributes(file)["content_hash"]:
-        found["hash"] = "the data do not match content_hash: they were changed or damaged after the run"
-    return list(found.values())
+        yield "the data do not match content_hash: they were changed or damaged after the run"
 
 
 def _view(file: h5py.File, path: str) -> h5py.Dataset | None:

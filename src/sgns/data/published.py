@@ -96,18 +96,6 @@ def wheel_case(case: int) -> dict[str, float]:
     return found | {"width": WIDTHS[found["diameter"]]}
 
 
-def published_files(folder: str | Path) -> list[str]:
-    """Names of the splits in a folder: of every <split>.tfrecord."""
-    folder = Path(folder)
-    found = sorted(file.stem for file in folder.glob("*.tfrecord"))
-    if not found or not (folder / "metadata.json").is_file():
-        raise UserError(
-            f"{folder} does not hold published runs; it needs metadata.json and at least one <split>.tfrecord, as the "
-            "paper's authors published them"
-        )
-    return found
-
-
 def read_published(folder: str | Path, split: str = "valid") -> list[PublishedRun]:
     """The runs of one folder with `<split>.tfrecord` and `metadata.json`."""
     folder = Path(folder)
@@ -264,7 +252,12 @@ def published_dataset(settings: Mapping[str, Any], num_modes: int | str) -> Redu
     else:
         split["train"] = everything = [run for found in runs.values() for run in found]
         if folds is not None:
-            _check_fold(folds, fold, len(everything))
+            if not is_whole(folds) or not 2 <= folds <= len(everything):
+                raise UserError(
+                    f"dataset.folds is {folds!r}; allowed: 2 to {len(everything)}, the number of runs, or null"
+                )
+            if not is_whole(fold) or not 0 <= fold < folds:
+                raise UserError(f"dataset.fold is {fold!r}; allowed: 0 to {folds - 1}")
             split["test"] = everything[fold::folds]
             split["train"] = [run for i, run in enumerate(everything) if i % folds != fold]
     first = split["train"][0]
@@ -290,9 +283,16 @@ def published_dataset(settings: Mapping[str, Any], num_modes: int | str) -> Redu
 
 
 def published_runs(folder: str | Path) -> dict[str, list[ReducedRun]]:
-    """All runs of a folder by the name of their file."""
+    """All runs of a folder by the name of their file, <split>.tfrecord."""
+    folder = Path(folder)
+    splits = sorted(file.stem for file in folder.glob("*.tfrecord"))
+    if not splits or not (folder / "metadata.json").is_file():
+        raise UserError(
+            f"{folder} does not hold published runs; it needs metadata.json and at least one <split>.tfrecord, as the "
+            "paper's authors published them"
+        )
     found = {}
-    for split in published_files(folder):
+    for split in splits:
         runs = read_published(folder, split=split)
         # The authors drew their training split with replacement: a run may be there twice.
         unique = {run.latent.tobytes(): run for run in runs}.values()
@@ -307,26 +307,21 @@ def fingerprint(run: ReducedRun) -> str:
     return hashlib.blake2b(np.ascontiguousarray(run.latent).tobytes(), digest_size=6).hexdigest()
 
 
-def _check_fold(folds: Any, fold: Any, count: int) -> None:
-    if not is_whole(folds) or not 2 <= folds <= count:
-        raise UserError(f"dataset.folds is {folds!r}; allowed: 2 to {count}, the number of runs, or null")
-    if not is_whole(fold) or not 0 <= fold < folds:
-        raise UserError(f"dataset.fold is {fold!r}; allowed: 0 to {folds - 1}")
-
-
 def _reduced(run: PublishedRun, name: str) -> ReducedRun:
     # To this package's axes; where the origin of a mode's positions lies does not matter.
     latent = np.stack([-run.latent[..., 0], run.latent[..., 2], run.latent[..., 1]], axis=-1)
-    time = np.arange(len(latent)) / _FRAME_RATE
+    points, wheel = run.body_points, run.kind == "wheel"
+    # A wheel's pose: centre of the rim's points and turn since the first frame.
+    pose = fitted_poses(points[0] - points[0].mean(axis=0), points) if wheel else _blade_poses(points)
     return ReducedRun(
         name=name if run.case is None else f"{run.kind}_{run.case:03d}",
         latent=latent,
-        time=time,
-        pose=_wheel_poses(run.body_points) if run.kind == "wheel" else _blade_poses(run.body_points),
-        body_points=run.body_points,
+        time=np.arange(len(latent)) / _FRAME_RATE,
+        pose=pose,
+        body_points=points,
         force=run.force,
         torque=np.zeros_like(run.force),
-        scene={"kind": run.kind} | (_wheel_values(run) if run.kind == "wheel" else {}),
+        scene={"kind": run.kind} | (_wheel_values(run) if wheel else {}),
     )
 
 
@@ -343,11 +338,6 @@ def _wheel_values(run: PublishedRun) -> dict[str, float]:
         "diameter": min(DIAMETERS, key=lambda diameter: abs(diameter - across)),
         "slip": round(1.0 - speed / _RIM_SPEED, 4),
     }
-
-
-def _wheel_poses(points: np.ndarray) -> np.ndarray:
-    """Centre of the rim's points and turn since the first frame, shape (T, 7)."""
-    return fitted_poses(points[0] - points[0].mean(axis=0), points)
 
 
 def _blade_poses(points: np.ndarray) -> np.ndarray:

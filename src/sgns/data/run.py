@@ -10,6 +10,7 @@ import math
 import os
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -230,41 +231,39 @@ def structure_problems(file: h5py.File) -> list[str]:
     A file without such problems can be read by `Run` without surprises.
     """
     counts: dict[str, int] = {}  # T, n and M, from the first that shows them
-    problems = _attribute_problems(file)
+    problems = list(_attribute_problems(file))
     for recorded in SERIES.values():
         problems += _series_problems(file, recorded, counts)
     return problems + _mesh_problems(file)
 
 
-def _attribute_problems(file: h5py.File) -> list[str]:
-    problems = [f"root attribute {name!r} is missing" for name in ATTRIBUTES if name not in file.attrs]
+def _attribute_problems(file: h5py.File) -> Iterator[str]:
     values = read_attributes(file)
+    yield from (f"root attribute {name!r} is missing" for name in ATTRIBUTES if name not in values)
     for name, kind in ATTRIBUTES.items():
         if name in values and not isinstance(values[name], kind):
-            problems.append(f"root attribute {name!r} has the wrong type ({type(values[name]).__name__})")
+            yield f"root attribute {name!r} has the wrong type ({type(values[name]).__name__})"
     for name, allowed in (("frame_rate", "above 0 Hz"), ("wall_time_s", "0 s or more")):
         value = values.get(name)
         if isinstance(value, _REAL) and not (0 <= value < math.inf and (value > 0 or name == "wall_time_s")):
-            problems.append(f"{name} is {value}; it must be {allowed}")
+            yield f"{name} is {value}; it must be {allowed}"
     digest = values.get("content_hash")  # it becomes the name of a file
     if isinstance(digest, str) and not re.fullmatch("[0-9a-f]{32}", digest):
-        problems.append(f"root attribute 'content_hash' is {digest[:40]!r}, not 32 hexadecimal digits")
-    return problems
+        yield f"root attribute 'content_hash' is {digest[:40]!r}, not 32 hexadecimal digits"
 
 
-def _series_problems(file: h5py.File, recorded: Recorded, counts: dict[str, int]) -> list[str]:
-    datasets, problems = {}, []
+def _series_problems(file: h5py.File, recorded: Recorded, counts: dict[str, int]) -> Iterator[str]:
+    datasets = {}
     for part in ("value", "step", "time"):
-        path = f"{recorded.path}/{part}"
         try:
-            found = own_dataset(file, path, by_frame=recorded.of_soil and part == "value")
+            found = own_dataset(file, f"{recorded.path}/{part}", recorded.of_soil and part == "value")
         except (KeyError, ValueError) as error:
-            problems.append(one_line(error).strip("'"))
+            yield one_line(error).strip("'")
             continue
-        if found.dtype.kind not in ("iu" if part == "step" else "f"):
-            problems.append(f"dataset /{path} has the wrong type {found.dtype}")
-        else:
+        if found.dtype.kind in ("iu" if part == "step" else "f"):
             datasets[part] = found
+        else:
+            yield f"dataset {found.name} has the wrong type {found.dtype}"
     for part, found in datasets.items():
         expected = ("T", *recorded.tail) if part == "value" else ("T",)
         known = [counts.get(size, size) if isinstance(size, str) else size for size in expected]
@@ -273,12 +272,11 @@ def _series_problems(file: h5py.File, recorded: Recorded, counts: dict[str, int]
         )
         if not fits:
             shown = ", ".join(map(str, known))  # a letter if not known yet
-            problems.append(f"dataset {found.name} has shape {found.shape}, expected ({shown})")
+            yield f"dataset {found.name} has shape {found.shape}, expected ({shown})"
             continue
         if found.shape[0] == 0:
-            problems.append(f"dataset {found.name} holds no frame")
+            yield f"dataset {found.name} holds no frame"
         counts |= {size: n for size, n in zip(known, found.shape, strict=True) if isinstance(size, str)}
-    return problems
 
 
 def _mesh_problems(file: h5py.File) -> list[str]:
@@ -381,10 +379,8 @@ class Run:
         """Of a tool that is a mesh: vertices (V, 3) about its centre of mass [m], float64, and triangles (F, 3), both
         read-only; None for other tools."""
         if "mesh" not in self._cache:
-            try:
+            with self._reading("the tool's mesh"):
                 self._cache["mesh"] = read_mesh(self._file)
-            except BROKEN as error:
-                raise self._damaged("the tool's mesh", error) from error
             for array in self._cache["mesh"] or ():
                 array.flags.writeable = False
         return self._cache["mesh"]
@@ -476,43 +472,41 @@ class Run:
         """A small array as float64: read once, given out as a copy."""
         key = f"{name}/{part}"
         if key not in self._cache:
-            try:
+            with self._reading(name):
                 self._cache[key] = self._dataset(name, part)[...].astype(np.float64)
-            except BROKEN as error:
-                raise self._damaged(name, error) from error
         return self._cache[key].copy()
 
     def _frames(self, name: str, frames: slice | int | list[int] | np.ndarray) -> np.ndarray:
         index = np.atleast_1d(np.arange(self.frame_count)[frames])
         dataset = self._dataset(name)
         out = np.empty((len(index), self.particle_count, 3), dtype=np.float32)
-        try:
+        with self._reading(name):
             if len(index) and (np.diff(index) == 1).all():
                 dataset.read_direct(out, np.s_[index[0] : index[-1] + 1])
             else:  # a frame is a chunk, so reading them one by one costs nothing extra
                 for row, frame in enumerate(index):
                     dataset.read_direct(out, np.s_[frame], np.s_[row])
-        except BROKEN as error:
-            raise self._damaged(name, error) from error
         return out
 
     def _yaml(self, name: str) -> dict[str, Any]:
         if name not in self._cache:
-            try:
+            with self._reading(name):
                 data = parse_yaml(self._text[name])
                 if not isinstance(data, dict):
                     raise ValueError("it is not a group of keys")
                 if name == "scene":
                     require_mesh_was_read(data)
-            except ValueError as error:
-                raise self._damaged(name, error) from error
             self._cache[name] = data
         return copy.deepcopy(self._cache[name])
 
-    def _damaged(self, name: str, error: object) -> UserError:
-        return UserError(
-            f"{self.path}: {name} is damaged ({one_line(error)}); copy the file again or repeat the run"
-        )
+    @contextmanager
+    def _reading(self, name: str) -> Iterator[None]:
+        try:
+            yield
+        except BROKEN as error:
+            raise UserError(
+                f"{self.path}: {name} is damaged ({one_line(error)}); copy the file again or repeat the run"
+            ) from error
 
 
 CHUNK_BYTES = 32e6  # positions held at one time, float64

@@ -62,7 +62,7 @@ def start(code, path):
     )
 
 
-def test_another_process_has_a_lock_until_it_ends(tmp_path):
+def test_who_asks_second_hears_who_is_at_it(tmp_path):
     path = tmp_path / "runs" / "a.h5"
     with start(HOLD, path) as holder:
         assert holder.stdout.readline() == "True\n"
