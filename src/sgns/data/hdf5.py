@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
 
 class NewFile(io.RawIOBase):
-    """A hidden file beside `path`, for `h5py.File(NewFile(path), "w")`; `complete` gives it its name.
+    """A hidden file beside `path`, for `h5py.File(NewFile(path), "w")`; `complete` gives it its name, `discard` removes
+    it.
 
     Until then an existing file of that name stays as it is. Missing folders are made, and hidden files that killed
     processes of this machine left for the same path are removed.
@@ -66,20 +67,16 @@ class NewFile(io.RawIOBase):
         the HDF5 file before.
 
         Raises:
-            UserError: the disk did not take it; nothing is left behind.
+            UserError: the disk did not take it.
         """
+        self.check()
         try:
-            self.check()
             give_name(self._file, self._hidden, path or self.path)
-            # Again: when this file was begun, a process just killed may still have had its lock.
-            with suppress(OSError):
-                remove_abandoned(self.path)
         except OSError as error:
-            self.discard()
             raise _cannot_write(self.path, error) from error
-        except BaseException:
-            self.discard()
-            raise
+        # Again: when this file was begun, a process just killed may still have had its lock.
+        with suppress(OSError):
+            remove_abandoned(self.path)
         if os.name == "posix":
             with suppress(OSError):  # the file is complete; some file systems cannot sync a folder
                 descriptor = os.open(self.path.parent, os.O_RDONLY)

@@ -74,10 +74,6 @@ class Recorded:
         """Whether it has a value for every particle, and therefore is written and read frame by frame."""
         return "n" in self.tail
 
-    def frame_shape(self, counts: dict[str, int]) -> tuple[int, ...]:
-        """Shape of one frame when the letters have these values."""
-        return tuple(counts[size] if isinstance(size, str) else size for size in self.tail)
-
 
 # H5MD's own attribute `unit` is left unset on purpose: MDAnalysis refuses lengths in metres.
 SERIES = {
@@ -85,13 +81,6 @@ SERIES = {
     "velocity": Recorded("particles/soil/velocity", ("n", 3), "<f4", "m/s", "soil particles, world frame"),
     "body_points": Recorded(
         "particles/body/position", ("M", 3), "<f8", "m", "fixed to the body, world frame"
-    ),
-    "pose": Recorded(
-        "observables/body/pose",
-        (7,),
-        "<f8",
-        "m, 1",
-        "centre of mass x y z [m], then unit quaternion x y z w, body to world",
     ),
     "force": Recorded(
         "observables/body/force", (3,), "<f8", "N", "by the soil on the body, world frame, mean of the frame"
@@ -103,8 +92,15 @@ SERIES = {
         "N m",
         "by the soil on the body about its centre of mass, world frame, mean over the frame",
     ),
+    "pose": Recorded(
+        "observables/body/pose",
+        (7,),
+        "<f8",
+        "m, 1",
+        "centre of mass x y z [m], then unit quaternion x y z w, body to world",
+    ),
 }
-"""What is recorded in every frame, in the order of the content hash."""
+"""What is recorded in every frame."""
 MESH = {
     "vertices": Recorded(
         "parameters/tool/vertices",
@@ -255,15 +251,19 @@ def _attribute_problems(file: h5py.File) -> Iterator[str]:
 def _series_problems(file: h5py.File, recorded: Recorded, counts: dict[str, int]) -> Iterator[str]:
     datasets = {}
     for part in ("value", "step", "time"):
+        path = f"{recorded.path}/{part}"
         try:
-            found = own_dataset(file, f"{recorded.path}/{part}", recorded.of_soil and part == "value")
-        except (KeyError, ValueError) as error:
-            yield one_line(error).strip("'")
+            found = own_dataset(file, path, by_frame=recorded.of_soil and part == "value")
+        except KeyError:
+            yield f"dataset /{path} is missing"
+            continue
+        except ValueError as error:
+            yield str(error)
             continue
         if found.dtype.kind in ("iu" if part == "step" else "f"):
             datasets[part] = found
         else:
-            yield f"dataset {found.name} has the wrong type {found.dtype}"
+            yield f"dataset /{path} has the wrong type {found.dtype}"
     for part, found in datasets.items():
         expected = ("T", *recorded.tail) if part == "value" else ("T",)
         known = [counts.get(size, size) if isinstance(size, str) else size for size in expected]
@@ -307,9 +307,6 @@ class Run:
     """A run file, open for reading; soil is read only when asked for.
 
     Opening reads attributes and shapes only. Close it, or use it as a context manager.
-
-    Args:
-        path: the .h5 file.
 
     Raises:
         UserError: the file is missing, cut short, incomplete, written by something else or by a newer sgns.

@@ -128,14 +128,16 @@ def _is_stopped(path: Path) -> bool:
 
 
 class ContentHash:
-    """BLAKE2b over the stored numbers: of each frame its time, then `SERIES` in their order, little-endian."""
+    """BLAKE2b over the stored numbers, frame by frame in the order of `ORDER`, little-endian."""
+
+    ORDER = ("time", "position", "velocity", "body_points", "pose", "force", "torque")
 
     def __init__(self) -> None:
         self._hash = hashlib.blake2b(digest_size=16)
 
     def update(self, frame: Mapping[str, np.ndarray]) -> None:
-        """Add one frame: `time` and an array for every name in `SERIES`, in the file's types."""
-        for name in ("time", *SERIES):
+        """Add one frame: an array for every name in `ORDER`, in the file's types."""
+        for name in self.ORDER:
             self._hash.update(np.ascontiguousarray(frame[name]).data)
 
     def hexdigest(self) -> str:
@@ -191,9 +193,12 @@ class RunWriter:
             raise ValueError(f"frame_rate is {frame_rate}; it must be above 0 Hz")
         self.path = Path(path)
         counts = {"n": int(particle_count), "M": int(body_points)}
-        self._shapes = {name: recorded.frame_shape(counts) for name, recorded in SERIES.items()}
+        self._shapes = {  # of one frame
+            name: tuple(counts[size] if isinstance(size, str) else size for size in recorded.tail)
+            for name, recorded in SERIES.items()
+        }
         self._small: dict[str, list[np.ndarray]] = {
-            name: [] for name in ("time", *SERIES) if name not in VIEWS
+            name: [] for name in ContentHash.ORDER if name not in VIEWS
         }
         self._hash = ContentHash()
         extra = extra or {}
@@ -260,7 +265,7 @@ class RunWriter:
         frame = {"time": np.asarray(time, dtype="<f8")}
         if frame["time"].shape != ():
             raise ValueError(f"time has shape {frame['time'].shape}; it must be one number [s]")
-        given = (position, velocity, body_points, body_pose, force, torque)
+        given = (position, velocity, body_points, force, torque, body_pose)  # as in SERIES
         for (name, recorded), values in zip(SERIES.items(), given, strict=True):
             # A float64 beyond float32's range becomes inf here and is reported below, so numpy need not warn.
             with np.errstate(over="ignore"):

@@ -148,14 +148,14 @@ def test_kernels_are_compiled_once_for_each_kind_of_scene(tmp_path, monkeypatch)
         return SimpleNamespace(frames=lambda: iter(["the first"]))
 
     monkeypatch.setattr(campaign_runs, "Solver", solver)
-    numbers = campaign(tmp_path, draw={"rake": [5.0, 10.0], "depth": [0.02, 0.04, 0.05]}, runs=None)
-    campaign_runs._compile(numbers, list(numbers.scenes), "cpu")
-    assert len(compiled) == 1
-    compiled.clear()
-    kinds = campaign(
-        tmp_path, draw={"motion": ["curved", "ramp"], "blade.friction": [0.0, 0.1, 0.3]}, runs=None
-    )
-    campaign_runs._compile(kinds, list(kinds.scenes), "cpu")
+    for draw, kernels in (
+        ({"rake": [5.0, 10.0], "depth": [0.02, 0.04, 0.05]}, 1),
+        ({"motion": ["curved", "ramp"], "blade.friction": [0.0, 0.1, 0.3]}, 4),
+    ):
+        compiled.clear()
+        c = campaign(tmp_path, draw=draw, runs=None)
+        campaign_runs._compile(c, list(c.scenes), "cpu")
+        assert len(compiled) == kernels
     assert sorted((s.motion, s.blade.friction) for s in compiled) == [
         ("curved", 0.0), ("curved", 0.1), ("ramp", 0.0), ("ramp", 0.1)
     ]  # fmt: skip
