@@ -192,7 +192,7 @@ def scene_stages(
     seed: int = 0,
     device: str = "cpu",
     precision: str = "float32",
-    progress: Callable[[], object] | None = None,
+    progress: Callable[[], object] = lambda: None,
     restart: Restart | None = None,
 ) -> Generator[Timing | Work, None, None]:
     """Compute a scene and write its run file, with the particles that `scene.bed.store_every` leaves in it.
@@ -213,6 +213,13 @@ def scene_stages(
         computed, state, before = restart.changed_scene, restart.state, restart.wall_time
     solver = Solver(computed, effects, device, precision, start=state)
     stored = scene.stored
+    made_with = {
+        "device": device,
+        "precision": precision,
+        "time_step_s": solver.time_step,
+        "substeps_per_frame": solver.substeps_per_frame,
+        "particles_simulated": solver.particle_count,
+    }
     with RunWriter(
         output,
         scene=scene.to_dict(),
@@ -223,60 +230,58 @@ def scene_stages(
         frame_rate=scene.frame_rate,
         seed=seed,
         producer="mpm",
-        extra={
-            "device": device,
-            "precision": precision,
-            "time_step_s": solver.time_step,
-            "substeps_per_frame": solver.substeps_per_frame,
-            "particles_simulated": solver.particle_count,
-        }
-        | ({"continued": restart.record} if restart is not None else {}),
+        extra=made_with | ({"continued": restart.record} if restart is not None else {}),
         mesh=scene.mesh,
     ) as writer:
         for frame in restart.frames() if restart is not None else ():
             writer.append(*frame)
-            if progress is not None:
-                progress()
+            progress()
         there = writer.frame_count
         # Loading kernels is not part of the cost of a run: the clock starts with the first frame, or with the first
         # work where the first frames are there already.
-        wall_time, seen, shared_by = before, None, 1
+        clock = _Clock(before)
         try:
             for stage in solver.stages():
                 if isinstance(stage, Work):
-                    if there and stage.steps and seen is None:
-                        seen = time.perf_counter()
+                    if there and stage.steps:
+                        clock.start()
                     yield stage
-                    shared_by = stage.shared_by
-                    if seen is not None:
-                        now = time.perf_counter()
-                        wall_time, seen = wall_time + elapsed(seen, now) / shared_by, now
+                    clock.read(stage.shared_by)
                     continue
-                seen = seen if seen is not None else time.perf_counter()
+                clock.start()
+                soil = stage.position[stored], stage.velocity[stored]
                 writer.append(
-                    stage.time,
-                    stage.position[stored],
-                    stage.velocity[stored],
-                    stage.body_points,
-                    stage.body_pose,
-                    stage.force,
-                    stage.torque,
+                    stage.time, *soil, stage.body_points, stage.body_pose, stage.force, stage.torque
                 )
-                if progress is not None:
-                    progress()
+                progress()
         except SolverStopped as stopped:
             if stopped.state is None or stopped.state.frame != writer.frame_count - 1:
                 raise
-            kept = writer.stop(wall_time, str(stopped), stopped.state)
+            kept = writer.stop(clock.seconds, str(stopped), stopped.state)
             raise SolverStopped(f"{stopped}. {_way_on(str(stopped), kept, output, computed)}") from stopped
-        wall_time += elapsed(seen, time.perf_counter()) / shared_by if seen is not None else 0.0
-        writer.finish(wall_time)
+        clock.read(clock.shared_by)
+        writer.finish(clock.seconds)
     frames = scene.frame_count - max(1, there)
-    yield Timing(
-        elapsed(before, wall_time),
-        frames / scene.frame_rate,
-        frames * solver.substeps_per_frame * solver.computed_count,
-    )
+    steps = frames * solver.substeps_per_frame * solver.computed_count
+    yield Timing(elapsed(before, clock.seconds), frames / scene.frame_rate, steps)
+
+
+class _Clock:
+    """The time that a run takes; of the time in which others are computed with it, its share."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds, self.shared_by = seconds, 1
+        self._seen: float | None = None
+
+    def start(self) -> None:
+        if self._seen is None:
+            self._seen = time.perf_counter()
+
+    def read(self, shared_by: int) -> None:
+        self.shared_by = shared_by
+        if self._seen is not None:
+            now = time.perf_counter()
+            self.seconds, self._seen = self.seconds + elapsed(self._seen, now) / shared_by, now
 
 
 def _way_on(cause: str, kept: Path, output: Path, computed: Scene) -> str:
