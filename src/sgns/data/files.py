@@ -164,40 +164,55 @@ def _sign(descriptor: int) -> None:
 _SUFFIX = ".partial"
 
 
-def hidden_beside(path: Path) -> Path:
-    """A name in the same folder that says which process of which machine writes `path`."""
-    return path.with_name(f"{_hidden_start(path)}{os.getpid()}-{uuid4().hex[:8]}{_SUFFIX}")
+class HiddenFile:
+    """A new file beside `path`, open, whose lock shows other processes that it is being written.
+
+    Its name says which process of which machine writes it. Those that killed processes of this machine left of `path`
+    are removed.
+
+    Raises:
+        OSError: The folder cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.hidden = path.with_name(f"{_hidden_start(path)}{os.getpid()}-{uuid4().hex[:8]}{_SUFFIX}")
+        remove_abandoned(path)
+        while True:
+            self.file: io.FileIO = open(self.hidden, "xb+", buffering=0)
+            if fcntl is not None:
+                with suppress(OSError):  # some file systems have no locks
+                    fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if self.hidden.exists():
+                return
+            self.file.close()  # before it was locked another process took it for abandoned
+
+    def complete(self, path: Path | None = None) -> None:
+        """Give the file its name, or that of `path` in the same folder, and the place of a plain file that had it, once
+        the disk has everything.
+
+        Raises:
+            UserError: By now the name stands for something else.
+            OSError: The system refuses.
+        """
+        path = path or self.path
+        os.fsync(self.file.fileno())
+        if fcntl is None:
+            self.file.close()  # Windows names closed files only; elsewhere the lock lasts until it has its name
+        require_replaceable(path)
+        os.replace(self.hidden, path)
+        self.file.close()
+
+    def discard(self) -> None:
+        """Remove the file if it has not got its name; does nothing the second time."""
+        with suppress(OSError):
+            self.file.close()
+        with suppress(OSError):
+            self.hidden.unlink(missing_ok=True)
 
 
 def _hidden_start(path: Path) -> str:
     return f".{path.name}.{socket.gethostname()}-"
-
-
-def open_hidden(hidden: Path) -> io.FileIO:
-    """A new file, open, with a lock that shows other processes that it is being written."""
-    while True:
-        file = open(hidden, "xb+", buffering=0)
-        if fcntl is not None:
-            with suppress(OSError):  # some file systems have no locks
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if hidden.exists():
-            return file
-        file.close()  # before it was locked another process took it for abandoned
-
-
-def give_name(file: io.FileIO, hidden: Path, path: Path) -> None:
-    """Let a complete file take its name, and the place of a plain file that had it, once the disk has everything.
-
-    Raises:
-        UserError: By now the name stands for something else.
-        OSError: The system refuses.
-    """
-    os.fsync(file.fileno())
-    if fcntl is None:
-        file.close()  # Windows gives names to closed files only; elsewhere the lock lasts until it has its name
-    require_replaceable(path)
-    os.replace(hidden, path)
-    file.close()
 
 
 def remove_abandoned(path: Path) -> None:
@@ -226,18 +241,19 @@ def whole_file(path: Path) -> Iterator[Path]:
         OSError: The disk does not take it; the error names `path`.
     """
     require_replaceable(path)
-    hidden = hidden_beside(path)
     try:
-        remove_abandoned(path)
-        with open_hidden(hidden) as file:
-            yield hidden
-            give_name(file, hidden, path)
+        new = HiddenFile(path)
+        try:
+            yield new.hidden
+            new.complete()
+        finally:
+            new.discard()
     except OSError as error:
-        if error.filename in (None, str(hidden)):  # a full disk is reported without a name
+        if error.filename is None or str(error.filename).endswith(
+            _SUFFIX
+        ):  # a full disk is reported without a name
             error.filename = str(path)
         raise
-    finally:
-        hidden.unlink(missing_ok=True)
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -14,14 +14,7 @@ import numpy as np
 
 from mpm_warp.inputs import open_file
 from sgns.config import UserError
-from sgns.data.files import (
-    ANY_SIZE,
-    give_name,
-    hidden_beside,
-    open_hidden,
-    remove_abandoned,
-    require_replaceable,
-)
+from sgns.data.files import ANY_SIZE, HiddenFile, remove_abandoned, require_replaceable
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -47,11 +40,9 @@ class NewFile(io.RawIOBase):
         require_replaceable(path)
         self.path = path
         self._error: BaseException | None = None
-        self._hidden = hidden_beside(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            remove_abandoned(path)
-            self._file = open_hidden(self._hidden)
+            self._new = HiddenFile(path)
         except OSError as error:
             raise _cannot_write(path, error) from error
 
@@ -71,7 +62,7 @@ class NewFile(io.RawIOBase):
         """
         self.check()
         try:
-            give_name(self._file, self._hidden, path or self.path)
+            self._new.complete(path)
         except OSError as error:
             raise _cannot_write(self.path, error) from error
         # Again: when this file was begun, a process just killed may still have had its lock.
@@ -87,25 +78,22 @@ class NewFile(io.RawIOBase):
 
     def discard(self) -> None:
         """Remove the hidden file; does nothing the second time."""
-        with suppress(OSError):
-            self._file.close()
-        with suppress(OSError):
-            self._hidden.unlink(missing_ok=True)
+        self._new.discard()
 
     # --- what h5py asks of a file, as in `io.RawIOBase`: nothing of this may raise ------------------------
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        return self._kept(self._file.seek, offset, whence)
+        return self._kept(self._new.file.seek, offset, whence)
 
     def truncate(self, size: int | None = None) -> int:
-        return self._kept(self._file.truncate, size)
+        return self._kept(self._new.file.truncate, size)
 
     def readinto(self, buffer: Buffer) -> int:
         """Fill the buffer, with zeros where nothing can be read."""
         view = memoryview(buffer).cast("B")
         done = 0
         while done < len(view):
-            count = self._kept(self._file.readinto, view[done:])
+            count = self._kept(self._new.file.readinto, view[done:])
             if not count:
                 view[done:] = bytes(len(view) - done)
                 break
@@ -117,7 +105,7 @@ class NewFile(io.RawIOBase):
         view = memoryview(data).cast("B")
         done = 0
         while done < len(view) and self._error is None:
-            done += self._kept(self._file.write, view[done:])
+            done += self._kept(self._new.file.write, view[done:])
         return len(view)
 
     def _kept(self, action: Callable[..., int | None], *arguments: Any) -> int:
