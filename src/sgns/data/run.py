@@ -10,7 +10,7 @@ import math
 import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -68,11 +68,6 @@ class Recorded:
     dtype: str
     si_unit: str
     description: str
-
-    @property
-    def of_soil(self) -> bool:
-        """Whether it has a value for every particle, and therefore is written and read frame by frame."""
-        return "n" in self.tail
 
 
 # H5MD's own attribute `unit` is left unset on purpose: MDAnalysis refuses lengths in metres.
@@ -150,11 +145,27 @@ def open_run(path: str | os.PathLike[str]) -> h5py.File:
             f"{path} is cut short or damaged and cannot be opened ({_reason(error)}); "
             "copy it again or repeat the run"
         ) from error
-    try:
-        _require_ours(file, path)
-    except BaseException:
-        file.close()
-        raise
+    with ExitStack() as unless_ours:
+        unless_ours.callback(file.close)
+        try:
+            made_as, version = own_attribute(file, "format"), own_attribute(file, "format_version")
+        except BROKEN as error:
+            raise UserError(
+                f"{path} is damaged ({_reason(error)}); copy it again or repeat the run"
+            ) from error
+        if not isinstance(made_as, str) or made_as != FORMAT:
+            raise UserError(
+                f"{path} is HDF5 but not a run of sgns (root attribute `format` is not {FORMAT!r}); "
+                "give a file made by `sgns simulate` or `sgns rollout`"
+            )
+        if not isinstance(version, _WHOLE):
+            raise UserError(f"{path} has no whole number as root attribute `format_version`; repeat the run")
+        if version > FORMAT_VERSION:
+            raise UserError(
+                f"{path} has run format {version}, but sgns {__version__} reads up to {FORMAT_VERSION}; "
+                "upgrade sgns"
+            )
+        unless_ours.pop_all()
     return file
 
 
@@ -166,26 +177,6 @@ def _reason(error: Exception) -> str:
     if "already open for" in text:
         return "its writer never closed it"
     return text
-
-
-def _require_ours(file: h5py.File, path: Path) -> None:
-    try:
-        made_as = own_attribute(file, "format")
-        version = own_attribute(file, "format_version")
-    except BROKEN as error:
-        raise UserError(f"{path} is damaged ({_reason(error)}); copy it again or repeat the run") from error
-    if not isinstance(made_as, str) or made_as != FORMAT:
-        raise UserError(
-            f"{path} is HDF5 but not a run of sgns (root attribute `format` is not {FORMAT!r}); "
-            "give a file made by `sgns simulate` or `sgns rollout`"
-        )
-    if not isinstance(version, _WHOLE):
-        raise UserError(f"{path} has no whole number as root attribute `format_version`; repeat the run")
-    if version > FORMAT_VERSION:
-        raise UserError(
-            f"{path} has run format {version}, but sgns {__version__} reads up to {FORMAT_VERSION}; "
-            "upgrade sgns"
-        )
 
 
 def read_attributes(file: h5py.File) -> dict[str, Any]:
@@ -253,7 +244,7 @@ def _series_problems(file: h5py.File, recorded: Recorded, counts: dict[str, int]
     for part in ("value", "step", "time"):
         path = f"{recorded.path}/{part}"
         try:
-            found = own_dataset(file, path, by_frame=recorded.of_soil and part == "value")
+            found = own_dataset(file, path, by_frame=part == "value" and "n" in recorded.tail)
         except KeyError:
             yield f"dataset /{path} is missing"
             continue

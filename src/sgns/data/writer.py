@@ -269,7 +269,7 @@ class RunWriter:
         for (name, recorded), values in zip(SERIES.items(), given, strict=True):
             # A float64 beyond float32's range becomes inf here and is reported below, so numpy need not warn.
             with np.errstate(over="ignore"):
-                convert = np.asarray if recorded.of_soil else np.array  # the small ones are kept: copy them
+                convert = np.asarray if name in VIEWS else np.array  # the small ones are kept: copy them
                 frame[name] = convert(values, dtype=recorded.dtype, order="C")
             if frame[name].shape != (expected := self._shapes[name]):
                 raise ValueError(f"frame {index}: {name} has shape {frame[name].shape}, expected {expected}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import shutil
 
 import h5py
 import numpy as np
@@ -16,12 +17,22 @@ from sgns.data.run import Run
 from sgns_testing.runs import make_run, make_writer, random_frame
 
 
-def spoil(path, change):
+@pytest.fixture
+def problems_after(tmp_path, good):
     """The problems of a good run after `change(file)`."""
-    assert check_run(make_run(path)) == []
-    with h5py.File(path, "r+") as file:
-        change(file)
-    return check_run(path)
+
+    def problems_after(change):
+        path = shutil.copy(good, tmp_path)
+        with h5py.File(path, "r+") as file:
+            change(file)
+        return check_run(path)
+
+    return problems_after
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("good") / "a.h5")
 
 
 def put(name, where, value):
@@ -107,8 +118,8 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("change", "words"), FAULTS, ids=[words for _, words in FAULTS])
-def test_a_planted_fault_is_found(tmp_path, change, words):
-    problems = spoil(tmp_path / "a.h5", change)
+def test_a_planted_fault_is_found(problems_after, change, words):
+    problems = problems_after(change)
     assert any(re.search(words, problem) for problem in problems), problems
     assert all("\n" not in problem for problem in problems)
 
@@ -131,8 +142,8 @@ def bad_values(file):
         (bad_values, ("particle 7", "quaternion", "time", "content_hash")),
     ],
 )
-def test_all_problems_are_listed(tmp_path, change, listed):
-    text = "\n".join(spoil(tmp_path / "a.h5", change))
+def test_all_problems_are_listed(problems_after, change, listed):
+    text = "\n".join(problems_after(change))
     assert [words for words in listed if words not in text] == []
 
 

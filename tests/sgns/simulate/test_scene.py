@@ -13,7 +13,6 @@ from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run
 from sgns.rollout import require_same_freedom
-from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import plan
 from sgns.simulate.command import simulate_campaign
 from sgns.simulate.scene import asked_effects, decided, decision_summary, scene_from_config
@@ -109,19 +108,6 @@ def test_runs_of_a_dataset_decide_for_themselves(tmp_path, caplog):
             assert run.effects["rate_dependence"]["on"] is (scene.speed == 4.0)
             assert (run.effects["rate_dependence"]["number"] > 0.01) is (scene.speed == 4.0)
             assert not run.torque.any()
-
-
-def test_each_set_of_effects_is_compiled_once(tmp_path, monkeypatch):
-    compiled = []
-
-    def solver(scene, effects, *_):
-        compiled.append(effects)
-        return SimpleNamespace(frames=lambda: iter([None]))
-
-    monkeypatch.setattr(campaign_runs, "Solver", solver)
-    c = fast_and_slow(tmp_path, {})
-    campaign_runs._compile(c, list(c.scenes), "cpu")
-    assert sorted(effects.rate_dependence for effects in compiled) == [False, True]
 
 
 def test_what_no_run_can_have_is_refused_before_anything_is_written(tmp_path):

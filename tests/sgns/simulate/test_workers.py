@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +20,7 @@ from sgns.data.run import Run
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import run_cost
 from sgns.simulate.workers import simulate_campaign
-from sgns_testing.campaigns import campaign
+from sgns_testing.campaigns import EFFECTS, campaign
 from sgns_testing.commands import environment
 
 # Makes a campaign of four runs in the folder named on the command line.
@@ -140,25 +141,28 @@ def test_a_disk_that_is_too_full_is_refused_before_anything_is_made(tmp_path, or
     assert order == []
 
 
-def test_kernels_are_compiled_once_for_each_kind_of_scene(tmp_path, monkeypatch):
+def test_kernels_are_compiled_once_for_each_kind_of_scene_and_set_of_effects(tmp_path, monkeypatch):
     compiled = []
 
-    def solver(scene, *_):
-        compiled.append(scene)
+    def solver(scene, effects, *_):
+        compiled.append((scene.motion, scene.blade.friction, effects.rate_dependence))
         return SimpleNamespace(frames=lambda: iter(["the first"]))
 
     monkeypatch.setattr(campaign_runs, "Solver", solver)
-    for draw, kernels in (
-        ({"rake": [5.0, 10.0], "depth": [0.02, 0.04, 0.05]}, 1),
-        ({"motion": ["curved", "ramp"], "blade.friction": [0.0, 0.1, 0.3]}, 4),
+    fast = {"start": [0.3], "clearance": [0.0], "speed": [0.05, 0.06, 4.0]}
+    for draw, effects, kernels in (
+        ({"rake": [5.0, 10.0], "depth": [0.02, 0.04, 0.05]}, EFFECTS, [("curved", 0.3, True)]),
+        (
+            {"motion": ["curved", "ramp"], "blade.friction": [0.0, 0.1, 0.3]},
+            EFFECTS,
+            [("curved", 0.0, True), ("curved", 0.1, True), ("ramp", 0.0, True), ("ramp", 0.1, True)],
+        ),
+        (fast, {}, [("curved", 0.3, False), ("curved", 0.3, True)]),
     ):
         compiled.clear()
-        c = campaign(tmp_path, draw=draw, runs=None)
+        c = replace(campaign(tmp_path, draw=draw, runs=None), effects=effects)
         campaign_runs._compile(c, list(c.scenes), "cpu")
-        assert len(compiled) == kernels
-    assert sorted((s.motion, s.blade.friction) for s in compiled) == [
-        ("curved", 0.0), ("curved", 0.1), ("ramp", 0.0), ("ramp", 0.1)
-    ]  # fmt: skip
+        assert sorted(compiled) == kernels
 
 
 def test_time_left_follows_from_the_work_left_and_the_speed_seen(tmp_path):
