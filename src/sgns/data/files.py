@@ -263,27 +263,27 @@ def write_whole(path: Path, text: str) -> None:
 
 
 # --- Small files that anybody may have written, read whole within bounds --------------------------------
-# Each reader takes the file, what it is where it is damaged (as in "no table of points"), what a person can do then,
-# and its largest size [bytes]. It raises a `UserError` of one line from these when the file cannot be read. Pipes
-# and devices are refused without waiting for them, larger files before they are read.
+# Each reader takes the file, what it is where it is damaged (as in "no table of points"), and what a person can do
+# then. It raises a `UserError` of one line from these when the file cannot be read. Pipes and devices are refused
+# without waiting for them, larger files before they are read.
 
-MOST_BYTES = 1 << 22
-"""Of text; a thousand times what this package writes of most."""
+_MOST_BYTES = 1 << 22  # of text; a thousand times what this package writes of most
+_MOST_OF_TABLE = 1 << 24
 MOST_OF_ARRAYS = 1 << 27
-"""Of an NPZ file, also after unpacking."""
+"""Of an NPZ file [bytes], also after unpacking."""
 ANY_SIZE = 1 << 62
 
 
-def read_text(path: Path, wrong: str, advice: str, most: int = MOST_BYTES) -> str:
-    """Content of a text file in UTF-8."""
+def read_text(path: Path, wrong: str, advice: str, most: int = _MOST_BYTES) -> str:
+    """Content of a text file in UTF-8, of at most so many bytes."""
     with _readable(path, wrong, advice):
         return inputs.read_text(path, most)
 
 
-def read_json(path: Path, wrong: str, advice: str, most: int = MOST_BYTES) -> Any:
+def read_json(path: Path, wrong: str, advice: str) -> Any:
     """Data of a JSON file."""
     with _readable(path, wrong, advice):
-        return parse_json(inputs.read_text(path, most))
+        return parse_json(inputs.read_text(path, _MOST_BYTES))
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -298,10 +298,10 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("it is nested too deep") from error
 
 
-def read_table(path: Path, wrong: str, advice: str, most: int = 1 << 24) -> list[dict[str, str]]:
+def read_table(path: Path, wrong: str, advice: str) -> list[dict[str, str]]:
     """Lines of a CSV file by the names in its first line."""
     with _readable(path, wrong, advice):
-        lines = csv.reader(io.StringIO(inputs.read_text(path, most), newline=""))
+        lines = csv.reader(io.StringIO(inputs.read_text(path, _MOST_OF_TABLE), newline=""))
         columns = next(lines, [])
         if len(set(columns)) < len(columns) or not columns:
             raise ValueError("its first line does not name columns, each once")
@@ -315,13 +315,13 @@ def read_table(path: Path, wrong: str, advice: str, most: int = 1 << 24) -> list
         return table
 
 
-def read_arrays(path: Path, wrong: str, advice: str, most: int = MOST_OF_ARRAYS) -> dict[str, np.ndarray]:
+def read_arrays(path: Path, wrong: str, advice: str) -> dict[str, np.ndarray]:
     """Arrays of an NPZ file by name, without Python objects; what its parts unfold to counts as its size does."""
     with _readable(path, wrong, advice):
-        packed = io.BytesIO(inputs.read_bytes(path, most))
+        packed = io.BytesIO(inputs.read_bytes(path, MOST_OF_ARRAYS))
         with zipfile.ZipFile(packed) as archive:
-            if sum(part.file_size for part in archive.infolist()) > most:
-                raise ValueError(f"it unfolds to more than {most / 1e6:.0f} MB")
+            if sum(part.file_size for part in archive.infolist()) > MOST_OF_ARRAYS:
+                raise ValueError(f"it unfolds to more than {MOST_OF_ARRAYS / 1e6:.0f} MB")
         packed.seek(0)
         with np.load(packed, allow_pickle=False) as content:
             return dict(content)
