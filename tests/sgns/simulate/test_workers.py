@@ -118,19 +118,10 @@ def test_shards_are_the_campaign_in_shares_of_like_work(tmp_path, order):
     assert len(order) == 6
 
 
-@pytest.mark.parametrize(
-    ("shard", "shards", "words"),
-    [
-        (2, 2, "from 0 to 1"),
-        (-1, 2, "from 0 to 1"),
-        ("a", 2, "shard is 'a'"),
-        (0, 0, "shards is 0"),
-        (0, 1.5, "1.5"),
-    ],
-)
-def test_shards_it_refuses(tmp_path, shard, shards, words):
-    with pytest.raises(UserError, match=words):
-        simulate_campaign(campaign(tmp_path), device="cpu", shard=shard, shards=shards)
+@pytest.mark.parametrize("shard", [2, -1])
+def test_shards_it_refuses(tmp_path, shard):
+    with pytest.raises(UserError, match=f"shard is {shard}; with shards=2 .* from 0 to 1"):
+        simulate_campaign(campaign(tmp_path), device="cpu", shard=shard, shards=2)
     assert list(tmp_path.iterdir()) == []
 
 
