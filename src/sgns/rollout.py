@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from sgns.clock import elapsed
 from sgns.config import UserError, differences
 from sgns.data.files import only_here
-from sgns.data.run import frame_chunks, require_run_place
-from sgns.data.writer import RunWriter
+from sgns.data.run import frame_chunks
+from sgns.data.writer import RunWriter, require_run_place
+from sgns.numbers import elapsed
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -21,13 +21,12 @@ import torch
 from torch import Tensor
 
 from mpm_warp.poses import in_world_frame
-from sgns.arrays import check_pose, check_poses, finite_array, first_pose, is_whole, real_array
-from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step
 from sgns.model.features import ToolMotion, context_of, markers
 from sgns.model.training_range import Excess
+from sgns.numbers import check_pose, check_poses, elapsed, finite_array, first_pose, is_whole, real_array
 from sgns.reduction.basis import Basis
 
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].

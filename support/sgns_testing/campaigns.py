@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from mpm_warp import Effects, Scene
 from sgns.simulate.campaign import Campaign, plan
 
 BASE = {
@@ -25,3 +26,11 @@ def campaign(folder: Path, seed: int = 0, **change: Any) -> Campaign:
         "runs": 10,
     }
     return plan(settings | change, BASE, EFFECTS, "float32", seed)
+
+
+def job(scene: Scene, file: Path) -> Any:
+    """A run as a campaign sends it to a worker process."""
+    from sgns.simulate.workers import _Job
+
+    effects, reasons = Effects(), Effects().described()
+    return _Job("tiny", 0, scene.to_dict(), scene.mesh, file, effects, reasons, 0, "cpu", "float32")

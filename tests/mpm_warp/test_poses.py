@@ -8,8 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mpm_warp.poses import fitted_poses, in_body_frame, in_world_frame, rotation_matrices, rotation_vectors
-from sgns.arrays import check_pose, check_poses, first_pose
 from sgns.config import UserError
+from sgns.numbers import check_pose, check_poses, first_pose
 from sgns_testing.runs import random_poses
 
 

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from mpm_warp import Effects
-from sgns.clock import elapsed
 from sgns.data.run import Run
 from sgns.evaluate import costs as full_space_cost
+from sgns.numbers import elapsed
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import run_cost
 from sgns.simulate.run import simulate_scene
-from sgns_testing.campaigns import campaign
+from sgns_testing.campaigns import campaign, job
 
 
 @pytest.fixture(params=[0.0, -7.0], ids=["still", "back"])
@@ -57,7 +57,7 @@ def test_a_trial_ends_and_takes_some_time(tmp_path, odd_clock, monkeypatch):
     monkeypatch.setattr(
         campaign_runs, "_barrier", type("Barrier", (), {"wait": lambda self, timeout: None})()
     )
-    counts, seconds = campaign_runs._try([(scene.to_dict(), scene.mesh)], [Effects()], "cpu", "float32")
+    counts, seconds = campaign_runs._try([job(scene, tmp_path / "run.h5")])
     assert counts == [scene.frame_count - 1]
     assert seconds > 0.0
 

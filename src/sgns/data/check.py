@@ -1,36 +1,38 @@
-"""Checking run files: `sgns check`."""
+"""Checking run files: `sgns check`.
+
+Letters: T frames, n soil particles, M body points.
+"""
 
 from __future__ import annotations
 
 import logging
+import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import h5py
 import numpy as np
 from omegaconf import OmegaConf
 from scipy.spatial import cKDTree
 
-from mpm_warp.poses import rotation_matrices
+from mpm_warp.poses import in_body_frame, rotation_matrices
 from sgns.config import UserError, parse_yaml
-from sgns.data.layout import (
-    BROKEN,
-    ELEMENTS,
+from sgns.data.files import one_line
+from sgns.data.hdf5 import BROKEN, own_dataset, own_object, own_view
+from sgns.data.run import (
     PRODUCERS,
-    one_line,
+    SERIES,
+    STOPPED,
     open_run,
-    own_dataset,
-    own_object,
     read_attributes,
     read_mesh,
     require_mesh_was_read,
-    require_own_view,
-    scene_problems,
+    series,
     structure_problems,
 )
-from sgns.data.writer import VIEW_ATTRIBUTES, ContentHash, view_arrays
+from sgns.data.writer import VIEW_ATTRIBUTES, VIEWS, ContentHash, view_arrays
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -39,7 +41,6 @@ log = logging.getLogger(__name__)
 
 
 # --- Every problem of a run file, in words --------------------------------------------------------------
-# Letters: T frames, n soil particles, M body points.
 
 RIGID_TOLERANCE = 1e-4
 """How far a body point may be from where the pose puts it [m]."""
@@ -47,6 +48,8 @@ QUATERNION_TOLERANCE = 1e-5
 """How far a quaternion's length may be from 1."""
 INTERVAL_TOLERANCE = 1e-2
 """How far the time between frames may be from 1 / frame_rate, as a share of it."""
+_SCENE_NUMBERS = "depth speed rake diameter width grouser_height load slip friction_angle gravity".split()
+_BLADE_NUMBERS = ("thickness", "width", "length")
 
 
 def check_run(path: str | os.PathLike[str]) -> list[str]:
@@ -74,209 +77,200 @@ def check_run(path: str | os.PathLike[str]) -> list[str]:
     return problems
 
 
-def _check_h5md(file: h5py.File) -> list[str]:
-    problems = []
+def _check_h5md(file: h5py.File) -> Iterator[str]:
     h5md = own_object(file, "h5md")
     if not isinstance(h5md, h5py.Group):
-        return ["group /h5md is missing"]
+        yield "group /h5md is missing"
+        return
     if tuple(np.atleast_1d(h5md.attrs.get("version", ()))) != (1, 1):
-        problems.append("attribute version of /h5md is not (1, 1)")
+        yield "attribute version of /h5md is not (1, 1)"
     for group, key in (("author", "name"), ("creator", "name"), ("creator", "version")):
         found = own_object(h5md, group)
         if found is None or key not in found.attrs:
-            problems.append(f"attribute {key} of /h5md/{group} is missing")
+            yield f"attribute {key} of /h5md/{group} is missing"
     for group in ("soil", "body"):
         box = own_object(file, f"particles/{group}/box")
         if box is None or "dimension" not in box.attrs or "boundary" not in box.attrs:
-            problems.append(f"group /particles/{group}/box with dimension and boundary is missing")
-    return problems
+            yield f"group /particles/{group}/box with dimension and boundary is missing"
 
 
-def _check_attributes(file: h5py.File) -> list[str]:
-    problems = []
+def _check_attributes(file: h5py.File) -> Iterator[str]:
     values = read_attributes(file)
     for name in ("scene", "effects", "extra"):
-        text = values.get(name)
-        if not isinstance(text, str):
+        if not isinstance(text := values.get(name), str):
             continue  # reported with the structure
         try:
             data = parse_yaml(text)
         except ValueError as error:
-            problems.append(f"root attribute {name!r} is not YAML ({one_line(error)})")
+            yield f"root attribute {name!r} is not YAML ({one_line(error)})"
             continue
         if not isinstance(data, dict):
-            problems.append(f"root attribute {name!r} is not a group of keys")
+            yield f"root attribute {name!r} is not a group of keys"
         elif name == "scene":
-            problems += scene_problems(data)
+            yield from scene_problems(data)
             try:
                 require_mesh_was_read(data)
             except ValueError as error:
-                problems.append(f"root attribute 'scene': {one_line(error)}")
+                yield f"root attribute 'scene': {one_line(error)}"
         elif name == "effects":
             for key, effect in data.items():
                 if not (isinstance(effect, dict) and type(effect.get("on")) is bool and effect.get("reason")):
-                    problems.append(f"effect {key!r} does not say whether it is on and why")
+                    yield f"effect {key!r} does not say whether it is on and why"
     producer = values.get("producer")
     if isinstance(producer, str) and producer not in PRODUCERS:
-        problems.append(f"producer is {producer!r}; allowed: {', '.join(PRODUCERS)}")
-    return problems
+        yield f"producer is {producer!r}; allowed: {', '.join(PRODUCERS)}"
 
 
-def _check_stopped(file: h5py.File) -> list[str]:
-    reason = read_attributes(file).get("stopped")
-    if reason is None:
-        return []
-    frames = file[f"{ELEMENTS['position'].path}/value"].shape[0]
-    return [f"the run stopped after {frames} good frames: {one_line(reason)}"]
+def scene_problems(scene: Mapping[str, Any]) -> list[str]:
+    """Values of a scene that are not the numbers which others calculate with, in words; what is not there is none."""
+    found = [(key, scene[key]) for key in _SCENE_NUMBERS if scene.get(key) is not None]
+    blade = scene.get("blade")
+    if blade is not None:
+        if not isinstance(blade, Mapping):
+            return [f"scene.blade is {blade!r:.40}, not a group of keys"]
+        found += [(f"blade.{key}", blade.get(key)) for key in _BLADE_NUMBERS]
+    return [
+        f"scene.{key} is {value!r:.40}, not a finite number"
+        for key, value in found
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf
+    ]
 
 
-def _check_times(file: h5py.File) -> list[str]:
-    problems = []
-    time = file[f"{ELEMENTS['position'].path}/time"][...]
-    step = file[f"{ELEMENTS['position'].path}/step"][...]
-    for element in ELEMENTS.values():
+def _check_stopped(file: h5py.File) -> Iterator[str]:
+    if (reason := read_attributes(file).get(STOPPED)) is not None:
+        yield f"the run stopped after {len(series(file, 'position'))} good frames: {one_line(reason)}"
+
+
+def _check_times(file: h5py.File) -> Iterator[str]:
+    time, step = (series(file, "position", part)[...] for part in ("time", "step"))
+    for name, recorded in SERIES.items():
         for part, expected in (("time", time), ("step", step)):
-            if not np.array_equal(file[f"{element.path}/{part}"][...], expected, equal_nan=part == "time"):
-                problems.append(f"dataset /{element.path}/{part} differs from that of the soil positions")
-    if not np.isfinite(time).all():
-        return [*problems, f"time is not finite at frame {np.flatnonzero(~np.isfinite(time))[0]}"]
-    if not (np.diff(step) > 0).all():
-        problems.append(f"step does not increase at frame {np.flatnonzero(np.diff(step) <= 0)[0] + 1}")
-    interval = np.diff(time)
-    if not (interval > 0).all():
-        return [*problems, f"time does not increase at frame {np.flatnonzero(interval <= 0)[0] + 1}"]
-    wrong = ~(np.abs(interval * float(file.attrs["frame_rate"]) - 1.0) <= INTERVAL_TOLERANCE)
-    if wrong.any():
-        frame = np.flatnonzero(wrong)[0] + 1
-        problems.append(
-            f"time before frame {frame} advances by {interval[frame - 1]:.6g} s, "
-            f"not by 1 / frame_rate = {1.0 / float(file.attrs['frame_rate']):.6g} s"
+            if not np.array_equal(series(file, name, part)[...], expected, equal_nan=part == "time"):
+                yield f"dataset /{recorded.path}/{part} differs from that of the soil positions"
+    if (frame := _first(~np.isfinite(time))) is not None:
+        yield f"time is not finite at frame {frame}"
+        return
+    if (frame := _first(np.diff(step) <= 0)) is not None:
+        yield f"step does not increase at frame {frame + 1}"
+    interval, rate = np.diff(time), float(file.attrs["frame_rate"])
+    if (frame := _first(interval <= 0)) is not None:
+        yield f"time does not increase at frame {frame + 1}"
+    elif (frame := _first(~(np.abs(interval * rate - 1.0) <= INTERVAL_TOLERANCE))) is not None:
+        yield (
+            f"time before frame {frame + 1} advances by {interval[frame]:.6g} s, "
+            f"not by 1 / frame_rate = {1.0 / rate:.6g} s"
         )
-    return problems
 
 
-def _check_body(file: h5py.File) -> list[str]:
-    problems = []
-    data = {
-        name: file[f"{ELEMENTS[name].path}/value"][...].astype(float)
-        for name in ("pose", "force", "torque", "body_points")
-    }
-    for name, values in data.items():
+def _check_body(file: h5py.File) -> Iterator[str]:
+    names = ("pose", "force", "torque", "body_points")
+    pose, force, torque, points = (series(file, name)[...].astype(float) for name in names)
+    good = True
+    for name, values in zip(names, (pose, force, torque, points), strict=True):
         frame = _first(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
         if frame is not None:
-            problems.append(f"{name} is not finite at frame {frame}")
-    if problems:
-        return problems
-    pose, points = data["pose"], data["body_points"]
+            yield f"{name} is not finite at frame {frame}"
+            good = False
+    if not good:
+        return
     length = np.linalg.norm(pose[:, 3:], axis=1)
-    frame = _first(~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE))
-    if frame is not None:
-        return [f"the quaternion of frame {frame} has length {length[frame]:.6g}, not 1"]
-    rotation = rotation_matrices(pose[:, 3:])  # (T, 3, 3)
-    body_frame = (points - pose[:, None, :3]) @ rotation  # rows times R = R^T applied to each point
-    error = np.linalg.norm(body_frame - body_frame[:1], axis=2)
-    frame = _first(~(error <= RIGID_TOLERANCE).all(axis=1))
-    if frame is not None:
+    if (frame := _first(~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE))) is not None:
+        yield f"the quaternion of frame {frame} has length {length[frame]:.6g}, not 1"
+        return
+    # Rows times R are R^T applied to each point.
+    nodes = (points - pose[:, None, :3]) @ rotation_matrices(pose[:, 3:])
+    error = np.linalg.norm(nodes - nodes[:1], axis=2)
+    if (frame := _first(~(error <= RIGID_TOLERANCE).all(axis=1))) is not None:
         point = int(error[frame].argmax())
-        problems.append(
+        yield (
             f"body point {point} of frame {frame} is {error[frame, point]:.3g} m from where the pose puts it "
             f"(allowed {RIGID_TOLERANCE:g} m)"
         )
-    return problems
 
 
-def _check_mesh(file: h5py.File) -> list[str]:
+def _check_mesh(file: h5py.File) -> Iterator[str]:
     """That the tool's mesh is one, and that the body points are vertices of it."""
     try:
         mesh = read_mesh(file)
     except BROKEN as error:
-        return [f"the tool's mesh is damaged ({one_line(error)})"]
-    if mesh is None:
-        return []
-    pose, points = (file[f"{ELEMENTS[name].path}/value"][0].astype(float) for name in ("pose", "body_points"))
-    nodes = (points - pose[:3]) @ rotation_matrices(pose[None, 3:])[0]
-    away, _ = cKDTree(mesh[0]).query(nodes)
-    number = _first(~(away <= RIGID_TOLERANCE))
-    if number is None:
-        return []
-    return [
-        f"body point {number} is {away[number]:.3g} m from the nearest vertex of the tool's mesh (allowed "
-        f"{RIGID_TOLERANCE:g} m): the mesh is of another tool"
-    ]
+        yield f"the tool's mesh is damaged ({one_line(error)})"
+        return
+    if mesh is not None:
+        pose, points = (series(file, name)[0].astype(float) for name in ("pose", "body_points"))
+        away, _ = cKDTree(mesh[0]).query(in_body_frame(pose, points))
+        if (point := _first(~(away <= RIGID_TOLERANCE))) is not None:
+            yield (
+                f"body point {point} is {away[point]:.3g} m from the nearest vertex of the tool's mesh (allowed "
+                f"{RIGID_TOLERANCE:g} m): the mesh is of another tool"
+            )
 
 
-def _check_view(file: h5py.File) -> list[str]:
+def _check_view(file: h5py.File) -> Iterator[str]:
     """Where /VTKHDF does not fit the H5MD arrays; the values behind it are compared by `_check_frames`."""
     group = own_object(file, "VTKHDF")
     if not isinstance(group, h5py.Group):
-        return ["group /VTKHDF is missing: ParaView cannot open the file"]
-    problems = []
+        yield "group /VTKHDF is missing: ParaView cannot open the file"
+        return
     for name, value in VIEW_ATTRIBUTES.items():
-        if not np.array_equal(group.attrs.get(name), value):
+        if not np.array_equal(np.asarray(group.attrs.get(name)), np.asarray(value)):
             wanted = value.decode() if isinstance(value, bytes) else tuple(value.tolist())
-            problems.append(f"attribute {name} of /VTKHDF is not {wanted}")
-    frames, particles, _ = file[f"{ELEMENTS['position'].path}/value"].shape
-    times = file[f"{ELEMENTS['position'].path}/time"][...]
+            yield f"attribute {name} of /VTKHDF is not {wanted}"
+    frames, particles, _ = series(file, "position").shape
+    times = series(file, "position", "time")[...]
     for name, values in (view_arrays(frames, particles) | {"Steps/Values": times}).items():
         try:
-            found = own_dataset(group, name)
+            stored = own_dataset(group, name)
         except KeyError:
-            problems.append(f"dataset /VTKHDF/{name} is missing")
+            yield f"dataset /VTKHDF/{name} is missing"
             continue
-        if found.shape != values.shape or not np.array_equal(found[...], values):
-            problems.append(f"dataset /VTKHDF/{name} does not fit {frames} frames of {particles} particles")
-    for name in ("Points", "PointData/velocity"):
+        if stored.shape != values.shape or not np.array_equal(stored[...], values):
+            yield f"dataset /VTKHDF/{name} does not fit {frames} frames of {particles} particles"
+    expected = (frames * particles, 3)
+    for name in VIEWS.values():
         found = own_object(group, name)
         if not isinstance(found, h5py.Dataset):
-            problems.append(f"dataset /VTKHDF/{name} is missing")
-        elif found.shape != (frames * particles, 3):
-            expected = (frames * particles, 3)
-            problems.append(f"dataset /VTKHDF/{name} has shape {found.shape}, expected {expected}")
+            yield f"dataset /VTKHDF/{name} is missing"
+        elif found.shape != expected:
+            yield f"dataset /VTKHDF/{name} has shape {found.shape}, expected {expected}"
         elif not found.is_virtual:
-            problems.append(f"dataset /VTKHDF/{name} is a copy, not a view")
+            yield f"dataset /VTKHDF/{name} is a copy, not a view"
         else:
-            require_own_view(found)
-    return problems
+            own_view(group, name)
 
 
-def _check_frames(file: h5py.File) -> list[str]:
+def _check_frames(file: h5py.File) -> Iterator[str]:
     """Finite soil, the same numbers through /VTKHDF, and the content hash; memory for a frame only."""
-    values = {name: file[f"{element.path}/value"] for name, element in ELEMENTS.items()}
-    small = {name: values[name][...] for name in values if name not in ("position", "velocity")}
-    small["time"] = file[f"{ELEMENTS['position'].path}/time"][...]
-    views = {"position": _view(file, "VTKHDF/Points"), "velocity": _view(file, "VTKHDF/PointData/velocity")}
-    frames, particles, _ = values["position"].shape
+    small = {name: series(file, name)[...] for name in SERIES if name not in VIEWS}
+    small["time"] = series(file, "position", "time")[...]
+    views = {name: _view(file, f"VTKHDF/{path}") for name, path in VIEWS.items()}
+    frames, particles, _ = series(file, "position").shape
     found: dict[str, str] = {}  # the first problem of each kind
     content = ContentHash()
     for frame in range(frames):
-        arrays = {name: series[frame] for name, series in small.items()}
+        arrays = {name: values[frame] for name, values in small.items()}
         for name, view in views.items():
-            arrays[name] = soil = values[name][frame]
-            finite = np.isfinite(soil).all(axis=1)
-            if not finite.all():
-                found.setdefault(
-                    f"{name} finite", f"{name} of particle {_first(~finite)} is not finite at frame {frame}"
-                )
+            arrays[name] = soil = series(file, name)[frame]
+            if (particle := _first(~np.isfinite(soil).all(axis=1))) is not None:
+                words = f"{name} of particle {particle} is not finite at frame {frame}"
+                found.setdefault(f"{name} finite", words)
             if view is not None and view.shape == (frames * particles, 3):
                 seen = view[frame * particles : (frame + 1) * particles]
                 if not np.array_equal(seen, soil, equal_nan=True):
                     found.setdefault(f"{name} view", f"/VTKHDF shows another {name} at frame {frame}")
         content.update(arrays)
+    yield from found.values()
     if content.hexdigest() != read_attributes(file)["content_hash"]:
-        found["hash"] = "the data do not match content_hash: they were changed or damaged after the run"
-    return list(found.values())
+        yield "the data do not match content_hash: they were changed or damaged after the run"
 
 
 def _view(file: h5py.File, path: str) -> h5py.Dataset | None:
-    """A dataset of this file's own values; what else may be there is reported with the view."""
-    try:
-        found = own_object(file, path)
-        if not isinstance(found, h5py.Dataset) or not found.is_virtual:
-            return own_dataset(file, path)
-        require_own_view(found)
-    except (KeyError, ValueError):
-        return None
-    return found
+    """A view or copy of this file's own values; what else may be there is reported with the view."""
+    for reading in (own_view, own_dataset):
+        try:
+            return reading(file, path)
+        except (KeyError, ValueError):
+            continue
+    return None
 
 
 def _first(wrong: np.ndarray) -> int | None:
@@ -320,7 +314,8 @@ def main(cfg: DictConfig) -> float:
     Raises:
         UserError: A path is missing or a file has a problem; all problems have been listed before.
     """
-    named = [cfg.files] if isinstance(cfg.files, str) else OmegaConf.to_container(cfg, resolve=True)["files"]
+    settings = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
+    named = [settings["files"]] if isinstance(settings["files"], str) else settings["files"]
     files = run_files(named)
     bad = 0
     for path in files:

@@ -1,4 +1,4 @@
-"""Files that are whole or not there, made by one process at a time; and small files, read within bounds."""
+"""Files that are whole or not there, made by one process at a time; and files of others, read within bounds."""
 
 from __future__ import annotations
 
@@ -11,19 +11,17 @@ import os
 import socket
 import stat
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any
 from uuid import uuid4
 
-import h5py
 import numpy as np
 from filelock import FileLock, Timeout
 
 from mpm_warp import inputs
 from sgns.config import UserError
-from sgns.data.layout import one_line
 
 try:
     import fcntl
@@ -31,6 +29,11 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 log = logging.getLogger(__name__)
+
+
+def one_line(error: object) -> str:
+    """An error's text without line breaks, for a one-line message."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 # --- Names that a file may take -------------------------------------------------------------------------
@@ -55,14 +58,10 @@ def require_replaceable(*paths: Path) -> None:
         UserError: says what it is.
     """
     for path in paths:
-        if not is_replaceable(path):
-            what = _FILE_TYPES.get(_file_type(path), "no plain file; give the name of a file")
+        kind = _file_type(path)
+        if kind not in (None, stat.S_IFREG):
+            what = _FILE_TYPES.get(kind, "no plain file; give the name of a file")
             raise UserError(f"cannot write {path}: it is {what}")
-
-
-def is_replaceable(path: Path) -> bool:
-    """Whether a file of ours may be there, or be put there: see `require_replaceable`."""
-    return _file_type(path) in (None, stat.S_IFREG)
 
 
 def _file_type(path: Path) -> int | None:
@@ -80,10 +79,7 @@ _NO_LOCKS = {errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK}  # fil
 
 @contextmanager
 def only_here(path: Path) -> Iterator[None]:
-    """Locks the making of what a person asks for, before anything is computed.
-
-    Args:
-        path: the file; of a folder of results one of its files stands for all.
+    """Locks the making of what a person asks for; of a folder of results one of its files stands for all.
 
     Raises:
         UserError: another process is making it, the name stands for something else than a file, or the folder cannot be
@@ -163,36 +159,131 @@ def _sign(descriptor: int) -> None:
         os.write(descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode("ascii", "replace"))
 
 
-# --- Small files that anybody may have written, read whole within bounds --------------------------------
-# What cannot be read is a `UserError` of one line with the file, what is wrong and what to do. Pipes and
-# devices are refused without waiting for them, larger files than asked for before they are read.
+# --- Hidden files that take their name when they are complete, and what killed processes leave of them --
 
-MOST_BYTES = 1 << 22
-"""Of text; a thousand times what this package writes of most."""
-MOST_OF_ARRAYS = 1 << 27
-"""Of an NPZ file, also after unpacking."""
+_SUFFIX = ".partial"
 
 
-def read_text(path: Path, wrong: str, advice: str, most: int = MOST_BYTES) -> str:
-    """Content of a text file in UTF-8.
+class HiddenFile:
+    """A new file beside `path`, open, whose lock shows other processes that it is being written.
 
-    Args:
-        path: the file.
-        wrong: what it is where it is damaged, as in "no table of points"; for the message.
-        advice: what a person can do then, the end of the message.
-        most: largest size [bytes].
+    Its name says which process of which machine writes it. Those that killed processes of this machine left of `path`
+    are removed.
 
     Raises:
-        UserError: it cannot be read, is larger, or is a pipe or device.
+        OSError: The folder cannot be written.
     """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.hidden = path.with_name(f"{_hidden_start(path)}{os.getpid()}-{uuid4().hex[:8]}{_SUFFIX}")
+        remove_abandoned(path)
+        while True:
+            self.file: io.FileIO = open(self.hidden, "xb+", buffering=0)
+            if fcntl is not None:
+                with suppress(OSError):  # some file systems have no locks
+                    fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if self.hidden.exists():
+                return
+            self.file.close()  # before it was locked another process took it for abandoned
+
+    def complete(self, path: Path | None = None) -> None:
+        """Give the file its name, or that of `path` in the same folder, and the place of a plain file that had it, once
+        the disk has everything.
+
+        Raises:
+            UserError: By now the name stands for something else.
+            OSError: The system refuses.
+        """
+        path = path or self.path
+        os.fsync(self.file.fileno())
+        if fcntl is None:
+            self.file.close()  # Windows names closed files only; elsewhere the lock lasts until it has its name
+        require_replaceable(path)
+        os.replace(self.hidden, path)
+        self.file.close()
+
+    def discard(self) -> None:
+        """Remove the file if it has not got its name; does nothing the second time."""
+        with suppress(OSError):
+            self.file.close()
+        with suppress(OSError):
+            self.hidden.unlink(missing_ok=True)
+
+
+def _hidden_start(path: Path) -> str:
+    return f".{path.name}.{socket.gethostname()}-"
+
+
+def remove_abandoned(path: Path) -> None:
+    """Delete the hidden files that killed processes of this machine left of `path`: the ones without a lock."""
+    if fcntl is None:
+        return
+    start = _hidden_start(path)
+    for found in path.parent.iterdir():
+        if not (found.name.startswith(start) and found.name.endswith(_SUFFIX)):
+            continue
+        if _file_type(found) == stat.S_IFREG:  # others are none of ours; opening a pipe may never end
+            with suppress(OSError, ValueError), inputs.open_file(found, ANY_SIZE) as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                found.unlink()
+                log.info("removed %s, left by a process that was killed", found)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A hidden path beside `path` to write to; it gets its name at the end, or is removed after an exception.
+
+    For small files; for runs, which may fill the disk, see `sgns.data.hdf5.NewFile`.
+
+    Raises:
+        UserError: `path` is a device, pipe, link or folder.
+        OSError: The disk does not take it; the error names `path`.
+    """
+    require_replaceable(path)
+    try:
+        new = HiddenFile(path)
+        try:
+            yield new.hidden
+            new.complete()
+        finally:
+            new.discard()
+    except OSError as error:
+        if error.filename is None or str(error.filename).endswith(
+            _SUFFIX
+        ):  # a full disk is reported without a name
+            error.filename = str(path)
+        raise
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file in UTF-8."""
+    with whole_file(path) as hidden:
+        hidden.write_text(text, encoding="utf-8")
+
+
+# --- Small files that anybody may have written, read whole within bounds --------------------------------
+# Each reader takes the file, what it is where it is damaged (as in "no table of points"), and what a person can do
+# then. It raises a `UserError` of one line from these when the file cannot be read. Pipes and devices are refused
+# without waiting for them, larger files before they are read.
+
+_MOST_BYTES = 1 << 22  # of text; a thousand times what this package writes of most
+_MOST_OF_TABLE = 1 << 24
+MOST_OF_ARRAYS = 1 << 27
+"""Of an NPZ file [bytes], also after unpacking."""
+ANY_SIZE = 1 << 62
+
+
+def read_text(path: Path, wrong: str, advice: str, most: int = _MOST_BYTES) -> str:
+    """Content of a text file in UTF-8, of at most so many bytes."""
     with _readable(path, wrong, advice):
         return inputs.read_text(path, most)
 
 
-def read_json(path: Path, wrong: str, advice: str, most: int = MOST_BYTES) -> Any:
-    """Data of a JSON file; arguments and errors as `read_text`."""
+def read_json(path: Path, wrong: str, advice: str) -> Any:
+    """Data of a JSON file."""
     with _readable(path, wrong, advice):
-        return parse_json(inputs.read_text(path, most))
+        return parse_json(inputs.read_text(path, _MOST_BYTES))
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -207,10 +298,10 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("it is nested too deep") from error
 
 
-def read_table(path: Path, wrong: str, advice: str, most: int = 1 << 24) -> list[dict[str, str]]:
-    """Lines of a CSV file by the names in its first line; arguments and errors as `read_text`."""
+def read_table(path: Path, wrong: str, advice: str) -> list[dict[str, str]]:
+    """Lines of a CSV file by the names in its first line."""
     with _readable(path, wrong, advice):
-        lines = csv.reader(io.StringIO(inputs.read_text(path, most), newline=""))
+        lines = csv.reader(io.StringIO(inputs.read_text(path, _MOST_OF_TABLE), newline=""))
         columns = next(lines, [])
         if len(set(columns)) < len(columns) or not columns:
             raise ValueError("its first line does not name columns, each once")
@@ -224,16 +315,13 @@ def read_table(path: Path, wrong: str, advice: str, most: int = 1 << 24) -> list
         return table
 
 
-def read_arrays(path: Path, wrong: str, advice: str, most: int = MOST_OF_ARRAYS) -> dict[str, np.ndarray]:
-    """Arrays of an NPZ file by name, without Python objects; arguments and errors as `read_text`.
-
-    What compressed parts unfold to counts as the size of the file does.
-    """
+def read_arrays(path: Path, wrong: str, advice: str) -> dict[str, np.ndarray]:
+    """Arrays of an NPZ file by name, without Python objects; what its parts unfold to counts as its size does."""
     with _readable(path, wrong, advice):
-        packed = io.BytesIO(inputs.read_bytes(path, most))
+        packed = io.BytesIO(inputs.read_bytes(path, MOST_OF_ARRAYS))
         with zipfile.ZipFile(packed) as archive:
-            if sum(part.file_size for part in archive.infolist()) > most:
-                raise ValueError(f"it unfolds to more than {most / 1e6:.0f} MB")
+            if sum(part.file_size for part in archive.infolist()) > MOST_OF_ARRAYS:
+                raise ValueError(f"it unfolds to more than {MOST_OF_ARRAYS / 1e6:.0f} MB")
         packed.seek(0)
         with np.load(packed, allow_pickle=False) as content:
             return dict(content)
@@ -247,229 +335,3 @@ def _readable(path: Path, wrong: str, advice: str) -> Iterator[None]:
         if isinstance(error, OSError) and error.strerror:
             raise UserError(f"cannot read {path}: {error.strerror}; {advice}") from error
         raise UserError(f"{path} is {wrong} ({one_line(error)}); {advice}") from error
-
-
-# --- Hidden files that take their name when they are complete, and what killed processes leave of them --
-
-_SUFFIX = ".partial"
-
-
-def _hidden_beside(path: Path) -> Path:
-    """A name in the same folder that says which process of which machine writes `path`."""
-    return path.with_name(f"{_start(path)}{os.getpid()}-{uuid4().hex[:8]}{_SUFFIX}")
-
-
-def _start(path: Path) -> str:
-    return f".{path.name}.{socket.gethostname()}-"
-
-
-def _open_hidden(temporary: Path) -> BinaryIO:
-    """A new file, open, with a lock that shows other processes that it is being written."""
-    while True:
-        file = open(temporary, "xb+", buffering=0)
-        if fcntl is not None:
-            with suppress(OSError):  # some file systems have no locks
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if temporary.exists():
-            return file
-        file.close()  # before it was locked another process took it for abandoned
-
-
-def _give_name(file: BinaryIO, temporary: Path, path: Path) -> None:
-    """Let a complete file take its name, and the place of a plain file that had it, once the disk has everything.
-
-    Raises:
-        UserError: By now the name stands for something else.
-        OSError: The system refuses.
-    """
-    os.fsync(file.fileno())
-    if fcntl is None:
-        file.close()  # Windows gives names to closed files only; elsewhere the lock lasts until it has its name
-    require_replaceable(path)
-    os.replace(temporary, path)
-    file.close()
-
-
-def remove_abandoned(path: Path) -> None:
-    """Delete the hidden files that killed processes of this machine left of `path`: the ones without a lock."""
-    if fcntl is None:
-        return
-    start = _start(path)
-    for found in path.parent.iterdir():
-        if not (found.name.startswith(start) and found.name.endswith(_SUFFIX)):
-            continue
-        if _file_type(found) == stat.S_IFREG:  # others are none of ours; opening a pipe may never end
-            with suppress(OSError, ValueError), inputs.open_file(found, 1 << 62) as file:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                found.unlink()
-                log.info("removed %s, left by a process that was killed", found)
-
-
-@contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A hidden path beside `path` to write to; it gets its name at the end, or is removed after an exception.
-
-    For small files; for runs, which may fill the disk, see `NewFile`.
-
-    Raises:
-        UserError: `path` is a device, pipe, link or folder.
-        OSError: The disk does not take it; the error names `path`.
-    """
-    require_replaceable(path)
-    temporary = _hidden_beside(path)
-    try:
-        remove_abandoned(path)
-        with _open_hidden(temporary) as file:
-            yield temporary
-            _give_name(file, temporary, path)
-    except OSError as error:
-        if error.filename in (None, str(temporary)):  # a full disk is reported without a name
-            error.filename = str(path)
-        raise
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file in UTF-8."""
-    with whole_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
-# --- A file that appears under its name only when it is complete ----------------------------------------
-# HDF5 writes through `NewFile` rather than to the disk itself: when the disk is full HDF5 can neither close a
-# file nor give it up, and takes the whole process down. `NewFile` keeps the error to itself and lets the caller
-# raise it.
-
-T = TypeVar("T")
-
-
-class NewFile(io.RawIOBase):
-    """A hidden file beside `path`, for `h5py.File(NewFile(path), "w")`; `complete` gives it its name.
-
-    Until then an existing file of that name stays as it is. Hidden files that killed processes of this
-    machine left for the same path are removed.
-
-    Args:
-        path: where the file goes; missing folders are made.
-
-    Raises:
-        UserError: the folder cannot be made or written, or `path` is a device, pipe, link or folder.
-    """
-
-    def __init__(self, path: Path) -> None:
-        require_replaceable(path)
-        self.path = path
-        self._error: BaseException | None = None
-        self._temporary = _hidden_beside(path)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            remove_abandoned(path)
-            self._file = _open_hidden(self._temporary)
-        except OSError as error:
-            raise _cannot_write(path, error) from error
-
-    def check(self) -> None:
-        """Raise what a read or write since the last check ran into."""
-        if self._error is None:
-            return
-        error = self._error
-        if isinstance(error, OSError):
-            raise _cannot_write(self.path, error) from error
-        raise error
-
-    def complete(self, path: Path | None = None) -> None:
-        """Wait until the disk has everything, then give the file its name, or that of `path` in the same folder. Close
-        the HDF5 file before.
-
-        Raises:
-            UserError: the disk did not take it; nothing is left behind.
-        """
-        try:
-            self.check()
-            _give_name(self._file, self._temporary, path or self.path)
-            # Again: when this file was begun, a process just killed may still have had its lock.
-            with suppress(OSError):
-                remove_abandoned(self.path)
-        except OSError as error:
-            self.discard()
-            raise _cannot_write(self.path, error) from error
-        except BaseException:
-            self.discard()
-            raise
-        if os.name == "posix":
-            with suppress(OSError):  # the file is complete; some file systems cannot sync a folder
-                descriptor = os.open(self.path.parent, os.O_RDONLY)
-                try:
-                    os.fsync(descriptor)
-                finally:
-                    os.close(descriptor)
-
-    def discard(self) -> None:
-        """Remove the hidden file; does nothing the second time."""
-        with suppress(OSError):
-            self._file.close()
-        with suppress(OSError):
-            self._temporary.unlink(missing_ok=True)
-
-    # --- what h5py asks of a file, as in `io.RawIOBase`: nothing of this may raise ------------------------
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        return self._kept(lambda: self._file.seek(offset, whence), 0)
-
-    def readinto(self, buffer: memoryview) -> int:
-        """Fill the buffer, with zeros where nothing can be read."""
-        view = memoryview(buffer).cast("B")
-        done = 0
-        while done < len(view):
-            count = self._kept(lambda part=view[done:]: self._file.readinto(part), 0)
-            if not count:
-                view[done:] = bytes(len(view) - done)
-                break
-            done += count
-        return len(view)
-
-    def write(self, data: memoryview) -> int:
-        """Write everything, or remember why not."""
-        view = memoryview(data).cast("B")
-        done = 0
-        while done < len(view) and self._error is None:
-            done += self._kept(lambda part=view[done:]: self._file.write(part), 0) or 0
-        return len(view)
-
-    def truncate(self, size: int | None = None) -> int:
-        return self._kept(lambda: self._file.truncate(size), 0)
-
-    def _kept(self, action: Callable[[], T], otherwise: T) -> T:
-        try:
-            return action()
-        except BaseException as error:  # also an interrupt: HDF5 must not see it half-way through a write
-            self._error = self._error or error
-            return otherwise
-
-
-@contextmanager
-def new_hdf5(path: Path) -> Iterator[h5py.File]:
-    """An HDF5 file to fill; it appears under its name at the end, complete, or not at all.
-
-    Raises:
-        UserError: the disk does not take it; nothing is left behind.
-    """
-    disk = NewFile(path)
-    try:
-        with h5py.File(disk, "w") as file:
-            yield file
-        disk.complete()
-    finally:
-        disk.discard()
-
-
-def _cannot_write(path: Path, error: OSError) -> UserError:
-    """What a person can do about a failed write, in one line."""
-    reason = error.strerror or str(error)
-    advice = {
-        "No space left on device": "free some space or choose another output",
-        "Disk quota exceeded": "free some space or choose another output",
-        "File name too long": "choose a shorter name",
-    }.get(reason, "choose an output in a folder that you may write to")
-    return UserError(f"cannot write {path}: {reason}; nothing is kept; {advice}")

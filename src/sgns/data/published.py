@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from mpm_warp.inputs import open_file, read_text
 from mpm_warp.poses import fitted_poses
-from sgns.arrays import is_whole
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
 from sgns.data.files import parse_json
+from sgns.numbers import is_whole
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, ReducedRun
 
@@ -60,8 +60,6 @@ class PublishedRun:
 
     kind: str
     """excavation or wheel."""
-    case: int | None
-    """Number of the run among all of its kind, from 1; None where metadata.json does not say."""
     body_points: np.ndarray
     """Nodes of the rigid body [m], shape (T, M, 3)."""
     latent: np.ndarray
@@ -71,6 +69,8 @@ class PublishedRun:
     context: np.ndarray
     """Of a wheel: gravity [m/s^2], friction angle [degrees] and load [N] in every frame, shape (T, 3); of a blade:
     shape (T, 0)."""
+    case: int | None = None
+    """Number of the run among all of its kind, from 1; None where metadata.json does not say."""
 
 
 def _case(kind: str, case: int, **values: tuple[Any, ...]) -> dict[str, Any]:
@@ -96,26 +96,8 @@ def wheel_case(case: int) -> dict[str, float]:
     return found | {"width": WIDTHS[found["diameter"]]}
 
 
-def published_files(folder: str | Path) -> list[str]:
-    """Names of the splits in a folder: of every <split>.tfrecord."""
-    folder = Path(folder)
-    found = sorted(file.stem for file in folder.glob("*.tfrecord"))
-    if not found or not (folder / "metadata.json").is_file():
-        raise UserError(
-            f"{folder} does not hold published runs; it needs metadata.json and at least one <split>.tfrecord, as the "
-            "paper's authors published them"
-        )
-    return found
-
-
-def read_published(
-    folder: str | Path, bin_size: tuple[float, float, float] | None = None, split: str = "valid"
-) -> list[PublishedRun]:
-    """The runs of one folder with `<split>.tfrecord` and `metadata.json`.
-
-    Args:
-        bin_size: Lx, Ly, Lz of the soil bin [m]; None: the authors' own.
-    """
+def read_published(folder: str | Path, split: str = "valid") -> list[PublishedRun]:
+    """The runs of one folder with `<split>.tfrecord` and `metadata.json`."""
     folder = Path(folder)
     try:
         metadata = parse_json(read_text(folder / "metadata.json", _MOST_METADATA))
@@ -128,22 +110,23 @@ def read_published(
         raise UserError(f"{folder}: metadata.json does not name the {split} runs by their numbers")
     try:
         with open_file(folder / f"{split}.tfrecord", _MOST_BYTES) as file:
-            size = os.fstat(file.fileno()).st_size
-            count = sum(1 for _ in _lengths(file, size))
-            if cases is not None and len(cases) != count:
+            records = _records(file)
+            if cases is not None and len(cases) != len(records):
                 raise UserError(
-                    f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {count}"
+                    f"{folder}: metadata.json names {len(cases)} {split} runs, the file holds {len(records)}"
                 )
-            if not count:
+            if not records:
                 raise UserError(f"{folder}/{split}.tfrecord holds no run")
-            file.seek(0)
-            runs = [_run(None, file.read(length), bin_size) for length in _lengths(file, size)]
+            runs = []
+            for start, length in records:
+                file.seek(start)
+                runs.append(_run(file.read(length)))
     except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
         raise UserError(f"{folder}/{split}.tfrecord is not a file of published runs: {error}") from None
     return [replace(run, case=case) for run, case in zip(runs, cases or [None] * len(runs), strict=True)]
 
 
-def _run(case: int | None, record: bytes, bin_size: tuple[float, float, float] | None) -> PublishedRun:
+def _run(record: bytes) -> PublishedRun:
     about, frames = _sequence_example(record)
     types = np.frombuffer(about["particle_type"], dtype="<i8")
     nodes = _series(frames["position"], 3 * len(types)).reshape(-1, len(types), 3)[1:]
@@ -156,10 +139,10 @@ def _run(case: int | None, record: bytes, bin_size: tuple[float, float, float] |
         raise ValueError("a run has no frames, or values that are not finite")
     soil = types == _SUBSPACE
     kind = "wheel" if bool((types == _FREE).any()) else "excavation"
-    lx, _, lz = bin_size or _BINS[kind]
+    lx, _, lz = _BINS[kind]
     x, y, z = np.moveaxis(nodes[:, ~soil], -1, 0)
     body = np.stack([_MARGIN + lx - x, z - _MARGIN, y - _MARGIN - lz], axis=-1)
-    return PublishedRun(kind, case, body, nodes[:, soil], force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0], context)
+    return PublishedRun(kind, body, nodes[:, soil], force[:, [0, 2, 1]] * [-1.0, 1.0, 1.0], context)
 
 
 def _series(frames: Sequence[bytes], values: int) -> np.ndarray:
@@ -169,22 +152,19 @@ def _series(frames: Sequence[bytes], values: int) -> np.ndarray:
     return np.frombuffer(b"".join(frames), dtype="<f4").astype(float).reshape(-1, values)
 
 
-def _lengths(file: BinaryIO, size: int) -> Iterator[int]:
-    """Lengths of the payloads of a TFRecord file: length (8), check sum (4), payload, check sum (4).
-
-    The file stands at the beginning of each payload when its length is given.
-    """
-    at = 0
+def _records(file: BinaryIO) -> list[tuple[int, int]]:
+    """Start and length of the runs in a TFRecord file: each is length (8), check sum (4), run, check sum (4)."""
+    size, at, records = os.fstat(file.fileno()).st_size, 0, []
     while at < size:
+        file.seek(at)
         (length,) = struct.unpack("<Q", file.read(8))
         if at + 16 + length > size:
             raise ValueError("the file is cut short")
         if not 0 < length <= _MOST_OF_RUN:
             raise ValueError(f"a run has {length} bytes; allowed: 1 to {_MOST_OF_RUN}")
-        file.seek(at + 12)
-        yield length
+        records.append((at + 12, length))
         at += 16 + length
-        file.seek(at)
+    return records
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -272,7 +252,12 @@ def published_dataset(settings: Mapping[str, Any], num_modes: int | str) -> Redu
     else:
         split["train"] = everything = [run for found in runs.values() for run in found]
         if folds is not None:
-            _check_fold(folds, fold, len(everything))
+            if not is_whole(folds) or not 2 <= folds <= len(everything):
+                raise UserError(
+                    f"dataset.folds is {folds!r}; allowed: 2 to {len(everything)}, the number of runs, or null"
+                )
+            if not is_whole(fold) or not 0 <= fold < folds:
+                raise UserError(f"dataset.fold is {fold!r}; allowed: 0 to {folds - 1}")
             split["test"] = everything[fold::folds]
             split["train"] = [run for i, run in enumerate(everything) if i % folds != fold]
     first = split["train"][0]
@@ -298,9 +283,16 @@ def published_dataset(settings: Mapping[str, Any], num_modes: int | str) -> Redu
 
 
 def published_runs(folder: str | Path) -> dict[str, list[ReducedRun]]:
-    """All runs of a folder by the name of their file."""
+    """All runs of a folder by the name of their file, <split>.tfrecord."""
+    folder = Path(folder)
+    splits = sorted(file.stem for file in folder.glob("*.tfrecord"))
+    if not splits or not (folder / "metadata.json").is_file():
+        raise UserError(
+            f"{folder} does not hold published runs; it needs metadata.json and at least one <split>.tfrecord, as the "
+            "paper's authors published them"
+        )
     found = {}
-    for split in published_files(folder):
+    for split in splits:
         runs = read_published(folder, split=split)
         # The authors drew their training split with replacement: a run may be there twice.
         unique = {run.latent.tobytes(): run for run in runs}.values()
@@ -315,26 +307,21 @@ def fingerprint(run: ReducedRun) -> str:
     return hashlib.blake2b(np.ascontiguousarray(run.latent).tobytes(), digest_size=6).hexdigest()
 
 
-def _check_fold(folds: Any, fold: Any, count: int) -> None:
-    if not is_whole(folds) or not 2 <= folds <= count:
-        raise UserError(f"dataset.folds is {folds!r}; allowed: 2 to {count}, the number of runs, or null")
-    if not is_whole(fold) or not 0 <= fold < folds:
-        raise UserError(f"dataset.fold is {fold!r}; allowed: 0 to {folds - 1}")
-
-
 def _reduced(run: PublishedRun, name: str) -> ReducedRun:
     # To this package's axes; where the origin of a mode's positions lies does not matter.
     latent = np.stack([-run.latent[..., 0], run.latent[..., 2], run.latent[..., 1]], axis=-1)
-    time = np.arange(len(latent)) / _FRAME_RATE
+    points, wheel = run.body_points, run.kind == "wheel"
+    # A wheel's pose: centre of the rim's points and turn since the first frame.
+    pose = fitted_poses(points[0] - points[0].mean(axis=0), points) if wheel else _blade_poses(points)
     return ReducedRun(
         name=name if run.case is None else f"{run.kind}_{run.case:03d}",
         latent=latent,
-        time=time,
-        pose=_wheel_poses(run.body_points) if run.kind == "wheel" else _blade_poses(run.body_points),
-        body_points=run.body_points,
+        time=np.arange(len(latent)) / _FRAME_RATE,
+        pose=pose,
+        body_points=points,
         force=run.force,
         torque=np.zeros_like(run.force),
-        scene={"kind": run.kind} | (_wheel_values(run) if run.kind == "wheel" else {}),
+        scene={"kind": run.kind} | (_wheel_values(run) if wheel else {}),
     )
 
 
@@ -351,11 +338,6 @@ def _wheel_values(run: PublishedRun) -> dict[str, float]:
         "diameter": min(DIAMETERS, key=lambda diameter: abs(diameter - across)),
         "slip": round(1.0 - speed / _RIM_SPEED, 4),
     }
-
-
-def _wheel_poses(points: np.ndarray) -> np.ndarray:
-    """Centre of the rim's points and turn since the first frame, shape (T, 7)."""
-    return fitted_poses(points[0] - points[0].mean(axis=0), points)
 
 
 def _blade_poses(points: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import hashlib
 import logging
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path, PurePath
 from types import TracebackType
 from typing import Any
@@ -20,13 +21,23 @@ import yaml
 from mpm_warp import State
 from sgns import __version__
 from sgns.config import UserError
-from sgns.data.files import NewFile
-from sgns.data.layout import ELEMENTS, FORMAT, FORMAT_VERSION, MESH, PRODUCERS, write_text
-from sgns.data.run import remove_stopped, require_run_place, stopped_path, write_state
+from sgns.data.files import require_replaceable
+from sgns.data.hdf5 import BROKEN, NewFile
+from sgns.data.run import (
+    FORMAT,
+    FORMAT_VERSION,
+    MESH,
+    PRODUCERS,
+    SERIES,
+    STATE,
+    STOPPED,
+    Recorded,
+    open_run,
+    read_attributes,
+    series,
+)
 
 log = logging.getLogger(__name__)
-
-_STREAMED = ("position", "velocity")
 
 
 # --- A view of the soil for ParaView and VTK ------------------------------------------------------------
@@ -38,6 +49,8 @@ VIEW_ATTRIBUTES = {
     "Version": np.array((2, 0), dtype="<i8"),  # the first with PolyData in time; newer readers take every 2.x
     "Type": np.bytes_("PolyData"),  # the reader wants ASCII of fixed length
 }
+VIEWS = {"position": "Points", "velocity": "PointData/velocity"}
+"""Recorded soil → the dataset of /VTKHDF that shows it."""
 
 
 def view_arrays(frames: int, particles: int) -> dict[str, np.ndarray]:
@@ -63,20 +76,52 @@ def view_arrays(frames: int, particles: int) -> dict[str, np.ndarray]:
     return {path: np.asarray(values, dtype="<i8") for path, values in arrays.items()}
 
 
-def _write_view(file: h5py.File, position: h5py.Dataset, velocity: h5py.Dataset, time: h5py.Dataset) -> None:
-    frames, particles, axes = position.shape
+def _write_view(file: h5py.File) -> None:
+    frames, particles, axes = series(file, "position").shape
     group = file.create_group("VTKHDF")
     for name, value in VIEW_ATTRIBUTES.items():
         group.attrs[name] = value
-    for name, source in (("Points", position), ("PointData/velocity", velocity)):
+    for name, path in VIEWS.items():
+        source = series(file, name)
         layout = h5py.VirtualLayout(shape=(frames * particles, axes), dtype=source.dtype)
         # "." is HDF5's name for the file that holds the virtual dataset, whatever it is called later.
         layout[...] = h5py.VirtualSource(".", source.name, shape=source.shape, dtype=source.dtype)
-        group.create_virtual_dataset(name, layout)
-    for name, values in view_arrays(frames, particles).items():
-        group[name] = values
-    group["Steps/Values"] = time  # a hard link
+        group.create_virtual_dataset(path, layout)
+    for path, values in view_arrays(frames, particles).items():
+        group[path] = values
+    group["Steps/Values"] = series(file, "position", "time")  # a hard link
     group["Steps"].attrs["NSteps"] = np.int64(frames)
+
+
+# --- What is kept of a run that stopped, and what a run may replace -------------------------------------
+
+
+def stopped_path(path: Path) -> Path:
+    """Where the frames of a run go that was to become `path` and stopped before its end."""
+    return path.with_name(f"{path.stem}.stopped{path.suffix}")
+
+
+def require_run_place(path: Path) -> None:
+    """Refuse a run's name if the run, or its frames if it stops, would destroy something else than an earlier run.
+
+    Raises:
+        UserError: says what is there.
+    """
+    kept = stopped_path(path)
+    require_replaceable(path, kept)
+    if os.path.lexists(kept) and not _is_stopped(kept):
+        raise UserError(
+            f"{kept} is no stopped run, and the frames of {path.name} would go there if it stopped; move it, or choose "
+            "another output"
+        )
+
+
+def _is_stopped(path: Path) -> bool:
+    try:
+        with open_run(path) as file:
+            return STOPPED in read_attributes(file)
+    except (UserError, *BROKEN):
+        return False
 
 
 # --- The run --------------------------------------------------------------------------------------------
@@ -90,7 +135,7 @@ class ContentHash:
     def __init__(self) -> None:
         self._hash = hashlib.blake2b(digest_size=16)
 
-    def update(self, frame: dict[str, np.ndarray]) -> None:
+    def update(self, frame: Mapping[str, np.ndarray]) -> None:
         """Add one frame: an array for every name in `ORDER`, in the file's types."""
         for name in self.ORDER:
             self._hash.update(np.ascontiguousarray(frame[name]).data)
@@ -129,15 +174,15 @@ class RunWriter:
         self,
         path: str | os.PathLike[str],
         *,
-        scene: dict[str, Any],
-        effects: dict[str, dict[str, Any]],
+        scene: Mapping[str, Any],
+        effects: Mapping[str, Mapping[str, Any]],
         arrangement_hash: str,
         particle_count: int,
         body_points: int,
         frame_rate: float,
         seed: int,
         producer: str,
-        extra: dict[str, Any] | None = None,
+        extra: Mapping[str, Any] | None = None,
         mesh: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
         if producer not in PRODUCERS:
@@ -147,12 +192,16 @@ class RunWriter:
         if not (math.isfinite(frame_rate) and frame_rate > 0):
             raise ValueError(f"frame_rate is {frame_rate}; it must be above 0 Hz")
         self.path = Path(path)
-        self._counts = {"n": int(particle_count), "M": int(body_points)}
+        counts = {"n": int(particle_count), "M": int(body_points)}
+        self._shapes = {  # of one frame
+            name: tuple(counts[size] if isinstance(size, str) else size for size in recorded.tail)
+            for name, recorded in SERIES.items()
+        }
         self._small: dict[str, list[np.ndarray]] = {
-            name: [] for name in ContentHash.ORDER if name not in _STREAMED
+            name: [] for name in ContentHash.ORDER if name not in VIEWS
         }
         self._hash = ContentHash()
-        extra = dict(extra or {})
+        extra = extra or {}
         attributes = {  # in the order of a reader's interest
             "format": FORMAT,
             "format_version": np.int64(FORMAT_VERSION),
@@ -169,9 +218,17 @@ class RunWriter:
         self._disk = NewFile(self.path)
         self._file: h5py.File | None = None
         try:
-            self._create(attributes, str(extra.get("author", "unknown")))
-            if mesh is not None:
-                _write_mesh(self._file, *mesh)
+            # v110 is the oldest HDF5 whose files say that they were cut short and may hold virtual datasets.
+            self._file = h5py.File(self._disk, "w", libver=("v110", "v110"))
+            for name, value in attributes.items():
+                _set(self._file, name, value)
+            _write_h5md(self._file, str(extra.get("author", "unknown")))
+            self._create_soil(self._file)
+            for part, values in zip(MESH.values(), mesh or (), strict=mesh is not None):
+                data = np.asarray(values, dtype=part.dtype)
+                # Checksummed: no content hash guards it.
+                dataset = self._file.create_dataset(part.path, data=data, chunks=True, fletcher32=True)
+                _describe(dataset, part)
             self._disk.check()
         except BaseException:
             self._discard()
@@ -205,52 +262,49 @@ class RunWriter:
         """
         file = self._open_file()
         index = self.frame_count
-        frame = {
-            "time": np.asarray(time, dtype="<f8"),
-            "position": position,
-            "velocity": velocity,
-            "body_points": body_points,
-            "pose": body_pose,
-            "force": force,
-            "torque": torque,
-        }
+        frame = {"time": np.asarray(time, dtype="<f8")}
         if frame["time"].shape != ():
             raise ValueError(f"time has shape {frame['time'].shape}; it must be one number [s]")
-        for name, element in ELEMENTS.items():
+        given = (position, velocity, body_points, force, torque, body_pose)  # as in SERIES
+        for (name, recorded), values in zip(SERIES.items(), given, strict=True):
             # A float64 beyond float32's range becomes inf here and is reported below, so numpy need not warn.
             with np.errstate(over="ignore"):
-                convert = np.asarray if name in _STREAMED else np.array  # the small ones are kept: copy them
-                frame[name] = convert(frame[name], dtype=element.dtype, order="C")
-            if frame[name].shape != element.shape(self._counts):
-                expected = element.shape(self._counts)
+                convert = np.asarray if name in VIEWS else np.array  # the small ones are kept: copy them
+                frame[name] = convert(values, dtype=recorded.dtype, order="C")
+            if frame[name].shape != (expected := self._shapes[name]):
                 raise ValueError(f"frame {index}: {name} has shape {frame[name].shape}, expected {expected}")
         for name, values in frame.items():
             if not np.isfinite(values).all():
                 where = np.argwhere(~np.isfinite(values))[0]
-                at = f" of particle {where[0]}" if name in _STREAMED else ""
+                at = f" of particle {where[0]}" if name in VIEWS else ""
                 raise UserError(
                     f"{self.path}: frame {index} ({float(time):.4g} s): {name}{at} is not finite; "
                     "the run is not kept; use a smaller time step or check what drives it"
                 )
         if index and not frame["time"] > self._small["time"][-1]:
             raise ValueError(f"frame {index}: time {time} s is not after {self._small['time'][-1]} s")
-        for name in _STREAMED:
-            dataset = file[f"{ELEMENTS[name].path}/value"]
+        for name in VIEWS:
+            dataset = series(file, name)
             dataset.resize(index + 1, axis=0)
             # A frame is a chunk, so it needs neither HDF5's cache nor its conversions.
             dataset.id.write_direct_chunk((index, 0, 0), frame[name])
         self._disk.check()
-        for name, series in self._small.items():
-            series.append(frame[name])
+        for name, kept in self._small.items():
+            kept.append(frame[name])
         self._hash.update(frame)
 
     def finish(self, wall_time_s: float) -> None:
-        """Complete the file and give it its name; `wall_time_s` is what it took to compute the run [s]."""
+        """Complete the file and give it its name; `wall_time_s` is what it took to compute the run [s].
+
+        What an earlier attempt at this run left is removed.
+        """
         self._open_file()
         if self.frame_count == 0:
             raise ValueError("no frame was appended")
         self._complete(wall_time_s, self.path)
-        remove_stopped(self.path)
+        kept = stopped_path(self.path)
+        if not kept.is_symlink() and _is_stopped(kept):
+            kept.unlink(missing_ok=True)
 
     def stop(self, wall_time_s: float, reason: str, state: State | None = None) -> Path:
         """Complete the file with the frames so far, as a stopped run beside the one it was to be.
@@ -261,9 +315,12 @@ class RunWriter:
             state: at the last of them, to go on from; a rollout has none.
         """
         file = self._open_file()
-        write_text(file, "stopped", reason)
+        _set(file, STOPPED, reason)
         if state is not None:
-            write_state(file, state)
+            group = file.create_group(STATE)
+            group.attrs["frame"] = np.int64(state.frame)
+            for name, array in state.arrays.items():
+                group[name] = array
         path = stopped_path(self.path)
         self._complete(wall_time_s, path)
         return path
@@ -273,12 +330,42 @@ class RunWriter:
             raise ValueError("the run is already finished or discarded; make a new RunWriter")
         return self._file
 
+    def _create_soil(self, file: h5py.File) -> None:
+        # MDAnalysis reads the first group; in order of creation that is the soil.
+        particles = file.create_group("particles", track_order=True)
+        for name in ("soil", "body"):
+            box = particles.create_group(f"{name}/box")
+            box.attrs["dimension"] = np.int64(3)
+            box.attrs["boundary"] = np.array([b"none"] * 3)
+        for name in VIEWS:
+            recorded, shape = SERIES[name], self._shapes[name]
+            dataset = file.create_dataset(
+                f"{recorded.path}/value",
+                (0, *shape),
+                recorded.dtype,
+                maxshape=(None, *shape),
+                chunks=(1, *shape),
+            )
+            _describe(dataset, recorded)
+
     def _complete(self, wall_time_s: float, path: Path) -> None:
+        """Write the times, everything of the body, and the view for VTK; then the file gets its name."""
         file = self._open_file()
         try:
-            self._write_series(file)
-            file.attrs["wall_time_s"] = np.float64(wall_time_s)
-            write_text(file, "content_hash", self._hash.hexdigest())
+            first = file[SERIES["position"].path]
+            first["step"] = np.arange(self.frame_count, dtype="<i8")
+            first["time"] = np.array(self._small["time"], dtype="<f8")
+            _set(first["time"], "si_unit", "s")
+            for name, recorded in SERIES.items():
+                if name in self._small:
+                    file[f"{recorded.path}/value"] = np.array(self._small[name], dtype=recorded.dtype)
+                    _describe(series(file, name), recorded)
+                if name != "position":  # hard links: H5MD's way to say "sampled at the same times"
+                    file[f"{recorded.path}/step"] = first["step"]
+                    file[f"{recorded.path}/time"] = first["time"]
+            _write_view(file)
+            _set(file, "wall_time_s", np.float64(wall_time_s))
+            _set(file, "content_hash", self._hash.hexdigest())
             file.close()
             self._disk.complete(path)
         except BaseException:
@@ -297,48 +384,6 @@ class RunWriter:
                 log.warning("%s was left without finish(); nothing is kept", self.path)
             self._discard()
 
-    def _create(self, attributes: dict[str, Any], author: str) -> None:
-        # v110 is the oldest HDF5 whose files say that they were cut short and may hold virtual datasets.
-        self._file = file = h5py.File(self._disk, "w", libver=("v110", "v110"))
-        for name, value in attributes.items():
-            if isinstance(value, str):
-                write_text(file, name, value)
-            else:
-                file.attrs[name] = value
-        _write_h5md(file, author)
-        # MDAnalysis reads the first group; in order of creation that is the soil.
-        particles = file.create_group("particles", track_order=True)
-        for name in ("soil", "body"):
-            box = particles.create_group(f"{name}/box")
-            box.attrs["dimension"] = np.int64(3)
-            box.attrs["boundary"] = np.array([b"none"] * 3)
-        for name in _STREAMED:
-            element = ELEMENTS[name]
-            shape = element.shape(self._counts)
-            dataset = file.create_dataset(
-                f"{element.path}/value",
-                (0, *shape),
-                element.dtype,
-                maxshape=(None, *shape),
-                chunks=(1, *shape),
-            )
-            _describe(dataset, name)
-
-    def _write_series(self, file: h5py.File) -> None:
-        """Time, everything of the body, and the view for VTK."""
-        first = file[ELEMENTS["position"].path]
-        first["step"] = np.arange(self.frame_count, dtype="<i8")
-        first["time"] = np.array(self._small["time"], dtype="<f8")
-        write_text(first["time"], "si_unit", "s")
-        for name, element in ELEMENTS.items():
-            if name not in _STREAMED:
-                file[f"{element.path}/value"] = np.array(self._small[name], dtype=element.dtype)
-                _describe(file[f"{element.path}/value"], name)
-            if name != "position":  # hard links: H5MD's way to say "sampled at the same times"
-                file[f"{element.path}/step"] = first["step"]
-                file[f"{element.path}/time"] = first["time"]
-        _write_view(file, first["value"], file[ELEMENTS["velocity"].path]["value"], first["time"])
-
     def _discard(self) -> None:
         """Close and remove the hidden file, whatever state it is in."""
         file, self._file = self._file, None
@@ -349,31 +394,32 @@ class RunWriter:
             self._disk.discard()
 
 
-def _describe(dataset: h5py.Dataset, name: str) -> None:
-    write_text(dataset, "si_unit", ELEMENTS[name].si_unit)
-    write_text(dataset, "description", ELEMENTS[name].description)
+def _set(owner: h5py.Group | h5py.Dataset, name: str, value: Any) -> None:
+    """Set an attribute, text in UTF-8 of fixed length: H5MD asks for that, and HDF5 guards it by a checksum."""
+    if isinstance(value, str):
+        data = value.encode("utf-8") or b" "  # HDF5 has no text of length 0
+        owner.attrs.create(name, data, dtype=h5py.string_dtype("utf-8", len(data)))
+    else:
+        owner.attrs[name] = value
 
 
-def _write_mesh(file: h5py.File, vertices: np.ndarray, triangles: np.ndarray) -> None:
-    """Checksummed: no content hash guards it."""
-    for values, (path, dtype) in zip((vertices, triangles), MESH.values(), strict=True):
-        file.create_dataset(path, data=np.asarray(values, dtype=dtype), chunks=True, fletcher32=True)
-    write_text(file[MESH["vertices"][0]], "si_unit", "m")
-    write_text(file[MESH["vertices"][0]], "description", "of the tool, about its centre of mass, body frame")
-    write_text(file[MESH["triangles"][0]], "description", "vertices of each triangle, facing outwards")
+def _describe(dataset: h5py.Dataset, recorded: Recorded) -> None:
+    if recorded.si_unit:
+        _set(dataset, "si_unit", recorded.si_unit)
+    _set(dataset, "description", recorded.description)
 
 
 def _write_h5md(file: h5py.File, author: str) -> None:
     """The group that every H5MD file must have."""
     h5md = file.create_group("h5md")
     h5md.attrs["version"] = np.array([1, 1], dtype="<i8")
-    write_text(h5md.create_group("author"), "name", author or "unknown")
+    _set(h5md.create_group("author"), "name", author or "unknown")
     creator = h5md.create_group("creator")
-    write_text(creator, "name", "sgns")
-    write_text(creator, "version", __version__)
+    _set(creator, "name", "sgns")
+    _set(creator, "version", __version__)
 
 
-def _yaml_text(data: dict[str, Any]) -> str:
+def _yaml_text(data: Mapping[str, Any]) -> str:
     return yaml.dump(
         _plain(data),
         Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper),
@@ -385,14 +431,12 @@ def _yaml_text(data: dict[str, Any]) -> str:
 
 def _plain(value: Any) -> Any:
     """The same data in the types that YAML knows without tags."""
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray):
+    if isinstance(value, (np.ndarray, np.generic)):
         return _plain(value.tolist())
-    if isinstance(value, np.generic):
-        return value.item()
     if isinstance(value, PurePath):
         return str(value)
     if value is None or isinstance(value, (bool, int, float, str)):

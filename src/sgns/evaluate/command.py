@@ -21,10 +21,9 @@ from tqdm import tqdm
 
 from mpm_warp.inputs import open_file
 from mpm_warp.poses import in_body_frame
-from sgns.clock import elapsed
 from sgns.config import UserError
+from sgns.data.check import scene_problems
 from sgns.data.files import only_here, require_replaceable
-from sgns.data.layout import scene_problems
 from sgns.data.run import Run
 from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory, provenance
 from sgns.evaluate.figures import VALIDATION
@@ -40,6 +39,7 @@ from sgns.evaluate.results import (
     write_tables,
 )
 from sgns.evaluate.words import describe, forward_name, seen_warning, short_names
+from sgns.numbers import elapsed
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout
 from sgns.settings import ModelSettings, model_settings

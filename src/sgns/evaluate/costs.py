@@ -19,11 +19,11 @@ import numpy as np
 import torch
 
 from sgns import __version__
-from sgns.clock import elapsed
 from sgns.data.run import Run
 from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
 from sgns.evaluate.results import Costs, FullSpaceCost
 from sgns.model.checkpoint import SUMMARY, load_surrogate, read_summary
+from sgns.numbers import elapsed
 from sgns.rollout import single_thread
 from sgns.settings import ModelSettings
 

@@ -14,10 +14,10 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from mpm_warp import Scene
-from sgns.arrays import require_shapes
 from sgns.config import UserError
 from sgns.data.files import read_arrays, whole_file
 from sgns.evaluate.metrics import SurfaceGrid, VectorErrors, height_error, height_map, rms_mm
+from sgns.numbers import require_shapes
 
 # --- What is kept of a run ------------------------------------------------------------------------------
 # Forces, torques and poses are kept in every frame. The soil is kept a few times a second, in two forms that do

@@ -23,12 +23,12 @@ from omegaconf import DictConfig
 
 from mpm_warp import Frame, Scene, Solver, effects_for
 from sgns import __version__
-from sgns.clock import elapsed
 from sgns.config import UserError, parse_yaml
 from sgns.data.files import read_json, read_text, write_whole
 from sgns.evaluate.costs import command_line, cpu_model
 from sgns.frontier.observation import Observation, read_observation
 from sgns.frontier.point import ERRORS, Point, core_time
+from sgns.numbers import elapsed
 from sgns.rollout import single_thread
 from sgns.simulate.scene import scene_from_config
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from mpm_warp.poses import in_body_frame
 from sgns.config import UserError
 from sgns.data.files import read_json, whole_file
-from sgns.data.layout import require_mesh_was_read
+from sgns.data.run import require_mesh_was_read
 from sgns.model.dynamics import Dynamics
 from sgns.model.features import slowest_travel
 from sgns.model.network_dynamics import LatentDynamics

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor, nn
 
 from mpm_warp.poses import fitted_poses, in_world_frame
-from sgns.arrays import is_whole
 from sgns.config import UserError
 from sgns.model.features import BodyTrack, body_track, markers, step_frames
+from sgns.numbers import is_whole
 from sgns.settings import ModelSettings, PolynomialSettings
 
 # No latent position goes further than this from its mean, in deviations; training runs stay within about half of it. It

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from sgns.config import UserError
-from sgns.data.files import new_hdf5, parse_json
-from sgns.data.layout import BROKEN, one_line, open_hdf5, own_attribute, own_dataset
+from sgns.data.files import one_line, parse_json
+from sgns.data.hdf5 import BROKEN, new_hdf5, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
 
 CENTRINGS = ("scalar", "particle", "particle_axis")

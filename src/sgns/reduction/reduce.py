@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from sgns.arrays import require_shapes
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
-from sgns.data.files import new_hdf5, parse_json, require_replaceable
-from sgns.data.layout import BROKEN, open_hdf5, own_attribute, own_dataset
+from sgns.data.files import parse_json, require_replaceable
+from sgns.data.hdf5 import BROKEN, new_hdf5, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
+from sgns.numbers import require_shapes
 from sgns.reduction.basis import Basis, reconstruction_curve
 from sgns.reduction.pca import IncrementalPCA, checked_device
 from sgns.settings import ReductionSettings
@@ -314,7 +314,7 @@ def read_reduced(path: Path, counts: Mapping[str, int] | None = None) -> Reduced
     """Read a reduced run; `counts` are T, r or M where they are known.
 
     Raises:
-        One of sgns.data.layout.BROKEN: Not one, or its arrays do not fit together.
+        One of sgns.data.hdf5.BROKEN: Not one, or its arrays do not fit together.
     """
     with open_hdf5(path) as file:
         if own_attribute(file, "format") != _FORMAT:

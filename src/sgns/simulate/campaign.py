@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 import yaml
-from omegaconf import OmegaConf
 
 from mpm_warp import Decision, Effects, Scene, SceneError, substeps_per_frame
 from sgns.config import UserError, flattened
 from sgns.data.dataset import SPLITS, read_description
 from sgns.data.files import file_lock, write_whole
 from sgns.settings import DatasetSettings
-from sgns.simulate.scene import decided
+from sgns.simulate.scene import decided, replaced
 
 # --- What runs cost in work, time and disk, before and while they are made ------------------------------
 
@@ -67,22 +66,13 @@ def run_cost(scene: Scene) -> RunCost:
     per_frame = (
         stored * _BYTES_PER_PARTICLE + len(scene.body_points()) * _BYTES_PER_BODY_POINT + _BYTES_PER_FRAME
     )
-    return RunCost(
-        particles=particles,
-        substeps=substeps,
-        frames=scene.frame_count,
-        size=scene.frame_count * per_frame + _BYTES_PER_FILE,
-    )
+    frames = scene.frame_count
+    return RunCost(particles, substeps, frames, size=frames * per_frame + _BYTES_PER_FILE)
 
 
 def finishing_time(waiting: Sequence[float], running: Sequence[float], workers: int) -> float:
-    """When the last job ends if every worker that becomes free takes the next one, in the unit of the jobs' lengths.
-
-    Args:
-        waiting: lengths of the jobs not begun, in their order.
-        running: what is left of the jobs under way, at most one for each worker.
-        workers: how many jobs go on at once.
-    """
+    """When the last job ends if every worker that becomes free takes the next one, in the unit of the jobs' lengths:
+    those waiting, in their order, and what is left of those running, at most one for each worker."""
     free_at = [*running, *[0.0] * (workers - len(running))]
     heapq.heapify(free_at)
     for length in waiting:
@@ -91,11 +81,7 @@ def finishing_time(waiting: Sequence[float], running: Sequence[float], workers: 
 
 
 def require_space(folder: Path, size: int) -> None:
-    """Refuses to begin what the disk cannot take.
-
-    Args:
-        folder: where files will be written; it need not exist yet.
-        size: of the files [bytes].
+    """Refuses to begin what the disk cannot take: files of this size [bytes] in a folder that need not exist yet.
 
     Raises:
         UserError: less than that is free.
@@ -176,9 +162,8 @@ class Campaign:
         file = self.path / "dataset.yaml"
         try:
             if not file.exists():
-                with file_lock(
-                    file, wait=True
-                ):  # of two campaigns that begin at once the second finds the first's
+                # Of two campaigns that begin at once the second finds the first's.
+                with file_lock(file, wait=True):
                     if not file.exists():
                         write_whole(file, yaml.safe_dump(self.describe(), sort_keys=False))
                         return
@@ -244,14 +229,11 @@ def plan(
     grids: dict[int, list[str]] = {}
     for index in chosen:
         grid, values = combinations[index]
-        data = OmegaConf.create(dict(base))
-        for key, value in values.items():
-            OmegaConf.update(data, key, value, force_add=True)
-        plain = OmegaConf.to_container(data, resolve=True)
-        if isinstance(plain.get("tool"), dict):
-            plain["tool"].pop("digest", None)  # `draw` may name another file; these are the person's settings
+        data = replaced(base, values)
+        if isinstance(data.get("tool"), dict):
+            data["tool"].pop("digest", None)  # `draw` may name another file; these are the person's settings
         name = f"{index:04d}_" + "_".join(f"{key.split('.')[-1]}-{value}" for key, value in values.items())
-        scenes[name] = Scene.from_dict(plain)
+        scenes[name] = Scene.from_dict(data)
         grids.setdefault(grid, []).append(name)
     return Campaign(
         name=asked.name,

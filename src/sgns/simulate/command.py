@@ -9,16 +9,17 @@ from typing import Any
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tqdm import tqdm
 
 from mpm_warp import Scene
 from sgns.config import UserError
 from sgns.data.files import only_here
-from sgns.data.run import Run, require_run_place
+from sgns.data.run import Run
+from sgns.data.writer import require_run_place
 from sgns.simulate.campaign import plan, require_space, run_cost
 from sgns.simulate.run import restart_from, simulate_scene
-from sgns.simulate.scene import asked_effects, decided, decision_line, recorded, scene_from_config
+from sgns.simulate.scene import asked_effects, decided, decision_line, plain, recorded, scene_from_config
 from sgns.simulate.workers import simulate_campaign
 
 log = logging.getLogger(__name__)
@@ -53,7 +54,7 @@ def main(cfg: DictConfig) -> float | None:
         return _simulate_one(restart.scene, cfg, **same, restart=restart)
     asked = asked_effects(cfg)
     if cfg.get("dataset") is not None:  # `dataset: null` in a defaults list leaves no key
-        settings = OmegaConf.to_container(cfg.dataset, resolve=True)
+        settings = plain(cfg.dataset)
         if settings.get("where"):
             raise UserError(
                 "dataset.where picks among runs that are there; to simulate fewer change dataset.draw"
@@ -70,8 +71,8 @@ def main(cfg: DictConfig) -> float | None:
     effects, decisions = decided(scene, asked)
     for name, decision in decisions.items():
         log.info("%s", decision_line(name, decision))
-    settings = {"reasons": recorded(decisions), "seed": cfg.seed, "precision": cfg.solver.precision}
-    return _simulate_one(scene, cfg, effects=effects, **settings)
+    reasons, precision = recorded(decisions), cfg.solver.precision
+    return _simulate_one(scene, cfg, effects=effects, reasons=reasons, seed=cfg.seed, precision=precision)
 
 
 def _simulate_one(scene: Scene, cfg: DictConfig, **settings: Any) -> float:

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from mpm_warp import Effects, Scene, Solver, SolverStopped, State
 from mpm_warp.launch import Job
 from mpm_warp.solver import run_concurrently
-from sgns.clock import elapsed
 from sgns.config import UserError
-from sgns.data.run import Run, read_state
+from sgns.data.run import Run
 from sgns.data.writer import RunWriter
+from sgns.numbers import elapsed
+from sgns.simulate.scene import replaced
 
 # --- Going on with a run whose solver stopped -----------------------------------------------------------
 
@@ -59,27 +59,20 @@ class Restart:
     @property
     def changed_scene(self) -> Scene:
         """What is computed from here on."""
-        data = self.scene.to_dict()
-        for key, value in self.changes.items():
-            *groups, last = key.split(".")
-            place = data
-            for group in groups:
-                place = place[group]
-            place[last] = value
-        return Scene.from_dict(data, self.scene.mesh)
+        return Scene.from_dict(replaced(self.scene.to_dict(), self.changes), self.scene.mesh)
 
     @property
     def record(self) -> list[dict[str, Any]]:
         """For the run file: at which frames the solver went on, and with what changed."""
         return [*self.earlier, {"frame": self.state.frame, "changed": dict(self.changes)}]
 
-    def frames(self) -> Iterator[tuple[np.ndarray, ...]]:
+    def frames(self) -> Iterator[tuple[Any, ...]]:
         """The frames that are there, as `RunWriter.append` takes them."""
         with Run(self.path) as run:
             small = (run.body_points, run.pose, run.force, run.torque)
             for index, time in enumerate(run.time):
                 soil = run.positions(index)[0], run.velocities(index)[0]
-                yield (time, *soil, *(series[index] for series in small))
+                yield time, *soil, *(series[index] for series in small)
 
 
 def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
@@ -93,15 +86,16 @@ def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
     with Run(path) as run:
         if run.stopped is None:
             raise UserError(f"continue_from: {path} is a whole run; there is nothing to go on with")
-        scene, mesh, reasons, extra = run.scene, run.mesh, run.effects, run.extra
-        seed, count, wall_time = run.seed, run.frame_count, run.wall_time_s
-    if any(o.lstrip("+").startswith(f"{_FILE}=") for o in overrides):
-        raise UserError(f"{path} brings its own tool; leave out {_FILE}")
+        if any(o.lstrip("+").startswith(f"{_FILE}=") for o in overrides):
+            raise UserError(f"{path} brings its own tool; leave out {_FILE}")
+        scene, mesh, state = run.scene, run.mesh, run.state
     if mesh is None and isinstance(tool := scene.get("tool"), dict) and tool.get("shape") == "mesh":
         raise UserError(f"{path} does not hold the mesh of its tool; repeat the run")
-    state = read_state(path)
-    if state.frame != count - 1:
-        raise UserError(f"{path} holds {count} frames but the state of frame {state.frame}; repeat the run")
+    if state.frame != run.frame_count - 1:
+        raise UserError(
+            f"{path} holds {run.frame_count} frames but the state of frame {state.frame}; repeat the run"
+        )
+    reasons, extra = run.effects, run.extra
     effects, earlier = _effects(reasons, path), _earlier(extra, path)
     changes = {key: value for one in earlier for key, value in one["changed"].items()} | asked
     if effects.nonlocality and "bed.headroom" in changes:
@@ -112,8 +106,18 @@ def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
     precision = cfg.solver.precision
     if not any(o.startswith("solver.precision=") for o in overrides):
         precision = str(extra.get("precision", precision))
-    scene = Scene.from_dict(scene, mesh)
-    return Restart(path, scene, changes, effects, reasons, precision, seed, state, wall_time, earlier)
+    return Restart(
+        path,
+        Scene.from_dict(scene, mesh),
+        changes,
+        effects,
+        reasons,
+        precision,
+        run.seed,
+        state,
+        run.wall_time_s,
+        earlier,
+    )
 
 
 def _effects(reasons: Mapping[str, Any], path: Path) -> Effects:
@@ -190,7 +194,7 @@ def scene_stages(
     seed: int = 0,
     device: str = "cpu",
     precision: str = "float32",
-    progress: Any = None,
+    progress: Callable[[], object] = lambda: None,
     restart: Restart | None = None,
 ) -> Generator[Timing | Job, None, None]:
     """Compute a scene and write its run file, with the particles that `scene.bed.store_every` leaves in it.
@@ -211,6 +215,13 @@ def scene_stages(
         computed, state, before = restart.changed_scene, restart.state, restart.wall_time
     solver = Solver(computed, effects, device, precision, start=state)
     stored = scene.stored
+    made_with = {
+        "device": device,
+        "precision": precision,
+        "time_step_s": solver.time_step,
+        "substeps_per_frame": solver.substeps_per_frame,
+        "particles_simulated": solver.particle_count,
+    }
     with RunWriter(
         output,
         scene=scene.to_dict(),
@@ -221,60 +232,58 @@ def scene_stages(
         frame_rate=scene.frame_rate,
         seed=seed,
         producer="mpm",
-        extra={
-            "device": device,
-            "precision": precision,
-            "time_step_s": solver.time_step,
-            "substeps_per_frame": solver.substeps_per_frame,
-            "particles_simulated": solver.particle_count,
-        }
-        | ({"continued": restart.record} if restart is not None else {}),
+        extra=made_with | ({"continued": restart.record} if restart is not None else {}),
         mesh=scene.mesh,
     ) as writer:
         for frame in restart.frames() if restart is not None else ():
             writer.append(*frame)
-            if progress is not None:
-                progress()
+            progress()
         there = writer.frame_count
         # Loading kernels is not part of the cost of a run: the clock starts with the first frame, or with the first
         # work where the first frames are there already.
-        wall_time, seen, shared_by = before, None, 1
+        clock = _Clock(before)
         try:
             for stage in solver.stages():
                 if isinstance(stage, Job):
-                    if there and stage.steps and seen is None:
-                        seen = time.perf_counter()
+                    if there and stage.steps:
+                        clock.start()
                     yield stage
-                    shared_by = stage.shared_by
-                    if seen is not None:
-                        now = time.perf_counter()
-                        wall_time, seen = wall_time + elapsed(seen, now) / shared_by, now
+                    clock.read(stage.shared_by)
                     continue
-                seen = seen if seen is not None else time.perf_counter()
+                clock.start()
+                soil = stage.position[stored], stage.velocity[stored]
                 writer.append(
-                    stage.time,
-                    stage.position[stored],
-                    stage.velocity[stored],
-                    stage.body_points,
-                    stage.body_pose,
-                    stage.force,
-                    stage.torque,
+                    stage.time, *soil, stage.body_points, stage.body_pose, stage.force, stage.torque
                 )
-                if progress is not None:
-                    progress()
+                progress()
         except SolverStopped as stopped:
             if stopped.state is None or stopped.state.frame != writer.frame_count - 1:
                 raise
-            kept = writer.stop(wall_time, str(stopped), stopped.state)
+            kept = writer.stop(clock.seconds, str(stopped), stopped.state)
             raise SolverStopped(f"{stopped}. {_way_on(str(stopped), kept, output, computed)}") from stopped
-        wall_time += elapsed(seen, time.perf_counter()) / shared_by if seen is not None else 0.0
-        writer.finish(wall_time)
+        clock.read(clock.shared_by)
+        writer.finish(clock.seconds)
     frames = scene.frame_count - max(1, there)
-    yield Timing(
-        elapsed(before, wall_time),
-        frames / scene.frame_rate,
-        frames * solver.substeps_per_frame * solver.computed_count,
-    )
+    steps = frames * solver.substeps_per_frame * solver.computed_count
+    yield Timing(elapsed(before, clock.seconds), frames / scene.frame_rate, steps)
+
+
+class _Clock:
+    """The time that a run takes; of the time in which others are computed with it, its share."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds, self.shared_by = seconds, 1
+        self._seen: float | None = None
+
+    def start(self) -> None:
+        if self._seen is None:
+            self._seen = time.perf_counter()
+
+    def read(self, shared_by: int) -> None:
+        self.shared_by = shared_by
+        if self._seen is not None:
+            now = time.perf_counter()
+            self.seconds, self._seen = self.seconds + elapsed(self._seen, now) / shared_by, now
 
 
 def _way_on(cause: str, kept: Path, output: Path, computed: Scene) -> str:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import io
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
 from mpm_warp import Decision, Effects, Scene, Tolerances, effects_for
 from mpm_warp.inputs import read_text
-from sgns.config import UserError
+from sgns.config import UserError, flattened
 
 # --- From conf to a scene of mpm_warp -------------------------------------------------------------------
 
@@ -23,11 +24,29 @@ _MOST_BYTES = 1 << 26
 
 def scene_from_config(cfg: DictConfig) -> Scene:
     """The scene in `cfg.scene` with the soil in `cfg.material`; a path file is read into the scene."""
-    data = OmegaConf.to_container(cfg.scene, resolve=True)
-    data["material"] = OmegaConf.to_container(cfg.material, resolve=True)
+    data = plain(cfg.scene) | {"material": plain(cfg.material)}
     if isinstance(data.get("path"), str):
         data["path"] = read_path(Path(data["path"]))
     return Scene.from_dict(data)
+
+
+def plain(group: DictConfig) -> dict[str, Any]:
+    """A group of settings as plain data."""
+    return cast(dict[str, Any], OmegaConf.to_container(group, resolve=True))
+
+
+def replaced(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of nested settings with other values at some dotted keys."""
+    found = copy.deepcopy(dict(data))
+    for key, value in flattened(changes).items():
+        *groups, last = key.split(".")
+        place = found
+        for group in groups:
+            if not isinstance(place.get(group), dict):
+                place[group] = {}
+            place = place[group]
+        place[last] = value
+    return found
 
 
 def read_path(file: Path) -> list[list[float]]:
@@ -61,7 +80,7 @@ def read_path(file: Path) -> list[list[float]]:
 
 def asked_effects(cfg: DictConfig) -> dict[str, Any]:
     """`cfg.effects` as plain data: each effect true, false or auto, and the group `tolerance`."""
-    asked = OmegaConf.to_container(cfg.effects, resolve=True)
+    asked = plain(cfg.effects)
     asked.pop("nonlocal", None)  # its other name has its value
     return asked
 

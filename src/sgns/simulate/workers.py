@@ -13,6 +13,7 @@ from collections.abc import Generator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,10 @@ from tqdm import tqdm
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
 from mpm_warp.launch import Job
 from mpm_warp.solver import run_concurrently
-from sgns.clock import elapsed
 from sgns.config import UserError, flattened
 from sgns.data.files import file_lock, remove_abandoned
 from sgns.data.run import Run
+from sgns.numbers import elapsed
 from sgns.simulate.campaign import (
     Campaign,
     RunCost,
@@ -114,7 +115,7 @@ def _compile(campaign: Campaign, names: list[str], device: str) -> None:
             return bool(value)
         return value if isinstance(value, str) else type(value)
 
-    with_other_kernels = {}
+    with_other_kernels: dict[tuple[frozenset[Any], Effects], Scene] = {}
     for name in names:
         scene, effects = campaign.scenes[name], campaign.physics[name][0]
         settings = flattened(scene.to_dict() | {"name": ""})
@@ -122,6 +123,27 @@ def _compile(campaign: Campaign, names: list[str], device: str) -> None:
         with_other_kernels.setdefault((switches, effects), scene)
     for (_, effects), scene in with_other_kernels.items():
         next(Solver(scene, effects, device, campaign.precision).frames())
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A run, as it is sent to a worker process."""
+
+    name: str
+    number: int
+    """Among the runs to make."""
+    scene: dict[str, Any]
+    """With the mesh, for `Scene.from_dict`."""
+    mesh: tuple[np.ndarray, np.ndarray] | None
+    file: Path
+    effects: Effects
+    reasons: dict[str, dict[str, Any]]
+    seed: int
+    device: str
+    precision: str
+
+    def read_scene(self) -> Scene:
+        return Scene.from_dict(self.scene, self.mesh)
 
 
 class _Workers:
@@ -132,13 +154,25 @@ class _Workers:
     ) -> None:
         self.campaign, self.costs, self.workers, self.batch = campaign, costs, workers, batch
         self.at_once = workers * batch
-        self._settings = (campaign.seed, device, campaign.precision)
+        self._jobs = []
+        for number, name in enumerate(costs):
+            scene, (effects, decisions) = campaign.scenes[name], campaign.physics[name]
+            run = (
+                name,
+                number,
+                scene.to_dict(),
+                scene.mesh,
+                campaign.file(name),
+                effects,
+                recorded(decisions),
+            )
+            self._jobs.append(_Job(*run, campaign.seed, device, campaign.precision))
         context = multiprocessing.get_context("spawn")
         # Frames done of every run, and whether it has ended; each entry has one writer, so there is no lock.
         self._frames_done, self._ended = context.RawArray("q", len(costs)), context.RawArray("b", len(costs))
         shared = (self._frames_done, self._ended, context.Barrier(workers))
         self._pool = ProcessPoolExecutor(workers, context, _start_worker, shared)
-        self._jobs: dict[str, Future[dict[str, tuple[str, str]]]] = {}
+        self._futures: dict[str, Future[dict[str, tuple[str, str]]]] = {}
         # What the estimates rest on: particle-steps made, and the seconds that they took, of each run for itself.
         self._steps_seen, self._seconds_seen = 0.0, 0.0
 
@@ -148,9 +182,13 @@ class _Workers:
             try:
                 self._measure()
                 log.info("about %s with %d at once, %s", self._left(), self.at_once, disk)
-                self._submit()
+                # Every run is for itself, but a worker that makes several at once gets its share of them together.
+                shares = self.workers if self.batch > 1 else len(self._jobs)
+                for share in (self._jobs[number::shares] for number in range(shares)):
+                    future = self._pool.submit(_make_share, share, self.batch)
+                    self._futures.update((job.name, future) for job in share)
                 self._follow()
-                outcomes = {name: job.result()[name] for name, job in self._jobs.items()}
+                outcomes = {name: future.result()[name] for name, future in self._futures.items()}
             except BrokenProcessPool:
                 raise UserError(
                     f"a process that simulated died, perhaps for lack of memory; the complete runs are kept in "
@@ -167,36 +205,18 @@ class _Workers:
 
     def _measure(self) -> None:
         """Let all workers step runs from all over the list for a moment, at the same time."""
-        names = list(self.costs)
-        sample = [names[i * len(names) // self.at_once] for i in range(self.at_once)]
-        _, device, precision = self._settings
+        sample = [self._jobs[i * len(self._jobs) // self.at_once] for i in range(self.at_once)]
         shares = [sample[worker :: self.workers] for worker in range(self.workers)]
-        trials = []
-        for share in shares:
-            scenes = [_described(self.campaign.scenes[name]) for name in share]
-            effects = [self.campaign.physics[name][0] for name in share]
-            trials.append(self._pool.submit(_try, scenes, effects, device, precision))
+        trials = [self._pool.submit(_try, share) for share in shares]
         for share, trial in zip(shares, trials, strict=True):
             frames, seconds = trial.result()
-            for name, count in zip(share, frames, strict=True):
-                self._steps_seen += count * self.costs[name].steps_per_frame
+            for job, count in zip(share, frames, strict=True):
+                self._steps_seen += count * self.costs[job.name].steps_per_frame
                 self._seconds_seen += seconds
-
-    def _submit(self) -> None:
-        """Every run is a job, but a worker that makes several at once gets its share of the runs as one job."""
-        jobs = []
-        for index, name in enumerate(self.costs):
-            scene, file = _described(self.campaign.scenes[name]), self.campaign.file(name)
-            effects, decisions = self.campaign.physics[name]
-            jobs.append((name, index, scene, file, effects, recorded(decisions)))
-        shares = self.workers if self.batch > 1 else len(jobs)
-        for share in (jobs[number::shares] for number in range(shares)):
-            future = self._pool.submit(_make_share, share, self.batch, *self._settings)
-            self._jobs.update((name, future) for name, *_ in share)
 
     def _follow(self) -> None:
         """Wait for all runs, keeping the bar and the estimate up to date."""
-        total = sum(cost.particle_steps for cost in self.costs.values())
+        total, runs = sum(cost.particle_steps for cost in self.costs.values()), len(self._jobs)
         made, last, last_line = 0, time.monotonic(), time.monotonic()
         layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
         with tqdm(total=total, desc=f"{self.at_once} at once", bar_format=layout, disable=None) as bar:
@@ -205,20 +225,20 @@ class _Workers:
                 now, steps = time.monotonic(), self._steps_made()
                 self._see(steps - made, elapsed(last, now), busy=min(self.at_once, len(rest)))
                 made, last = steps, now
-                done = f"{len(self._jobs) - len(rest)} of {len(self._jobs)} runs"
+                done = f"{runs - len(rest)} of {runs} runs"
                 bar.set_postfix_str(f"{done}, {self._left()} left", refresh=False)
                 bar.update(total - sum(rest.values()) - bar.n)
                 if bar.disable and now - last_line > _LOG_EVERY:
                     log.info("%s, %s left", done, self._left())
                     last_line = now
-            bar.set_postfix_str(f"{len(self._jobs)} of {len(self._jobs)} runs", refresh=False)
+            bar.set_postfix_str(f"{runs} of {runs} runs", refresh=False)
             bar.update(total - bar.n)
 
-    def _see(self, steps: float, elapsed: float, busy: int) -> None:
-        """Add the particle-steps of `busy` runs in the last `elapsed` seconds; a machine's speed may change."""
-        kept = math.exp(-elapsed / _MEMORY)
+    def _see(self, steps: float, seconds: float, busy: int) -> None:
+        """Add the particle-steps of `busy` runs in the last seconds; a machine's speed may change."""
+        kept = math.exp(-seconds / _MEMORY)
         self._steps_seen = kept * self._steps_seen + steps
-        self._seconds_seen = kept * self._seconds_seen + elapsed * busy
+        self._seconds_seen = kept * self._seconds_seen + seconds * busy
 
     def _steps_made(self) -> int:
         """Particle-steps in all frames so far; a run's first frame takes none."""
@@ -231,7 +251,7 @@ class _Workers:
         return {
             name: cost.particle_steps - max(0, frames - 1) * cost.steps_per_frame
             for (name, cost), frames, ended in runs
-            if name not in self._jobs or not (ended or self._jobs[name].done())
+            if name not in self._futures or not (ended or self._futures[name].done())
         }
 
     def _left(self) -> str:
@@ -258,34 +278,25 @@ def _start_worker(frames_done: Any, ended: Any, barrier: Any) -> None:
     _frames_done, _ended, _barrier = frames_done, ended, barrier
     # Ctrl-C reaches all processes of the terminal; the first one ends the others.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    first = multiprocessing.parent_process()
+    assert first is not None
 
     def leave_with_parent() -> None:
-        # Without this a worker would go on alone after its parent was killed.
-        multiprocessing.parent_process().join()
+        first.join()  # else a worker would go on alone after its parent was killed
         os._exit(1)
 
     threading.Thread(target=leave_with_parent, daemon=True).start()
 
 
-_Described = tuple[dict[str, Any], tuple[np.ndarray, np.ndarray] | None]
-
-
-def _described(scene: Scene) -> _Described:
-    """A scene as it is sent to another process: its plain data and its mesh, for `Scene.from_dict`."""
-    return scene.to_dict(), scene.mesh
-
-
-def _try(
-    scenes: list[_Described], effects: list[Effects], device: str, precision: str
-) -> tuple[list[int], float]:
-    """Frames made of each scene and the seconds they took all together, while the other workers do the same."""
-    found = [Scene.from_dict(*scene) for scene in scenes]
-    frames = frames_together(found, effects, device, precision, at_once=len(found))
-    for _ in found:
+def _try(jobs: list[_Job]) -> tuple[list[int], float]:
+    """Frames made of each run and the seconds they took all together, while the other workers do the same."""
+    scenes, effects = [job.read_scene() for job in jobs], [job.effects for job in jobs]
+    frames = frames_together(scenes, effects, jobs[0].device, jobs[0].precision, at_once=len(jobs))
+    for _ in jobs:
         next(frames)  # the state at the start
     with suppress(threading.BrokenBarrierError):
         _barrier.wait(timeout=120.0)
-    start, counts = time.perf_counter(), [0] * len(found)
+    start, counts = time.perf_counter(), [0] * len(jobs)
     for number, frame in frames:
         counts[number] += isinstance(frame, Frame)  # if it is an error, whoever makes the run says so
         if elapsed(start, time.perf_counter()) > _MEASURED:
@@ -293,55 +304,39 @@ def _try(
     return counts, elapsed(start, time.perf_counter())
 
 
-def _make_share(
-    jobs: list[tuple[str, int, _Described, Path, Effects, dict[str, Any]]],
-    batch: int,
-    seed: int,
-    device: str,
-    precision: str,
-) -> dict[str, tuple[str, str]]:
-    """Make the runs (name, number in the campaign, scene, file, effects and their reasons), `batch` at once; gives what
-    `_make` says of each."""
-    tasks = (_make(*job, seed, device, precision) for _, *job in jobs)
+def _make_share(jobs: list[_Job], batch: int) -> dict[str, tuple[str, str]]:
+    """Make the runs, `batch` at once; gives what `_make` says of each."""
     outcomes = {}
-    for number, outcome in run_concurrently(tasks, batch, device):
-        name, index, *_ = jobs[number]
-        outcomes[name] = outcome
-        _ended[index] = True
+    for number, outcome in run_concurrently(map(_make, jobs), batch, jobs[0].device):
+        outcomes[jobs[number].name] = outcome
+        _ended[jobs[number].number] = True
     return outcomes
 
 
-def _make(
-    index: int,
-    described: _Described,
-    output: Path,
-    effects: Effects,
-    reasons: dict[str, dict[str, Any]],
-    seed: int,
-    device: str,
-    precision: str,
-) -> Generator[tuple[str, str] | Job, None, None]:
+def _make(job: _Job) -> Generator[tuple[str, str] | Job, None, None]:
     """Make one run unless another process does, passing on the work for the device; gives made, elsewhere or failed,
     and what went wrong in words."""
 
     def count_frame() -> None:
-        _frames_done[index] += 1
+        _frames_done[job.number] += 1
 
-    settings = {
-        "effects": effects,
-        "reasons": reasons,
-        "seed": seed,
-        "device": device,
-        "precision": precision,
-    }
     outcome = "made", ""
     try:
-        scene = Scene.from_dict(*described)
-        with file_lock(output) as ours:
-            if not ours or _done(output, scene):
+        scene = job.read_scene()
+        with file_lock(job.file) as ours:
+            if not ours or _done(job.file, scene):
                 outcome = "elsewhere", ""
             else:
-                for stage in scene_stages(scene, output, progress=count_frame, **settings):
+                for stage in scene_stages(
+                    scene,
+                    job.file,
+                    effects=job.effects,
+                    reasons=job.reasons,
+                    seed=job.seed,
+                    device=job.device,
+                    precision=job.precision,
+                    progress=count_frame,
+                ):
                     if isinstance(stage, Job):
                         yield stage
     except (UserError, SceneError, SolverStopped) as error:

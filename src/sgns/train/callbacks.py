@@ -15,9 +15,9 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from tqdm import tqdm
 
-from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate
+from sgns.numbers import elapsed
 from sgns.train.validation import ValidationRollouts, force_figure
 
 if TYPE_CHECKING:

@@ -24,11 +24,11 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from tqdm import tqdm
 
-from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate, read_checkpoint, write_checkpoint
 from sgns.model.features import BodyTrack, moves_freely, varying_context
 from sgns.model.network_dynamics import LatentDynamics
+from sgns.numbers import elapsed
 from sgns.settings import ModelSettings, TrainingSettings
 from sgns.train import Fit, Fitted, Task
 from sgns.train.callbacks import RolloutValidation, StepProgress

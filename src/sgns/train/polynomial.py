@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sgns.clock import elapsed
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate
 from sgns.model.dynamics import Standardiser
 from sgns.model.features import moves_freely, varying_context
 from sgns.model.polynomial import PolynomialDynamics, normalised
+from sgns.numbers import elapsed
 from sgns.settings import FitSettings, PolynomialSettings
 from sgns.train import Fit, Fitted, Task
 from sgns.train.validation import RolloutScore, ValidationRollouts

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from pathlib import Path
+import shutil
 
 import h5py
 import numpy as np
@@ -16,15 +16,23 @@ from sgns.data.check import check_run, main, run_files
 from sgns.data.run import Run
 from sgns_testing.runs import make_run, make_writer, random_frame
 
-# --- `check_run` finds every planted fault, and nothing in a good file ----------------------------------
 
-
-def spoil(path, change):
+@pytest.fixture
+def problems_after(tmp_path, good):
     """The problems of a good run after `change(file)`."""
-    assert check_run(make_run(path)) == []
-    with h5py.File(path, "r+") as file:
-        change(file)
-    return check_run(path)
+
+    def problems_after(change):
+        path = shutil.copy(good, tmp_path)
+        with h5py.File(path, "r+") as file:
+            change(file)
+        return check_run(path)
+
+    return problems_after
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("good") / "a.h5")
 
 
 def put(name, where, value):
@@ -110,32 +118,33 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("change", "words"), FAULTS, ids=[words for _, words in FAULTS])
-def test_a_planted_fault_is_found(tmp_path, change, words):
-    problems = spoil(tmp_path / "a.h5", change)
+def test_a_planted_fault_is_found(problems_after, change, words):
+    problems = problems_after(change)
     assert any(re.search(words, problem) for problem in problems), problems
     assert all("\n" not in problem for problem in problems)
 
 
-def test_all_problems_are_listed(tmp_path):
-    def change(file):
-        del file["h5md"], file["observables/body/force"], file["VTKHDF"], file.attrs["seed"]
-        file.attrs["producer"] = "me"
-
-    problems = spoil(tmp_path / "a.h5", change)
-    text = "\n".join(problems)
-    for words in ("h5md", "force/value", "force/step", "force/time", "seed", "producer"):
-        assert words in text
+def missing_parts(file):
+    del file["h5md"], file["observables/body/force"], file["VTKHDF"], file.attrs["seed"]
+    file.attrs["producer"] = "me"
 
 
-def test_bad_values_are_all_listed(tmp_path):
-    def change(file):
-        file["particles/soil/position/value"][3, 7] = np.nan
-        file["observables/body/pose/value"][2] = 1.0
-        file["particles/soil/position/time"][5] = 9.0
+def bad_values(file):
+    file["particles/soil/position/value"][3, 7] = np.nan
+    file["observables/body/pose/value"][2] = 1.0
+    file["particles/soil/position/time"][5] = 9.0
 
-    text = "\n".join(spoil(tmp_path / "a.h5", change))
-    for words in ("particle 7", "quaternion", "time", "content_hash"):
-        assert words in text
+
+@pytest.mark.parametrize(
+    ("change", "listed"),
+    [
+        (missing_parts, ("h5md", "force/value", "force/step", "force/time", "seed", "producer")),
+        (bad_values, ("particle 7", "quaternion", "time", "content_hash")),
+    ],
+)
+def test_all_problems_are_listed(problems_after, change, listed):
+    text = "\n".join(problems_after(change))
+    assert [words for words in listed if words not in text] == []
 
 
 def test_a_file_that_cannot_be_opened_is_one_problem(tmp_path):
@@ -230,7 +239,7 @@ def test_damage_to_a_mesh_is_found(tmp_path, change, words):
 # --- Which files `sgns check` reads, and what it says of them -------------------------------------------
 
 
-def test_a_dataset_stands_for_its_runs_in_order(tmp_path: Path) -> None:
+def test_a_dataset_stands_for_its_runs_in_order(tmp_path):
     (tmp_path / "runs").mkdir()
     for name in ("b.h5", "a.h5", ".a.h5.123", ".half.h5", "notes.txt"):
         (tmp_path / "runs" / name).touch()
@@ -240,29 +249,22 @@ def test_a_dataset_stands_for_its_runs_in_order(tmp_path: Path) -> None:
     assert run_files([expected[1], expected[0]]) == expected[::-1]
 
 
-def test_what_cannot_be_checked_is_said(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds no run file"):
-        run_files([tmp_path])
-    with pytest.raises(UserError, match="no such file"):
-        run_files([tmp_path / "nope.h5"])
-    with pytest.raises(UserError, match="nothing to check"):
-        run_files([])
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [([""], "holds no run file"), (["nope.h5"], "no such file"), ([], "nothing to check")],
+)
+def test_what_cannot_be_checked_is_said(tmp_path, names, words):
+    with pytest.raises(UserError, match=words):
+        run_files([tmp_path / name for name in names])
 
 
-def test_good_files_are_good(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    make_run(tmp_path / "run.h5")
+def test_every_file_is_read_before_a_bad_one_is_reported(tmp_path, caplog):
+    good, bad = make_run(tmp_path / "good.h5"), tmp_path / "bad.h5"
+    bad.write_bytes(b"not HDF5")
     with caplog.at_level(logging.INFO):
-        assert main(OmegaConf.create({"files": str(tmp_path / "run.h5")})) == 0
-    assert caplog.messages == [f"{tmp_path / 'run.h5'}: good"]
-
-
-def test_every_file_is_read_before_a_bad_one_is_reported(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    make_run(tmp_path / "good.h5")
-    (tmp_path / "bad.h5").write_bytes(b"not HDF5")
-    with caplog.at_level(logging.INFO), pytest.raises(UserError, match="1 of 2 files checked is not good"):
-        main(OmegaConf.create({"files": [str(tmp_path / "bad.h5"), str(tmp_path / "good.h5")]}))
-    assert caplog.messages[-1] == f"{tmp_path / 'good.h5'}: good"
-    assert caplog.messages[0].startswith(f"{tmp_path / 'bad.h5'}")
-    assert caplog.messages[0].count("bad.h5") == 1
+        assert main(OmegaConf.create({"files": str(good)})) == 0
+        with pytest.raises(UserError, match="1 of 2 files checked is not good"):
+            main(OmegaConf.create({"files": [str(bad), str(good)]}))
+    first, problem, last = caplog.messages
+    assert first == last == f"{good}: good"
+    assert problem.startswith(str(bad)) and problem.count("bad.h5") == 1

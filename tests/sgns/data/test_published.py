@@ -14,8 +14,6 @@ from sgns.data.published import excavation_case, fingerprint, published_dataset,
 from sgns_testing.commands import refusal, sgns
 from sgns_testing.published import record
 
-BIN = (0.8, 0.6, 0.15)
-
 
 def write(folder, records, cases, split="valid"):
     (folder / "metadata.json").write_text(json.dumps({"dataset_split": {split: cases}}))
@@ -28,7 +26,7 @@ def test_axes_signs_and_the_doubled_first_frame(tmp_path):
     first = [[0.82, 0.30, 0.50], [1.0, 2.0, 3.0]]
     frames = [first, first, [[0.72, 0.20, 0.55], [4.0, 5.0, 6.0]]]
     write(tmp_path, [record(frames, [3, 6], [[9, 9, 9], [10, 20, 30], [11, 21, 31]])], [186])
-    (run,) = read_published(tmp_path, BIN)
+    (run,) = read_published(tmp_path)
     assert run.case == 186
     np.testing.assert_allclose(run.body_points[:, 0], [[0.08, 0.40, 0.05], [0.18, 0.45, -0.05]], atol=1e-6)
     np.testing.assert_allclose(run.latent[:, 0], [[1, 2, 3], [4, 5, 6]])
@@ -37,19 +35,12 @@ def test_axes_signs_and_the_doubled_first_frame(tmp_path):
     assert run.context.shape == (2, 0)
 
 
-def test_case_numbers():
-    assert excavation_case(186) == {"depth": 0.08, "speed": 0.10, "rake": 10.0, "motion": "curved"}
-    assert excavation_case(1) == {"depth": 0.02, "speed": 0.01, "rake": 0.0, "motion": "ramp"}
-    with pytest.raises(UserError, match="1 to 250"):
-        excavation_case(251)
-
-
 def test_wheel_runs_say_their_gravity_friction_and_load(tmp_path):
     # A wheel is predicted there (type 0); a force against its motion is positive there, a drawbar pull negative.
     frames = [[[0.38, 0.31, 0.195], [1.0, 2.0, 3.0]]] * 3
     context = [[1.62, 37.0, 164.0]] * 3
     write(tmp_path, [record(frames, [0, 6], [[-14, 41, -0.6]] * 3, context)], [44])
-    (run,) = read_published(tmp_path, (0.40, 0.19, 0.0583))
+    (run,) = read_published(tmp_path)
     np.testing.assert_allclose(run.body_points[0, 0], [0.12, 0.095, 0.1517], atol=1e-6)
     np.testing.assert_allclose(run.force[0], [14, -0.6, 41], atol=1e-6)
     np.testing.assert_allclose(run.context, [[1.62, 37.0, 164.0]] * 2, rtol=1e-6)
@@ -57,20 +48,24 @@ def test_wheel_runs_say_their_gravity_friction_and_load(tmp_path):
     assert [case[key] for key in ("gravity", "friction_angle", "load")] == [1.62, 37.0, 164.0]
 
 
-def test_wheel_case_numbers():
-    assert wheel_case(1) == pytest.approx(
-        {
-            "gravity": 1.62,
-            "slip": 0.2,
-            "load": 100 / 9,
-            "diameter": 0.05,
-            "friction_angle": 30.0,
-            "width": 0.25 / 3,
-        }
-    )
-    assert wheel_case(203)["diameter"] == 0.15
+@pytest.mark.parametrize(
+    ("values_of", "case", "values"),
+    [
+        (excavation_case, 186, (0.08, 0.10, 10.0, "curved")),
+        (excavation_case, 1, (0.02, 0.01, 0.0, "ramp")),
+        (wheel_case, 1, (1.62, 0.2, 100 / 9, 0.05, 30.0, 0.25 / 3)),
+        (wheel_case, 203, (9.81, 5 / 13, 164.0, 0.15, 37.0, 0.25 / 3)),
+        (wheel_case, 243, (9.81, 0.7, 225.0, 0.30, 43.0, 0.125)),
+    ],
+)
+def test_case_numbers(values_of, case, values):
+    assert tuple(values_of(case).values()) == values
+
+
+def test_a_wheel_of_a_case_and_cases_that_are_not_there():
     assert 1e3 * Wheel(**wheel_case(203)).speed == pytest.approx(12.0)
-    assert wheel_case(243)["width"] == 0.125
+    with pytest.raises(UserError, match="1 to 250"):
+        excavation_case(251)
     with pytest.raises(UserError, match="1 to 243"):
         wheel_case(0)
 
@@ -84,19 +79,14 @@ def test_what_is_not_published_data_is_refused(tmp_path, damage):
     if damage == "short":
         (tmp_path / "valid.tfrecord").write_bytes((tmp_path / "valid.tfrecord").read_bytes()[:-9])
     with pytest.raises(UserError):
-        read_published(tmp_path, BIN)
+        read_published(tmp_path)
 
 
 def blade(case, frames=8, points=15):
     """A record of a blade that moves on, with two modes, and its case."""
     rng = np.random.default_rng(case)
-    rows, columns = points // 5, 5
-    grid = np.stack(
-        np.meshgrid(np.linspace(0, 0.2, rows), np.linspace(-0.2, 0.2, columns), indexing="ij"), -1
-    )
-    plate = np.concatenate([np.full((points, 1), 0.8), grid.reshape(-1, 2)], axis=1) + np.array(
-        [0.0, 0.3, 0.4]
-    )
+    y, z = np.meshgrid(np.linspace(0.3, 0.5, points // 5), np.linspace(0.2, 0.6, 5), indexing="ij")
+    plate = np.stack([np.full(points, 0.8), y.ravel(), z.ravel()], axis=1)
     still = rng.normal(size=(2, 3))
     moved = [np.concatenate([plate - [0.01 * t, 0, 0], still + 0.1 * t]) for t in range(frames)]
     force = rng.normal(size=(frames, 3)) + np.array([50.0, 30.0, 0.0])
@@ -113,9 +103,7 @@ def test_a_folder_becomes_a_dataset(tmp_path):
     assert whole.basis.arrangement_hash == "published-excavation"
     folded = published_dataset(settings | {"folds": 2, "fold": 1}, 2)
     assert [run.name for run in folded.runs("test")] == ["excavation_099", "excavation_078"]
-    assert [name.split()[1] for name in folded.basis.fitted_on] == [
-        fingerprint(r) for r in folded.runs("train")
-    ]
+    assert folded.basis.fitted_on == [f"{run.name} {fingerprint(run)}" for run in folded.runs("train")]
     for run in whole.runs("train"):
         # Whatever the number of points, the pose is the middle of the lowest row, which moves along x.
         np.testing.assert_allclose(run.pose[0, :3], [0.1, 0.3, 0.05], atol=1e-6)
@@ -147,12 +135,9 @@ def test_training_and_judging_from_the_command_line(tmp_path):
     for folder, cases in ((train, [5, 6, 7]), (other, [7, 8, 9])):
         folder.mkdir()
         write(folder, [blade(case) for case in cases], cases)
-    small = [
-        "model.hidden_width=8",
-        "training.max_steps=4",
-        "training.validate_every=4",
-        "reduction.num_modes=2",
-    ]
+    small = (
+        "model.hidden_width=8 training.max_steps=4 training.validate_every=4 reduction.num_modes=2".split()
+    )
     done = sgns(tmp_path, "train", "dataset=published", f"dataset.path={train}", "output=t", *small)
     assert done.returncode == 0, done.stderr
     judge = ["evaluate", "dataset=published", "checkpoint=t/best.ckpt", "output=e"]

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from sgns.config import UserError
@@ -49,22 +49,25 @@ def test_everything_appended_is_read_back(tmp_path):
             np.testing.assert_array_equal(read, np.array([each[key] for each in frames], np.float32))
 
 
+def written(path, m=2, **settings):
+    """A run of one frame, read back."""
+    with make_writer(path, m=m, **settings) as writer:
+        writer.append(**random_frame(0, m=m))
+        writer.finish(0.0)
+    return Run(path)
+
+
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(scene=st.dictionaries(NAMES, PLAIN, max_size=4))
+@example(scene={"path": [[0.1 * i, *range(7)] for i in range(5000)]})  # longer than an HDF5 header
 def test_any_plain_scene_survives(tmp_path, scene):
-    with make_writer(tmp_path / "a.h5", scene=scene) as writer:
-        writer.append(**random_frame(0))
-        writer.finish(0.0)
-    with Run(tmp_path / "a.h5") as run:
+    with written(tmp_path / "a.h5", scene=scene) as run:
         assert run.scene == scene
 
 
 def test_numpy_tuples_and_paths_in_a_scene_become_plain_and_other_things_are_refused(tmp_path):
     scene = {"a": np.float32(0.5), "b": np.arange(3), "c": (1, (2.0,)), "d": Path("x/y"), "e": math.inf}
-    with make_writer(tmp_path / "a.h5", scene=scene) as writer:
-        writer.append(**random_frame(0))
-        writer.finish(0.0)
-    with Run(tmp_path / "a.h5") as run:
+    with written(tmp_path / "a.h5", scene=scene) as run:
         expected = {"a": 0.5, "b": [0, 1, 2], "c": [1, [2.0]], "d": os.path.join("x", "y"), "e": math.inf}
         assert run.scene == expected
     with pytest.raises(TypeError, match="object cannot be stored"):
@@ -72,20 +75,8 @@ def test_numpy_tuples_and_paths_in_a_scene_become_plain_and_other_things_are_ref
     assert [p.name for p in tmp_path.iterdir()] == ["a.h5"]
 
 
-def test_a_scene_longer_than_an_hdf5_header_survives(tmp_path):
-    path = [[0.1 * i, *range(7)] for i in range(5000)]
-    with make_writer(tmp_path / "a.h5", scene={"path": path}) as writer:
-        writer.append(**random_frame(0))
-        writer.finish(0.0)
-    with Run(tmp_path / "a.h5") as run:
-        assert run.scene == {"path": path}
-
-
 def test_a_scene_without_body_points(tmp_path):
-    with make_writer(tmp_path / "a.h5", m=0) as writer:
-        writer.append(**random_frame(0, m=0))
-        writer.finish(0.0)
-    with Run(tmp_path / "a.h5") as run:
+    with written(tmp_path / "a.h5", m=0) as run:
         assert run.body_points.shape == (1, 0, 3)
 
 

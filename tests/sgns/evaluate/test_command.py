@@ -14,7 +14,6 @@ from torch.utils.tensorboard import SummaryWriter
 from mpm_warp.poses import in_body_frame, in_world_frame
 from sgns.config import UserError
 from sgns.data.check import check_run
-from sgns.data.layout import write_text
 from sgns.data.run import Run
 from sgns.evaluate import command as evaluate_module
 from sgns.evaluate.command import full_basis, single_thread, training_means
@@ -194,7 +193,7 @@ def test_what_cannot_be_evaluated_is_refused_before_anything_is_rolled_out(datas
         path = make_run(tmp_path / f"{name}.h5", frames=20, n=120, **kw)
         if scene is not None:
             with h5py.File(path, "r+") as file:
-                write_text(file, "scene", json.dumps(scene))
+                file.attrs["scene"] = json.dumps(scene)
         return path
 
     foreign, slow = run("foreign", arrangement_hash="other"), run("slow", frame_rate=30.0)

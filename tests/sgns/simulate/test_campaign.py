@@ -16,6 +16,7 @@ from sgns.simulate import campaign as cost
 from sgns.simulate.campaign import duration_words, finishing_time, plan, require_space, run_cost, size_words
 from sgns.simulate.run import simulate_scene
 from sgns_testing.campaigns import BASE, EFFECTS, campaign
+from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
 # --- What runs cost: counted, scheduled, and said in words ----------------------------------------------
 
@@ -57,50 +58,45 @@ def test_a_disk_that_is_too_full_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("seconds", "words"),
+    ("say", "value", "words"),
     [
-        (0.0, "1 s"),
-        (99.0, "99 s"),
-        (100.0, "2 min"),
-        (5990.0, "1 h 40 min"),
-        (12000.0, "3 h 20 min"),
-        (2e5, "2 d 8 h"),
+        (duration_words, 0.0, "1 s"),
+        (duration_words, 99.0, "99 s"),
+        (duration_words, 100.0, "2 min"),
+        (duration_words, 5990.0, "1 h 40 min"),
+        (duration_words, 12000.0, "3 h 20 min"),
+        (duration_words, 2e5, "2 d 8 h"),
+        (size_words, 100, "0.1 kB"),
+        (size_words, 56_300_000, "56 MB"),
+        (size_words, 999_600_000, "1.0 GB"),
+        (size_words, 3e12, "3.0 TB"),
+        (size_words, 3e15, "3000 TB"),
     ],
 )
-def test_durations(seconds, words):
-    assert duration_words(seconds) == words
-
-
-@pytest.mark.parametrize(
-    ("size", "words"),
-    [(100, "0.1 kB"), (56_300_000, "56 MB"), (999_600_000, "1.0 GB"), (3e12, "3.0 TB"), (3e15, "3000 TB")],
-)
-def test_sizes(size, words):
-    assert size_words(size) == words
+def test_durations_and_sizes(say, value, words):
+    assert say(value) == words
 
 
 # --- Campaigns and datasets: what is drawn, how it is split, what is on disk ----------------------------
 
 
-def test_runs_are_different_scenes_of_the_grid(tmp_path):
-    scenes = list(campaign(tmp_path).scenes.values())
-    drawn = {(s.rake, s.depth, s.blade.friction) for s in scenes}
+def test_runs_are_different_scenes_of_the_grid_and_each_in_one_split(tmp_path):
+    c = campaign(tmp_path)
+    drawn = {(s.rake, s.depth, s.blade.friction) for s in c.scenes.values()}
     assert len(drawn) == 10
     assert {d for _, d, _ in drawn} <= {0.02, 0.04, 0.05}
-    assert len({s.arrangement_hash for s in scenes}) == 1
+    assert len({s.arrangement_hash for s in c.scenes.values()}) == 1
+    assert [list(c.split.values()).count(s) for s in SPLITS] == [8, 1, 1]
+    assert list(campaign(tmp_path, split=[0.9, 0.0, 0.1]).split.values()).count("validation") == 0
+    assert len(campaign(tmp_path, runs=None).scenes) == 12  # all combinations when no number is given
+    name, scene = next(iter(c.scenes.items()))
+    assert Scene.from_dict(c.describe()["scenes"][name]) == scene
 
 
 def test_seed_decides_draw_and_split(tmp_path):
     one, two, other = campaign(tmp_path), campaign(tmp_path), campaign(tmp_path, seed=1)
     assert one == two
     assert (list(one.scenes), one.split) != (list(other.scenes), other.split)
-
-
-def test_every_run_is_in_one_split(tmp_path):
-    c = campaign(tmp_path)
-    counts = [list(c.split.values()).count(s) for s in SPLITS]
-    assert counts == [8, 1, 1]
-    assert list(campaign(tmp_path, split=[0.9, 0.0, 0.1]).split.values()).count("validation") == 0
 
 
 def test_several_grids_are_joined(tmp_path):
@@ -112,10 +108,6 @@ def test_several_grids_are_joined(tmp_path):
     assert sorted((s.motion, s.depth, s.speed) for s in scenes) == [
         ("curved", 0.02, 0.1), ("curved", 0.04, 0.1), ("ramp", 0.02, 0.1), ("ramp", 0.02, 0.2)
     ]  # fmt: skip
-
-
-def test_all_combinations_when_no_number_is_given(tmp_path):
-    assert len(campaign(tmp_path, runs=None).scenes) == 12
 
 
 @pytest.mark.parametrize(
@@ -186,22 +178,20 @@ def test_a_dataset_file_with_odd_effects_is_another_dataset(tmp_path, effects):
         c.record()
 
 
-def test_scenes_are_recorded_completely(tmp_path):
-    c = campaign(tmp_path)
-    name, scene = next(iter(c.scenes.items()))
-    assert Scene.from_dict(c.describe()["scenes"][name]) == scene
-
-
-@pytest.mark.parametrize("text", ["split: [", "- 1", "!!python/object/apply:os.system [ls]"])
-def test_a_foreign_dataset_file_is_refused(tmp_path, text):
-    (tmp_path / "dataset.yaml").write_text(text)
-    with pytest.raises(UserError):
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "sgns simulate dataset="),
+        ("split: [", "cannot read"),
+        ("- 1", "has no split"),
+        ("!!python/object/apply:os.system [ls]", "cannot read"),
+    ],
+)
+def test_what_is_no_dataset_is_refused(tmp_path, text, words):
+    if text is not None:
+        (tmp_path / "dataset.yaml").write_text(text)
+    with pytest.raises(UserError, match=words):
         Dataset.open(tmp_path)
-
-
-def test_no_dataset(tmp_path):
-    with pytest.raises(UserError, match="sgns simulate dataset="):
-        Dataset.open(tmp_path / "nothing")
 
 
 def test_where_picks_runs_by_their_scene(tmp_path) -> None:
@@ -227,8 +217,6 @@ def test_where_picks_runs_by_their_scene(tmp_path) -> None:
 
 
 def test_every_scene_reads_the_mesh_that_the_settings_name(tmp_path):
-    from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
-
     sizes = {"one": (0.08, 0.09, 0.10), "two": (0.08, 0.09, 0.11)}
     files = [
         str(write_obj(tmp_path / f"{name}.obj", box_corners(size), BOX_FACES)) for name, size in sizes.items()

@@ -18,7 +18,7 @@ from sgns.data.run import Run
 from sgns.simulate import command as simulate
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.run import scene_stages, simulate_scene
-from sgns_testing.campaigns import campaign
+from sgns_testing.campaigns import campaign, job
 from sgns_testing.commands import SHORT, refusal, sgns
 
 
@@ -124,9 +124,7 @@ def test_a_campaign_refuses_a_pipe_before_the_first_frame(tmp_path, monkeypatch)
     monkeypatch.setattr(campaign_runs, "_frames_done", [0])
     scene, place = Excavation(bed=Bed(size=(0.8, 0.6, 0.16), spacing=0.04)), tmp_path / "a.h5"
     os.mkfifo(place)
-    described = scene.to_dict(), None
-    task = campaign_runs._make(0, described, place, Effects(), Effects().described(), 0, "cpu", "float32")
-    ((_, (kind, words)),) = run_concurrently([task], 1, "cpu")
+    ((_, (kind, words)),) = run_concurrently([campaign_runs._make(job(scene, place))], 1, "cpu")
     assert kind == "failed" and "it is a pipe" in words
     assert campaign_runs._frames_done == [0]
     assert place.is_fifo()

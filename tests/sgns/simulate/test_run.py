@@ -27,10 +27,12 @@ from mpm_warp import mesh as mesh_file
 from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
 from sgns.data.check import check_run
-from sgns.data.run import Run, read_state, stopped_path
+from sgns.data.run import Run
+from sgns.data.writer import stopped_path
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.run import restart_from, simulate_scene
 from sgns.simulate.scene import recorded
+from sgns_testing.campaigns import job
 from sgns_testing.commands import SHORT, refusal, sgns
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
@@ -50,6 +52,13 @@ def physics() -> dict[str, Any]:
     """Effects and the record of them as `sgns simulate` decides."""
     effects, decisions = effects_for(small())
     return {"effects": effects, "reasons": recorded(decisions)}
+
+
+def restarted(kept, *overrides):
+    """The restart of `sgns simulate continue_from=<kept> <overrides>`."""
+    cfg = {"continue_from": str(kept), "solver": {"precision": "float32"}}
+    found = OmegaConf.merge(cfg, OmegaConf.from_dotlist([o.lstrip("+") for o in overrides]))
+    return restart_from(found, overrides)
 
 
 @pytest.fixture
@@ -86,15 +95,11 @@ def test_the_frames_before_are_kept(stopped):
         assert run.frame_count == LAST + 1
         assert "particle 51 at (" in run.stopped  # 11 of the half that is computed
         assert run.positions(0)[0].shape == (len(small().stored), 3)
+        assert run.state.frame == LAST
     (problem,) = check_run(kept)
     assert problem.startswith("the run stopped after 4 good frames: particle 51 at (")
-    assert read_state(kept).frame == LAST
-
-
-def test_check_names_it(stopped):
-    done = sgns(stopped[0].parent, "check", ".")
-    assert done.returncode == 2
-    assert "run.stopped.h5: the run stopped after 4 good frames" in done.stdout
+    done = sgns(kept.parent, "check", ".")
+    assert done.returncode == 2 and f"run.stopped.h5: {problem}" in done.stdout
 
 
 def test_going_on_with_half_the_step(stopped):
@@ -130,10 +135,7 @@ def test_it_may_stop_again(stopped, monkeypatch):
     kept, output = stopped
     with Run(kept) as run:
         first = run.wall_time_s
-    cfg = OmegaConf.create(
-        {"continue_from": str(kept), "scene": {"courant": 0.3}, "solver": {"precision": "float32"}}
-    )
-    restart = restart_from(cfg, ["scene.courant=0.3", f"output={output}"])
+    restart = restarted(kept, "scene.courant=0.3", f"output={output}")
 
     def check(self, index):
         if index == LAST + 2:
@@ -147,10 +149,9 @@ def test_it_may_stop_again(stopped, monkeypatch):
         assert "stops it again" in run.stopped
         assert run.extra["continued"] == [{"frame": LAST, "changed": {"courant": 0.3}}]
         took = run.wall_time_s
+        assert run.state.frame == LAST + 1
     assert took > first  # the frames before the first stop included
-    assert read_state(kept).frame == LAST + 1
-    cfg.scene = {"bed": {"headroom": 0.5}}
-    third = restart_from(cfg, ["scene.bed.headroom=0.5"])
+    third = restarted(kept, "scene.bed.headroom=0.5")
     assert third.changes == {"courant": 0.3, "bed.headroom": 0.5}  # those of before as well
     assert third.changed_scene.courant == 0.3 and third.wall_time == took
 
@@ -158,10 +159,7 @@ def test_it_may_stop_again(stopped, monkeypatch):
 def test_a_campaign_says_where_its_run_is_kept(stops, tmp_path, monkeypatch):
     monkeypatch.setattr(campaign_runs, "_frames_done", [0])
     output = tmp_path / "runs" / "1.h5"
-    task = campaign_runs._make(
-        0, (small().to_dict(), None), output, Effects(), Effects().described(), 0, "cpu", "float32"
-    )
-    ((_, (kind, words)),) = run_concurrently([task], 1, "cpu")
+    ((_, (kind, words)),) = run_concurrently([campaign_runs._make(job(small(), output))], 1, "cpu")
     assert kind == "failed"
     assert f"continue_from={stopped_path(output)}" in words
     assert check_run(stopped_path(output))[0].startswith("the run stopped after 4 good frames")
@@ -193,19 +191,20 @@ def test_what_cannot_be_gone_on_with(tmp_path, stopped):
     with h5py.File(kept, "r+") as file:
         del file["state/position"]
         file["state/position"] = "text"
-    with pytest.raises(UserError, match="does not hold numbers"):
-        read_state(kept)
+    with Run(kept) as run, pytest.raises(UserError, match="does not hold numbers"):
+        _ = run.state
     with h5py.File(kept, "r+") as file:
         del file["state"]
-    with pytest.raises(UserError, match="holds no state to go on from"):
-        read_state(kept)
+    with Run(kept) as run, pytest.raises(UserError, match="holds no state to go on from"):
+        _ = run.state
 
 
 def test_a_bed_without_a_body_can_go_on(stops, tmp_path):
     scene = Scene(bed=Bed(size=(0.2, 0.2, 0.1), spacing=0.04), duration=0.1)
     with pytest.raises(SolverStopped, match="continue_from="):
         simulate_scene(scene, tmp_path / "bed.h5", effects=Effects())
-    assert read_state(tmp_path / "bed.stopped.h5").frame == LAST
+    with Run(tmp_path / "bed.stopped.h5") as run:
+        assert run.state.frame == LAST
 
 
 def pushed(file) -> Push:
@@ -225,12 +224,6 @@ def stopped_mesh(stops, tmp_path):
     return tmp_path / "run.stopped.h5", content
 
 
-def asked(kept, *overrides):
-    cfg = {"continue_from": str(kept), "scene": {"courant": 0.3}, "solver": {"precision": "float32"}}
-    found = OmegaConf.merge(cfg, OmegaConf.from_dotlist([o.lstrip("+") for o in overrides]))
-    return restart_from(found, ["scene.courant=0.3", *overrides])
-
-
 def test_a_run_brings_its_mesh(stopped_mesh, tmp_path, monkeypatch):
     """Whatever lies where the run says that the mesh was, it is not looked at."""
     kept, _ = stopped_mesh
@@ -242,8 +235,8 @@ def test_a_run_brings_its_mesh(stopped_mesh, tmp_path, monkeypatch):
     monkeypatch.setattr(bodies, "read_bytes", never)
     monkeypatch.setattr(mesh_file, "read_bytes", never)
     with pytest.raises(UserError, match=r"brings its own tool; leave out scene\.tool\.file"):
-        asked(kept, "+scene.tool.file=box.obj")
-    restart = asked(kept)
+        restarted(kept, "+scene.tool.file=box.obj")
+    restart = restarted(kept, "scene.courant=0.3")
     simulate_scene(restart.scene, tmp_path / "run.h5", effects=restart.effects, restart=restart)
     assert check_run(tmp_path / "run.h5") == []
     with Run(tmp_path / "run.h5") as run:
@@ -257,7 +250,7 @@ def test_a_run_without_its_mesh_is_refused(stopped_mesh, tmp_path):
         del file["parameters"]
     (tmp_path / "box.obj").write_text(content)  # where the run says it was
     with pytest.raises(UserError, match="does not hold the mesh of its tool; repeat the run"):
-        asked(kept)
+        restarted(kept)
 
 
 def test_a_run_cannot_ask_for_a_file(stopped_mesh):
@@ -269,4 +262,4 @@ def test_a_run_cannot_ask_for_a_file(stopped_mesh):
         del file["parameters"]
         file.attrs["scene"] = yaml.safe_dump(scene)
     with pytest.raises(UserError, match="without the digest"):
-        asked(kept)
+        restarted(kept)

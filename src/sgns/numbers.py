@@ -1,4 +1,4 @@
-"""Arrays that a person or a file gives: their kind, shape and numbers."""
+"""Numbers that a file, a person or a clock gives: refused in one line, or good to calculate with."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from sgns.config import UserError
 
-# --- Whether arrays that were read from a file fit together ---------------------------------------------
+# --- From a file: whether arrays fit together -----------------------------------------------------------
 
 
 def require_shapes(
@@ -35,18 +35,20 @@ def require_shapes(
         if found.dtype.kind != "f":
             raise ValueError(f"{name} does not hold floating-point numbers")
         wanted = tuple(known.get(size, size) if isinstance(size, str) else size for size in shape)
-        fits = len(found.shape) == len(wanted) and all(
-            actual > 0 if isinstance(size, str) else actual == size
-            for size, actual in zip(wanted, found.shape, strict=True)
-        )
-        if not fits:
+        if not _fits(found.shape, wanted):
             raise ValueError(f"{name} has shape {found.shape}, expected ({', '.join(map(str, wanted))})")
-        for size, actual in zip(shape, found.shape, strict=True):
-            if isinstance(size, str):
-                known[size] = actual
+        known |= {size: n for size, n in zip(shape, found.shape, strict=True) if isinstance(size, str)}
 
 
-# --- What a person gives in Python: what is none of the kind that is needed is refused in one line ------
+def _fits(shape: Sequence[int], wanted: Sequence[int | str]) -> bool:
+    """Whether an array has the wanted shape, in which a letter or word stands for any size but 0."""
+    return len(shape) == len(wanted) and all(
+        size > 0 if isinstance(asked, str) else size == asked
+        for size, asked in zip(shape, wanted, strict=True)
+    )
+
+
+# --- From a person in Python ----------------------------------------------------------------------------
 
 
 def is_whole(value: Any) -> bool:
@@ -55,10 +57,10 @@ def is_whole(value: Any) -> bool:
 
 
 def real_array(values: Any, what: str, needs: str) -> np.ndarray:
-    """A float64 copy of real numbers.
+    """A float64 copy of real numbers: an array, a list, a tensor on the CPU.
 
     Args:
-        values: An array, a list, a tensor on the CPU.
+        values: The numbers.
         what: How to call them in an error.
         needs: What is allowed, for an error.
 
@@ -84,31 +86,24 @@ def finite_array(values: Any, what: str, shape: Sequence[int | str]) -> np.ndarr
     """
     needs = f"shape ({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
     found = real_array(values, what, needs)
-    fits = len(found.shape) == len(shape) and all(
-        size > 0 if isinstance(wanted, str) else size == wanted
-        for size, wanted in zip(found.shape, shape, strict=True)
-    )
-    if not fits:
+    if not _fits(found.shape, shape):
         raise UserError(f"the {what} has shape {found.shape}; it needs {needs}")
     if not np.isfinite(found).all():
         raise UserError(f"the {what} holds values that are not finite; every value must be")
     return found
 
 
-# --- Poses that a person gives ------------------------------------------------------------------------------
-
-
-def check_pose(pose: np.ndarray, what: str = "tool pose") -> np.ndarray:
+def check_pose(pose: Any, what: str = "tool pose") -> np.ndarray:
     """As `check_poses`, of one pose, shape (7,); several are refused, too."""
-    return require_poses(pose_rows(pose, what, "x, y, z, qx, qy, qz, qw, shape (7,)", 1), what, "")[0]
+    return _unit_poses(_pose_rows(pose, what, "x, y, z, qx, qy, qz, qw, shape (7,)", 1), what, "")[0]
 
 
-def first_pose(poses: np.ndarray, what: str = "first pose") -> np.ndarray:
+def first_pose(poses: Any, what: str = "first pose") -> np.ndarray:
     """As `check_pose`, of a pose (7,) or of the first of some (T, 7), the others not looked at."""
-    return require_poses(pose_rows(poses, what)[:1], what, "")[0]
+    return _unit_poses(_pose_rows(poses, what)[:1], what, "")[0]
 
 
-def check_poses(poses: np.ndarray, what: str = "tool path") -> np.ndarray:
+def check_poses(poses: Any, what: str = "tool path") -> np.ndarray:
     """A float64 copy (T, 7) of poses, centre of mass [m] and quaternion x, y, z, w, shape (T, 7) or (7,), with exactly
     unit quaternions.
 
@@ -116,20 +111,20 @@ def check_poses(poses: np.ndarray, what: str = "tool path") -> np.ndarray:
         UserError: No real numbers, wrong shape, a value that is not finite, or a quaternion off unit length by more
             than 1e-3.
     """
-    return require_poses(pose_rows(poses, what), what)
+    return _unit_poses(_pose_rows(poses, what), what)
 
 
-def pose_rows(
-    poses: np.ndarray, what: str, needs: str = "rows x, y, z, qx, qy, qz, qw, shape (T, 7)", most: int = 2
+def _pose_rows(
+    poses: Any, what: str, needs: str = "rows x, y, z, qx, qy, qz, qw, shape (T, 7)", most_axes: int = 2
 ) -> np.ndarray:
-    """A float64 copy of what has the shape of poses, (T, 7) or (7,), of at most so many axes; shape (T, 7)."""
-    poses = real_array(poses, what, needs)
-    if not 1 <= poses.ndim <= most or poses.shape[-1] != 7 or len(poses) == 0:
-        raise UserError(f"the {what} has shape {poses.shape}; it needs {needs}")
-    return np.atleast_2d(poses)
+    """A float64 copy of what has the shape of poses, (T, 7) or (7,), as (T, 7)."""
+    found = real_array(poses, what, needs)
+    if not 1 <= found.ndim <= most_axes or found.shape[-1] != 7 or len(found) == 0:
+        raise UserError(f"the {what} has shape {found.shape}; it needs {needs}")
+    return np.atleast_2d(found)
 
 
-def require_poses(poses: np.ndarray, what: str, where: str = " at frame {}") -> np.ndarray:
+def _unit_poses(poses: np.ndarray, what: str, where: str = " at frame {}") -> np.ndarray:
     """Poses (T, 7), whose quaternions are made exactly unit in place, or a UserError that says where they are none."""
     bad = ~np.isfinite(poses).all(axis=1)
     if bad.any():
@@ -148,3 +143,17 @@ def require_poses(poses: np.ndarray, what: str, where: str = " at frame {}") -> 
         )
     poses[:, 3:] /= length[:, None]
     return poses
+
+
+# --- From a clock ---------------------------------------------------------------------------------------
+
+LEAST_TIME = 1.0e-9
+"""[s]; the clocks count in such steps."""
+
+
+def elapsed(began: float, now: float) -> float:
+    """Time between two readings of a clock [s], above 0, so that one may divide by it.
+
+    The clock of a virtual machine that was paused may stand still or go back.
+    """
+    return max(now - began, LEAST_TIME)
