@@ -27,8 +27,8 @@ from sgns.data.files import only_here, require_replaceable
 from sgns.data.run import Run
 from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory, provenance
 from sgns.evaluate.figures import VALIDATION
-from sgns.evaluate.metrics import body_errors, is_wheel, mean_prediction, position_errors, surface_grid
-from sgns.evaluate.report import write_report
+from sgns.evaluate.metrics import body_errors, mean_prediction, position_errors, surface_grid
+from sgns.evaluate.report import describe, forward_name, seen_warning, short_names, write_report
 from sgns.evaluate.results import (
     EvaluatedRun,
     Evaluation,
@@ -38,7 +38,7 @@ from sgns.evaluate.results import (
     seen_before,
     write_tables,
 )
-from sgns.evaluate.words import describe, forward_name, seen_warning, short_names
+from sgns.model.features import is_wheel
 from sgns.numbers import elapsed
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout

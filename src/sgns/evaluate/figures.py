@@ -29,8 +29,8 @@ from sgns.evaluate.metrics import (
     SurfaceGrid,
     forward_force,
     height_map,
-    is_wheel,
 )
+from sgns.model.features import is_wheel
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType

@@ -12,13 +12,9 @@ from numpy.typing import ArrayLike
 
 from sgns.config import UserError
 from sgns.data.run import frame_chunks
+from sgns.model.features import is_wheel
 
 # --- The body of a recorded scene -----------------------------------------------------------------------
-
-
-def is_wheel(scene: Mapping[str, Any]) -> bool:
-    """Whether the body is a wheel, the only one whose height the soil decides (`mpm_warp.Scene.axle`)."""
-    return scene.get("kind") == "wheel"
 
 
 def forward_force(scene: Mapping[str, Any]) -> tuple[str, float]:

@@ -31,8 +31,8 @@ from sgns.evaluate.figures import (
     new_figure,
     styled,
 )
-from sgns.evaluate.metrics import is_wheel, particle_spacing
-from sgns.model.features import distance, markers
+from sgns.evaluate.metrics import particle_spacing
+from sgns.model.features import distance, is_wheel, markers
 from sgns.reduction.basis import Basis
 
 STEEL = "#4d5a66"

@@ -152,9 +152,14 @@ def free_axes(predicted: bool, body_nodes: str) -> Tensor:
     return torch.tensor([0.0, 0.0, 1.0] if body_nodes == "pose" else [1.0, 1.0, 1.0], dtype=torch.float64)
 
 
+def is_wheel(scene: Mapping[str, Any]) -> bool:
+    """Whether the body is a wheel, the only one whose height the soil decides (`mpm_warp.Scene.axle`)."""
+    return scene.get("kind") == "wheel"
+
+
 def moves_freely(runs: Sequence[ReducedRun]) -> bool:
     """Whether the body moves as the soil lets it, which only a wheel's axle does; refuses a mixture."""
-    free = {run.scene.get("kind") == "wheel" for run in runs}
+    free = {is_wheel(run.scene) for run in runs}
     if len(free) > 1:
         raise UserError(
             "the training runs mix wheels, whose height is predicted, with bodies whose motion is prescribed; keep one "

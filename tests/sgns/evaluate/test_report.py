@@ -10,7 +10,16 @@ import pytest
 import torch
 
 from sgns.evaluate.metrics import ParticleErrors, PositionErrors, VectorErrors
-from sgns.evaluate.report import FigureGroup, ReportFigure, file_name, render_report
+from sgns.evaluate.report import (
+    FigureGroup,
+    ReportFigure,
+    describe,
+    file_name,
+    fixed,
+    number,
+    render_report,
+    short_names,
+)
 from sgns.evaluate.results import (
     Costs,
     EvaluatedRun,
@@ -20,7 +29,6 @@ from sgns.evaluate.results import (
     Scores,
     aggregate,
 )
-from sgns.evaluate.words import describe, fixed, number, short_names
 from sgns.reduction.basis import Basis, ReductionCurves
 
 EVIL = '<script>alert("run&1")</script>'

@@ -10,7 +10,7 @@ from mpm_warp.scenes import Wheel, sinkage
 from sgns.data.run import Run
 from sgns.evaluate import figures
 from sgns.evaluate.depth_buffer import CAMERA, DepthBuffer, project
-from sgns.evaluate.metrics import forward_force, is_wheel
+from sgns.evaluate.metrics import forward_force
 from sgns.evaluate.views import (
     body_corners,
     body_outline,
@@ -26,6 +26,7 @@ from sgns.evaluate.views import (
     upper_scale,
     view_times,
 )
+from sgns.model.features import is_wheel
 from sgns_testing.pictures import pixels
 from sgns_testing.runs import PLATE, make_run, start_positions
 from sgns_testing.surrogates import fitted

@@ -23,7 +23,7 @@ from mpm_warp import (
     bodies,
     effects_for,
 )
-from mpm_warp import mesh as mesh_file
+from mpm_warp import bodies as mesh_file
 from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
 from sgns.data.check import check_run
