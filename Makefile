@@ -46,8 +46,8 @@ frontier: setup ## what accuracy costs in time: the quick study, 9 minutes on tw
 	learned=$$?; wait $$solver && exit $$learned
 	$(BIN)/sgns frontier study=quick axis=none
 
-test: setup ## run the tests
-	$(BIN)/python -m pytest
+test: setup ## run the tests, in two processes: 5 minutes on two cores
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 stability: setup ## hard cases, kills, full disks and random input (most of an hour of one core; the hard cases go on where they stopped)
 	$(BIN)/python experiments/stability/run.py --workers $(WORKERS)

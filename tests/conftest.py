@@ -12,6 +12,7 @@ import torch
 if TYPE_CHECKING:
     from sgns.reduction.reduce import ReducedDataset
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of child processes, as below
 os.environ.setdefault("MPLBACKEND", "Agg")  # figures without a screen, in child processes too
 torch.set_num_threads(1)  # the tests' networks are so small that more threads only wait for each other
 

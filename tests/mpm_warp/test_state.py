@@ -123,14 +123,6 @@ def test_strains_that_soil_cannot_have(volume, shear, courant, words):
         assert words in found[1]
 
 
-def test_a_body_that_jumps_stops_the_solver():
-    rows = [(0.0, 0.104), (0.05, 0.104), (0.0501, 0.2), (1.0, 0.2)]
-    path = tuple((t, x, 0.2, 0.1, 0, 0, 0, 1) for t, x in rows)
-    solver = Solver(cut(motion="path", path=path, duration=0.1))
-    with pytest.raises(SolverStopped, match=r"the body jumps by 0\.\d+ m from \(0\.10"):
-        list(solver.frames())
-
-
 def test_a_state_of_another_scene_is_refused():
     assert Solver(cut()).state() is None
     solver = Solver(cut(duration=0.1))
