@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
-"""Draw which file imports which, of one or more trees: python .ci/house.py out.png TITLE=TREE [TITLE=TREE ...]
+"""Draw which file imports which, of one or more trees, and count lines: python .ci/house.py out.png TITLE=TREE [...]
 
 A file stands above all that it imports. Grey lines are imports; what the commands `simulate` and `train` reach is counted.
+Printed is a table of the lines of each folder of the last tree: code, docstrings, comments, blank.
 """
 
 from __future__ import annotations
@@ -103,12 +104,45 @@ def draw(axes: plt.Axes, title: str, tree: Path) -> None:
     axes.set_xticks([column + 0.5 for column in range(len(groups))], groups, rotation=35, ha="right", fontsize=8)
 
 
+def kinds_of_lines(path: Path) -> list[int]:
+    """Lines of code, docstrings, comments, blank lines."""
+    text = path.read_text(encoding="utf-8")
+    kinds = ["blank" if not line.strip() else "comment" if line.lstrip().startswith("#") else "code"
+             for line in text.splitlines()]
+    for node in ast.walk(ast.parse(text)):
+        body = getattr(node, "body", None)
+        first = body[0] if isinstance(body, list) and body else None
+        if isinstance(first, ast.Expr) and isinstance(getattr(first.value, "value", None), str):
+            kinds[first.lineno - 1 : first.end_lineno] = ["doc"] * (first.end_lineno - first.lineno + 1)
+    return [kinds.count(kind) for kind in ("code", "doc", "comment", "blank")]
+
+
+def table(tree: Path) -> str:
+    """Lines of every folder, in Markdown."""
+    rows: dict[str, list[int]] = {}
+    for path in sorted(tree.rglob("*.py")):
+        folder = path.relative_to(tree).parent
+        if folder.parts and (folder.parts[0][0] == "." or folder.parts[0] in ("build", "data", "outputs")):
+            continue
+        depth = 3 if folder.parts[:1] == ("src",) else 2 if folder.parts[:1] == ("mpm_warp",) else 1
+        row = rows.setdefault("/".join(folder.parts[:depth]) or ".", [0] * 5)
+        for i, count in enumerate([1, *kinds_of_lines(path)]):
+            row[i] += count
+    lines = ["| folder | files | code | docstrings | comments | blank | all |", "|---|---|---|---|---|---|---|"]
+    for name, row in sorted(rows.items()):
+        lines.append(f"| `{name}` | {' | '.join(map(str, [*row, sum(row[1:])]))} |")
+    total = [sum(column) for column in zip(*rows.values(), strict=True)]
+    lines.append(f"| all | {' | '.join(map(str, [*total, sum(total[1:])]))} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     out, *trees = sys.argv[1:]
     figure, axes = plt.subplots(1, len(trees), figsize=(7 * len(trees), 6), squeeze=False, layout="constrained")
     for ax, one in zip(axes[0], trees, strict=True):
         draw(ax, *(part if i == 0 else Path(part) for i, part in enumerate(one.split("=", 1))))
     figure.savefig(out, dpi=80)
+    print(table(Path(trees[-1].split("=", 1)[1])))
 
 
 if __name__ == "__main__":
