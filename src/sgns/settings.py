@@ -21,7 +21,8 @@ class Group(Settings):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a checkpoint."""
-        return asdict(self)  # type: ignore[call-overload]  # every group is a dataclass
+        values = asdict(self)  # type: ignore[call-overload]  # every group is a dataclass
+        return {key: values[key] for key in ("kind",) if key in values} | values  # the kind first
 
 
 # --- conf/dataset ---------------------------------------------------------------------------------------
