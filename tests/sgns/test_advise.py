@@ -85,14 +85,8 @@ def test_surrogates_can_be_judged_against_their_training_runs() -> None:
     ("overrides", "line"),
     [
         ([], "nothing is asked for"),
-        (["error.force=-1"], "error.force is -1.0; it must be a number above 0"),
-        (["time=fast"], "time is 'fast'"),
         (["task=moon", "time=1"], "task is 'moon'; the table has cut"),
-        (["against=me", "time=1"], "against is 'me'; allowed: reference, training"),
-        (["particles=3", "time=1"], "particles is 3"),
         (["error.sinkage=0.001"], "has all the numbers asked for"),
-        (["error=0.3"], "error is 0.3; it must be a group of keys"),
-        (["+error.torque=1"], "error has no key 'torque'"),
     ],
 )
 def test_bad_input_gives_one_line(overrides: list[str], line: str) -> None:

@@ -70,18 +70,6 @@ def test_a_wheel_of_a_case_and_cases_that_are_not_there():
         wheel_case(0)
 
 
-@pytest.mark.parametrize("damage", ["missing", "short", "foreign", "count"])
-def test_what_is_not_published_data_is_refused(tmp_path, damage):
-    good = record([[[0.0] * 3] * 2] * 3, [3, 6], [[0.0] * 3] * 3)
-    write(tmp_path, [b"not a message" if damage == "foreign" else good], [1, 2] if damage == "count" else [1])
-    if damage == "missing":
-        (tmp_path / "metadata.json").unlink()
-    if damage == "short":
-        (tmp_path / "valid.tfrecord").write_bytes((tmp_path / "valid.tfrecord").read_bytes()[:-9])
-    with pytest.raises(UserError):
-        read_published(tmp_path)
-
-
 def blade(case, frames=8, points=15):
     """A record of a blade that moves on, with two modes, and its case."""
     rng = np.random.default_rng(case)

@@ -75,11 +75,6 @@ def test_numpy_tuples_and_paths_in_a_scene_become_plain_and_other_things_are_ref
     assert [p.name for p in tmp_path.iterdir()] == ["a.h5"]
 
 
-def test_a_scene_without_body_points(tmp_path):
-    with written(tmp_path / "a.h5", m=0) as run:
-        assert run.body_points.shape == (1, 0, 3)
-
-
 def test_content_hash_follows_the_data_and_nothing_else(tmp_path):
     def content(name, **kw):
         with Run(make_run(tmp_path / name, scene={"depth": 0.05, "speed": 0.1, "rake": 5.0}, **kw)) as run:
@@ -160,11 +155,6 @@ def test_vtk_reads_the_soil_in_any_order(tmp_path):
             np.testing.assert_array_equal(vtk_to_numpy(cloud.GetPoints().GetData()), run.positions(i)[0])
             velocity = vtk_to_numpy(cloud.GetPointData().GetArray("velocity"))
             np.testing.assert_array_equal(velocity, run.velocities(i)[0])
-
-
-def test_the_view_for_vtk_costs_no_copy(tmp_path):
-    path = make_run(tmp_path / "a.h5", frames=100, n=500, m=3)
-    assert path.stat().st_size < 1.1 * 100 * 500 * 2 * 3 * 4
 
 
 def test_the_name_appears_only_when_complete_and_the_old_file_stays_until_then(tmp_path):

@@ -164,21 +164,6 @@ def test_missing_and_foreign_files_are_refused(basis, tmp_path):
         Basis.load(saved)
 
 
-def test_a_failed_save_leaves_nothing_behind(basis, tmp_path, monkeypatch):
-    (tmp_path / "basis.h5").write_text("old")
-    with pytest.raises(UserError, match="cannot write"):
-        basis.save(tmp_path / "basis.h5" / "basis.h5")
-
-    def fail(*_):
-        raise OSError("disk full")
-
-    monkeypatch.setattr("os.replace", fail)
-    with pytest.raises(UserError, match="disk full"):
-        basis.save(tmp_path / "basis.h5")
-    assert [p.name for p in tmp_path.iterdir()] == ["basis.h5"]
-    assert (tmp_path / "basis.h5").read_text() == "old"
-
-
 def test_reconstruction_curve_is_the_error_of_projecting(tmp_path):
     dataset = small_dataset(tmp_path)
     basis = fitted(dataset.runs("train"), modes=6)

@@ -315,11 +315,3 @@ def test_wrong_settings_are_named():
         pca.basis("mean")
     with pytest.raises(UserError, match="num_modes is 5; this stream tracked 4"):
         pca.basis(num_modes=5)
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_the_gpu_gives_the_same_basis():
-    x = soil(200, 30).astype(np.float32)
-    gpu = IncrementalPCA(10, 20, device="cuda").partial_fit(x).basis()
-    assert gpu.modes.device.type == "cpu"
-    np.testing.assert_allclose(gpu.modes, fit(x, 10, oversampling=20).basis().modes, atol=1e-8)

@@ -23,7 +23,6 @@ from mpm_warp import (
     bodies,
     effects_for,
 )
-from mpm_warp import bodies as mesh_file
 from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
 from sgns.data.check import check_run
@@ -233,7 +232,6 @@ def test_a_run_brings_its_mesh(stopped_mesh, tmp_path, monkeypatch):
         raise AssertionError("a file is read because a run names it")
 
     monkeypatch.setattr(bodies, "read_bytes", never)
-    monkeypatch.setattr(mesh_file, "read_bytes", never)
     with pytest.raises(UserError, match=r"brings its own tool; leave out scene\.tool\.file"):
         restarted(kept, "+scene.tool.file=box.obj")
     restart = restarted(kept, "scene.courant=0.3")

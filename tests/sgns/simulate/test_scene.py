@@ -15,7 +15,7 @@ from sgns.data.run import Run
 from sgns.rollout import require_same_freedom
 from sgns.simulate.campaign import plan
 from sgns.simulate.command import simulate_campaign
-from sgns.simulate.scene import asked_effects, decided, decision_summary, scene_from_config
+from sgns.simulate.scene import asked_effects, decided, scene_from_config
 from sgns_testing.campaigns import campaign
 from sgns_testing.commands import composed, refusal, sgns
 
@@ -70,12 +70,6 @@ def test_all_physics():
         ({"symmetry": "maybe"}, SceneError, "effects.symmetry is 'maybe'; allowed: auto, true, false"),
         ({"colour": True}, SceneError, "effects has no key 'colour'"),
         ({"tolerance": 3}, SceneError, "effects.tolerance is 3; it must be a group of keys"),
-        (
-            {"tolerance": {"grd": 1.0}},
-            SceneError,
-            "effects.tolerance has no key 'grd'; allowed: friction, grid",
-        ),
-        ({"tolerance": {"grid": -1.0, "reach": 0.1, "friction": 0.1}}, SceneError, "tolerance.grid is -1.0"),
     ],
 )
 def test_settings_it_refuses(tmp_path, asked, error, words):
@@ -119,14 +113,6 @@ def test_what_no_run_can_have_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(SceneError, match=r"effects\.free_body needs a body whose height is free"):
         simulate_campaign(c, device="cpu", workers=1)
     assert not c.path.exists()
-
-
-def test_summary_of_a_dataset():
-    on, off = Decision(True, "it flows"), Decision(False, "it rests")
-    assert decision_summary([{"yielding": on}]) == ["yielding on: it flows"]
-    assert decision_summary([{"yielding": on}, {"yielding": off}]) == [
-        "yielding on in 1 of 2 runs; else off: it rests"
-    ]
 
 
 # --- Wheels and other bodies ------------------------------------------------------------------------------
@@ -195,9 +181,6 @@ def test_a_body_from_the_command_line(tmp_path):
         (["scene=body"], "scene.path=..."),
         (["scene=body", "scene/tool=mesh"], "scene.tool.file=..."),
         (["scene=body", "scene/tool=cone"], "scene/tool=cone: no such option"),
-        (["scene=wheel", "scene.load=heavy"], "scene.load is 'heavy'"),
-        (["scene=wheel", "scene.bilateral=maybe"], "scene.bilateral is 'maybe'; allowed: true, false"),
-        (["scene=wheel", "scene.friction_angle=steep"], "scene.friction_angle is 'steep'"),
         (["scene=wheel", "scene.grousers=3"], "scene.grouser_height is 0.0; it must be above 0 m"),
     ],
 )
