@@ -129,6 +129,7 @@ def test_every_option_of_every_group_composes(command: str) -> None:
         (["train", "output=a~b"], ["'~' needs quotes, as in 'output=\"a~b\"'"]),
         (["train", "output=[a&b]"], ["'&' needs quotes, as in 'output=[\"&\"]'"]),
         (["rollout"], ["missing for checkpoint", "checkpoint=..."]),
+        (["rollout", "checkpoint=null"], ["checkpoint is null"]),
         (["rollout", "checkpoint=best.ckpt", "scene=quick_excavation"], ["no checkpoint at best.ckpt"]),
         (["rollout", "checkpoint=a.ckpt", "solver.precision=float64"], ["solver: no such key"]),
         (["evaluate", "checkpoint=a.ckpt", "dataset=null"], ["a group is null"]),

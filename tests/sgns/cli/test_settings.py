@@ -228,14 +228,7 @@ def test_settings_are_shown(kind, resolve, hostile, capsys, monkeypatch) -> None
 def test_the_launcher_for_several_processes(hostile) -> None:
     if importlib.util.find_spec("hydra_plugins") is None:
         pytest.skip("hydra-joblib-launcher is not installed")
-    command = [
-        sys.executable,
-        "-m",
-        "sgns",
-        "advise",
-        "-m",
-        "hydra/launcher=joblib",
-        "hydra.launcher.n_jobs=2",
-    ]
-    done = subprocess.run([*command, "time=0.01,0.1"], capture_output=True, text=True, timeout=100)
+    launcher = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    command = [sys.executable, "-m", "sgns", "advise", *launcher, "time=0.01,0.1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stderr

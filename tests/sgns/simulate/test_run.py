@@ -169,7 +169,6 @@ def test_a_campaign_says_where_its_run_is_kept(stops, tmp_path, monkeypatch):
     [
         (["scene.depth=0.03"], "leave out scene.depth"),
         (["scene=wheel"], "leave out scene"),
-        (["material.youngs_modulus=1e6"], "leave out material.youngs_modulus"),
         (["scene.courant=2"], "scene.courant is 2"),
         (["dataset=quick"], "leave out dataset="),
     ],

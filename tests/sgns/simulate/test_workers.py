@@ -117,7 +117,7 @@ def test_shards_it_refuses(tmp_path, shard):
 
 def test_a_disk_that_is_too_full_is_refused_before_anything_is_made(tmp_path, order, monkeypatch):
     monkeypatch.setattr("sgns.simulate.campaign.shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
-    with pytest.raises(UserError, match=r"of disk and 1\.0 kB are free"):
+    with pytest.raises(UserError, match=r"of disk and 1\.0 kB are free; .*store_every"):
         simulate_campaign(campaign(tmp_path), device="cpu")
     assert order == []
 
