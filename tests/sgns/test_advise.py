@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns.advise import advice, bands, main, shipped, table, wished
 from sgns.config import UserError
 from sgns.frontier.point import Point, read_points, write_points
+from sgns_testing.commands import composed
 
 POINTS = [
     Point("full", "cut", "solver", "reference", "finest", wall_s_per_simulated_s=400.0, ratio=90.0),
@@ -27,8 +27,7 @@ POINTS = [
 
 
 def asked(*overrides: str) -> dict:
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("advise", list(overrides)))
+    return OmegaConf.to_container(composed(*overrides, command="advise"))
 
 
 def answer(*overrides: str, more: Sequence[Point] = ()) -> list[str]:

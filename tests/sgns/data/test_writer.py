@@ -157,20 +157,6 @@ def test_vtk_reads_the_soil_in_any_order(tmp_path):
             np.testing.assert_array_equal(velocity, run.velocities(i)[0])
 
 
-def test_the_name_appears_only_when_complete_and_the_old_file_stays_until_then(tmp_path):
-    path = tmp_path / "new" / "folder" / "a.h5"
-    with make_writer(path) as writer:
-        writer.append(**random_frame(0))
-        assert [p.name.startswith(".a.h5.") for p in path.parent.iterdir()] == [True]
-        writer.finish(0.0)
-    assert [p.name for p in path.parent.iterdir()] == ["a.h5"]
-    before = path.read_bytes()
-    with pytest.raises(KeyboardInterrupt), make_writer(path) as writer:
-        writer.append(**random_frame(1))
-        raise KeyboardInterrupt
-    assert path.read_bytes() == before and [p.name for p in path.parent.iterdir()] == ["a.h5"]
-
-
 def test_leaving_without_finish_keeps_nothing_and_says_so(tmp_path, caplog):
     with make_writer(tmp_path / "a.h5") as writer:
         writer.append(**random_frame(0))
