@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 import mpm_warp
@@ -28,12 +27,11 @@ from sgns.settings import (
     ReductionSettings,
     TrainingSettings,
 )
+from sgns_testing import commands
 
 
 def composed(command: str, *overrides: str) -> dict[str, Any]:
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        cfg = compose(command, list(overrides))
-    return OmegaConf.to_container(cfg)
+    return OmegaConf.to_container(commands.composed(*overrides, command=command))
 
 
 @pytest.mark.parametrize(

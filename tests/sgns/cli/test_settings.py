@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import joblib
 import pytest
 
-from sgns_testing.commands import call, refused
+from sgns_testing.commands import call, python, refused
 
 CALL = "{_target_: joblib.load, filename: hostile.pickle}"
 MADE = "${oc.create:'{_target_: joblib.load, filename: hostile.pickle}'}"
@@ -152,21 +151,14 @@ def test_commands_of_a_launcher_are_taken_from_the_command_line_only(hostile) ->
     plugin.mkdir(parents=True)
     (plugin / "__init__.py").write_text(LAUNCHER)
     code = (
-        "import sys, sgns.cli, sgns.simulate.command; "
+        f"import sys; sys.path.insert(0, {str(hostile.parent / 'path')!r}); "
+        "import sgns.cli, sgns.simulate.command; "
         "sgns.simulate.command.main = lambda cfg: None; sys.exit(sgns.cli.main())"
     )
 
     def launch(text: str, *overrides: str) -> subprocess.CompletedProcess[str]:
         head = "defaults: [override /hydra/launcher: elsewhere]\nhydra: {launcher: {%s}}"
-        arguments = ["simulate", "-m", "seed=1", *with_file(head % text), *overrides]
-        environment = os.environ | {"PYTHONPATH": str(hostile.parent / "path")}
-        return subprocess.run(
-            [sys.executable, "-c", code, *arguments],
-            capture_output=True,
-            text=True,
-            env=environment,
-            timeout=100,
-        )
+        return python(code, "simulate", "-m", "seed=1", *with_file(head % text), *overrides)
 
     for text in ("setup: [touch canary]", 'partition: "a\\ntouch canary"'):
         done = launch(text)

@@ -278,7 +278,6 @@ def test_what_is_no_file_or_never_ends(tmp_path, read) -> None:
     ("read", "content", "words"),
     [
         (read_text, b"\xff\xfe", "decode"),
-        (read_json, b"", "Expecting value"),
         (read_json, b'{"a": ', "Expecting value"),
         (read_json, b"[" * 100_000, "nested too deep"),
         (read_json, b"1" * 5000, "digits"),
@@ -288,7 +287,6 @@ def test_what_is_no_file_or_never_ends(tmp_path, read) -> None:
         (read_table, b"a\n" + b"x" * 200_000, "field larger"),
         (read_table, b"a" + b"\n,,,,," * 100_000, "line 2 has 6 values"),
         (read_arrays, b"", "zip"),
-        (read_arrays, b"PK\x03\x04", "zip"),
     ],
 )
 def test_damaged_content_is_one_line(tmp_path, read, content, words) -> None:

@@ -137,8 +137,3 @@ def test_training_and_judging_from_the_command_line(tmp_path):
     done = sgns(tmp_path, *judge, f"dataset.path={train}")
     assert done.returncode == 0 and "was trained on all of these runs" in done.stdout + done.stderr
     assert "it needs metadata.json" in refusal(tmp_path, *judge, f"dataset.path={tmp_path}")
-
-
-def test_published_runs_are_not_simulated(tmp_path):
-    said = refusal(tmp_path, "simulate", "dataset=published")
-    assert "dataset=published has no scene: its runs come from elsewhere" in said

@@ -18,7 +18,7 @@ from sgns.data.run import Run
 from sgns.simulate import command as simulate
 from sgns.simulate.run import scene_stages
 from sgns_testing.campaigns import campaign
-from sgns_testing.commands import SHORT, refusal, sgns
+from sgns_testing.commands import SHORT, sgns
 
 
 def test_command_writes_a_complete_run(tmp_path):
@@ -36,21 +36,6 @@ def test_command_writes_a_complete_run(tmp_path):
     with h5py.File(tmp_path / "run.h5") as file:
         assert file["particles/soil/position/value"].shape == (4, 29, 3)
     assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
-
-
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("scene.depth=0.5", "leaves the bin"),
-        ("effects.gravity=true", "effects"),
-        ("shards=4", "give dataset=..."),
-        ("scene.courant=1e-3 material.youngs_modulus=1e12", "lower material.youngs_modulus"),
-        ("scene.duration=1e300", "scene.duration is 1e+300 s; allowed: at most"),
-        ("scene.path=nowhere.csv", "scene.path"),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, override, words):
-    assert words in refusal(tmp_path, "simulate", *SHORT, *override.split())
 
 
 def test_scenes_side_by_side_share_the_time_that_passes(tmp_path):

@@ -23,7 +23,6 @@ from mpm_warp import (
     bodies,
     effects_for,
 )
-from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run
@@ -31,7 +30,6 @@ from sgns.data.writer import stopped_path
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.run import restart_from, simulate_scene
 from sgns.simulate.scene import recorded
-from sgns_testing.campaigns import job
 from sgns_testing.commands import SHORT, refusal, sgns
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
@@ -153,15 +151,6 @@ def test_it_may_stop_again(stopped, monkeypatch):
     third = restarted(kept, "scene.bed.headroom=0.5")
     assert third.changes == {"courant": 0.3, "bed.headroom": 0.5}  # those of before as well
     assert third.changed_scene.courant == 0.3 and third.wall_time == took
-
-
-def test_a_campaign_says_where_its_run_is_kept(stops, tmp_path, monkeypatch):
-    monkeypatch.setattr(campaign_runs, "_frames_done", [0])
-    output = tmp_path / "runs" / "1.h5"
-    ((_, (kind, words)),) = run_concurrently([campaign_runs._make(job(small(), output))], 1, "cpu")
-    assert kind == "failed"
-    assert f"continue_from={stopped_path(output)}" in words
-    assert check_run(stopped_path(output))[0].startswith("the run stopped after 4 good frames")
 
 
 @pytest.mark.parametrize(
