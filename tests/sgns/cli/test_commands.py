@@ -165,6 +165,7 @@ def test_bad_input_gives_one_line_and_leaves_nothing(
     ("rows", "part"),
     [
         ("1,0.2,nan,0.15,0,0,0,1", "not finite in row 2, column 3"),
+        ("1,0.2,0.3", "line 3 of path.csv has 3 values"),
         ("1,left,0.3,0.15,0,0,0,1", "line 3 of path.csv holds something that is not a number"),
     ],
 )

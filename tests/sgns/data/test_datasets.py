@@ -7,22 +7,22 @@ from functools import cache
 from types import SimpleNamespace
 
 import pytest
+from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns.cli.help import options_of
 from sgns.simulate import command as simulate
 from sgns.simulate.campaign import plan, run_cost
-from sgns_testing.commands import composed
 
 
 @cache
 def planned(name, *overrides):
     """The campaign of `sgns simulate dataset=<name> <overrides>`."""
     task = [f"dataset={name}", *overrides]
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, initialize_config_module("sgns.conf", version_base="1.3"):
         current = SimpleNamespace(overrides=SimpleNamespace(task=task))
         patch.setattr(simulate.HydraConfig, "get", lambda: current)
-        cfg = composed(*task)
+        cfg = compose("simulate", task)
         settings = OmegaConf.to_container(cfg.dataset, resolve=True)
         return plan(settings, simulate._base_scene(settings), {}, "float32", cfg.seed)
 

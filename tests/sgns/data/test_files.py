@@ -30,6 +30,7 @@ from sgns.data.files import (
     whole_file,
     write_whole,
 )
+from sgns_testing.commands import environment
 from sgns_testing.runs import make_run, make_writer, random_frame
 
 # --- A lock on a file: one process has it, and it ends with that process --------------------------------
@@ -203,6 +204,32 @@ def test_places_that_cannot_be_written_are_named(tmp_path):
         with pytest.raises(UserError) as caught:
             make_writer(path)
         assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+# Writes a run of 160 kB in the folder named on the command line again and again, with other limits for files.
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from sgns_testing.runs import make_run
+from sgns.config import UserError
+folder, hard = Path(sys.argv[1]), resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+for limit in (1, 1_000, 30_000, 145_000, 155_000, 160_000):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        make_run(folder / "a.h5", frames=30, n=200)
+    except UserError as error:
+        print(error, len(list(folder.iterdir())))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs resource limits")
+def test_a_disk_that_fills_up_at_any_moment(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(tmp_path)], env=environment(), capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    said = done.stdout.splitlines()
+    assert len(said) == 6 and all("cannot write" in line and line.endswith(" 0") for line in said), said
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs file locks")

@@ -101,6 +101,7 @@ def test_several_grids_are_joined(tmp_path):
     [
         ({"runs": 13}, "allowed: 3 to 12"),
         ({"draw": {"rake": 3.0}}, "dataset.draw.rake is 3.0"),
+        ({"draw": [3]}, "must be a grid"),
         ({"split": [0.8, 0.1, 0.2]}, "sum to 1"),
     ],
 )
