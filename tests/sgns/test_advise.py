@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns.advise import advice, bands, main, shipped, table, wished
 from sgns.config import UserError
 from sgns.frontier.point import Point, read_points, write_points
+from sgns_testing.commands import composed
 
 POINTS = [
     Point("full", "cut", "solver", "reference", "finest", wall_s_per_simulated_s=400.0, ratio=90.0),
@@ -27,8 +27,7 @@ POINTS = [
 
 
 def asked(*overrides: str) -> dict:
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("advise", list(overrides)))
+    return OmegaConf.to_container(composed(*overrides, command="advise"))
 
 
 def answer(*overrides: str, more: Sequence[Point] = ()) -> list[str]:
@@ -85,14 +84,8 @@ def test_surrogates_can_be_judged_against_their_training_runs() -> None:
     ("overrides", "line"),
     [
         ([], "nothing is asked for"),
-        (["error.force=-1"], "error.force is -1.0; it must be a number above 0"),
-        (["time=fast"], "time is 'fast'"),
         (["task=moon", "time=1"], "task is 'moon'; the table has cut"),
-        (["against=me", "time=1"], "against is 'me'; allowed: reference, training"),
-        (["particles=3", "time=1"], "particles is 3"),
         (["error.sinkage=0.001"], "has all the numbers asked for"),
-        (["error=0.3"], "error is 0.3; it must be a group of keys"),
-        (["+error.torque=1"], "error has no key 'torque'"),
     ],
 )
 def test_bad_input_gives_one_line(overrides: list[str], line: str) -> None:

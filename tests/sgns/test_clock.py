@@ -13,7 +13,6 @@ from sgns.data.run import Run
 from sgns.evaluate import costs as full_space_cost
 from sgns.numbers import elapsed
 from sgns.simulate import workers as campaign_runs
-from sgns.simulate.campaign import run_cost
 from sgns.simulate.run import simulate_scene
 from sgns_testing.campaigns import campaign, job
 
@@ -38,18 +37,6 @@ def test_a_run_is_made_and_said_to_have_been_quick(tmp_path, odd_clock):
     assert timing.rate > 1e9
     with Run(tmp_path / "run.h5") as run:
         assert run.wall_time_s > 0.0
-
-
-def test_the_time_left_is_some_time(tmp_path, odd_clock):
-    c = campaign(tmp_path, runs=6)
-    costs = {name: run_cost(scene) for name, scene in c.scenes.items()}
-    workers = campaign_runs._Workers(c, costs, "cpu", 4)
-    try:
-        last = time.monotonic()
-        workers._see(1e6, elapsed(last, time.monotonic()), busy=4)
-        assert workers._left() == "1 s"
-    finally:
-        workers._pool.shutdown()
 
 
 def test_a_trial_ends_and_takes_some_time(tmp_path, odd_clock, monkeypatch):

@@ -6,13 +6,13 @@ import os
 from types import SimpleNamespace
 
 import pytest
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from sgns import demo
 from sgns.cli.commands import COMMANDS
 from sgns.simulate.campaign import plan
 from sgns.simulate.scene import scene_from_config
+from sgns_testing.commands import composed
 
 
 @pytest.fixture
@@ -57,11 +57,8 @@ def test_it_stops_at_the_first_failure(calls):
 
 
 def test_the_new_path_is_in_no_run():
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        new = scene_from_config(
-            compose("rollout", ["scene=quick_excavation", "checkpoint=x", *demo.NEW_SCENE])
-        )
-        base = compose("simulate", ["scene=quick_excavation", "dataset=quick"])
+    asked = composed("scene=quick_excavation", "checkpoint=x", *demo.NEW_SCENE, command="rollout")
+    new, base = scene_from_config(asked), composed("scene=quick_excavation", "dataset=quick")
     campaign = plan(OmegaConf.to_container(base.dataset), scene_from_config(base).to_dict(), {}, "float32", 0)
     assert len(campaign.scenes) >= 16
     for scene in campaign.scenes.values():

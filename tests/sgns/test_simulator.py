@@ -169,8 +169,6 @@ def test_fewer_modes_than_it_was_trained_with(trained) -> None:
     assert simulator.basis.num_modes == simulator.num_modes == 2
     simulator.reset(history=(run.latent[:3, :2], run.pose[:3]))
     np.testing.assert_array_equal(simulator.step(run.pose[3]).latent, rollout.latent[3])
-    with pytest.raises(UserError, match="trained with 4 modes and cannot have 5; allowed: 1 to 4"):
-        trained.simulator("pose", num_modes=5)
 
 
 # --- Far from the training runs -------------------------------------------------------------------------
@@ -473,7 +471,7 @@ def test_what_a_simulator_is_made_of_is_looked_at(trained) -> None:
         with pytest.raises(UserError, match=r"cannot be used: .*; use device=cpu"):
             Simulator(surrogate, device)
     for num_modes in (0, 1.5, True, 5, "2"):
-        with pytest.raises(UserError, match="allowed: 1 to 4"):
+        with pytest.raises(UserError, match=r"trained with 4 modes and cannot have .*; allowed: 1 to 4"):
             Simulator(surrogate, num_modes=num_modes)
     for rate_independent in (None, 1, "yes"):
         with pytest.raises(UserError, match="rate_independent"):

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
-import logging
-import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import joblib
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
-from sgns.cli.commands import main
+from sgns_testing.commands import call, python, refused
 
 CALL = "{_target_: joblib.load, filename: hostile.pickle}"
 MADE = "${oc.create:'{_target_: joblib.load, filename: hostile.pickle}'}"
@@ -79,7 +75,7 @@ OVERRIDES = [
 
 
 @pytest.fixture
-def hostile(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def hostile(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a module and a pickle that leave a canary, and a file that may not be emptied."""
     (empty_folder / "precious").write_text("precious")
     (empty_folder / "hostile_module.py").write_text("open('canary', 'w')")
@@ -88,9 +84,7 @@ def hostile(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
     monkeypatch.syspath_prepend(empty_folder)
     monkeypatch.setenv("HOSTILE", CALL)
     monkeypatch.setattr("sgns.simulate.command.main", lambda cfg: Path("canary").touch())
-    yield empty_folder
-    GlobalHydra.instance().clear()
-    logging.getLogger().handlers.clear()
+    return empty_folder
 
 
 class Touch:
@@ -100,15 +94,10 @@ class Touch:
         return (Path.touch, (Path("canary"),))
 
 
-def refusal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
-    """The line with which `sgns simulate` refuses."""
-    GlobalHydra.instance().clear()
-    monkeypatch.setattr(sys, "argv", ["sgns", "simulate", *arguments])
-    status = main()
-    said = capsys.readouterr().err
-    assert status == 2 and said.count("\n") == 1, said
+def refuse(*arguments: str) -> None:
+    """`sgns simulate` refuses in one line, and nothing is made, run or emptied."""
+    refused("simulate", *arguments)
     assert not Path("canary").exists() and Path("precious").read_text() == "precious"
-    return said
 
 
 def with_file(text: str) -> tuple[str, ...]:
@@ -118,18 +107,18 @@ def with_file(text: str) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_files_of_settings_run_nothing(name, hostile, capsys, monkeypatch) -> None:
-    refusal(capsys, monkeypatch, *with_file(FILES[name]))
+def test_files_of_settings_run_nothing(name, hostile) -> None:
+    refuse(*with_file(FILES[name]))
 
 
 @pytest.mark.parametrize("name", ["callback made by a resolver", "log file", "environment", "launcher"])
-def test_files_of_settings_run_nothing_in_a_sweep(name, hostile, capsys, monkeypatch) -> None:
-    refusal(capsys, monkeypatch, *with_file(FILES[name]), "-m", "seed=1,2")
+def test_files_of_settings_run_nothing_in_a_sweep(name, hostile) -> None:
+    refuse(*with_file(FILES[name]), "-m", "seed=1,2")
 
 
 @pytest.mark.parametrize("override", OVERRIDES)
-def test_overrides_run_nothing(override, hostile, capsys, monkeypatch) -> None:
-    refusal(capsys, monkeypatch, override)
+def test_overrides_run_nothing(override, hostile) -> None:
+    refuse(override)
 
 
 LAUNCHER = """
@@ -162,29 +151,22 @@ def test_commands_of_a_launcher_are_taken_from_the_command_line_only(hostile) ->
     plugin.mkdir(parents=True)
     (plugin / "__init__.py").write_text(LAUNCHER)
     code = (
-        "import sys, sgns.cli, sgns.simulate.command; "
+        f"import sys; sys.path.insert(0, {str(hostile.parent / 'path')!r}); "
+        "import sgns.cli, sgns.simulate.command; "
         "sgns.simulate.command.main = lambda cfg: None; sys.exit(sgns.cli.main())"
     )
 
-    def call(text: str, *overrides: str) -> subprocess.CompletedProcess[str]:
+    def launch(text: str, *overrides: str) -> subprocess.CompletedProcess[str]:
         head = "defaults: [override /hydra/launcher: elsewhere]\nhydra: {launcher: {%s}}"
-        arguments = ["simulate", "-m", "seed=1", *with_file(head % text), *overrides]
-        environment = os.environ | {"PYTHONPATH": str(hostile.parent / "path")}
-        return subprocess.run(
-            [sys.executable, "-c", code, *arguments],
-            capture_output=True,
-            text=True,
-            env=environment,
-            timeout=100,
-        )
+        return python(code, "simulate", "-m", "seed=1", *with_file(head % text), *overrides)
 
     for text in ("setup: [touch canary]", 'partition: "a\\ntouch canary"'):
-        done = call(text)
+        done = launch(text)
         assert done.returncode == 2 and "files of settings cannot set this" in done.stderr, done.stderr
-    done = call("nodes: 2", 'hydra.job.name="a\\ntouch canary"'.replace("\\n", "\n"))
+    done = launch("nodes: 2", 'hydra.job.name="a\\ntouch canary"'.replace("\\n", "\n"))
     assert done.returncode == 2 and "hydra.launcher.name" in done.stderr, done.stderr
     assert not Path("launched").exists()
-    done = call("nodes: 2, partition: gpu-long", "hydra.launcher.setup=[module load x]")
+    done = launch("nodes: 2, partition: gpu-long", "hydra.launcher.setup=[module load x]")
     assert done.returncode == 0, done.stderr
     assert Path("launched").read_text() == "(['module load x'], 'gpu-long', 2)"
 
@@ -204,23 +186,23 @@ def test_commands_of_a_launcher_are_taken_from_the_command_line_only(hostile) ->
     ],
     ids=str,
 )
-def test_what_stays_allowed(arguments, seeds, hostile, capsys, monkeypatch) -> None:
+def test_what_stays_allowed(arguments, seeds, hostile, monkeypatch) -> None:
     Path("conf/experiment/good.yaml").write_text("# @package _global_\nseed: 3\n")
     sweep = "hydra: {mode: MULTIRUN, sweeper: {params: {seed: '4,5'}}}"
     Path("conf/experiment/sweep.yaml").write_text(f"# @package _global_\nseed: 4\n{sweep}\n")
     found = []
     monkeypatch.setattr("sgns.simulate.command.main", lambda cfg: found.append(cfg.seed))
-    monkeypatch.setattr(sys, "argv", ["sgns", "simulate", "output=x.h5", *arguments])
-    assert main() == 0, capsys.readouterr().err
+    done = call("simulate", "output=x.h5", *arguments)
+    assert done.returncode == 0, done.stderr
     assert found == seeds
 
 
 @pytest.mark.parametrize("kind", ["job", "hydra", "all"])
 @pytest.mark.parametrize("resolve", [[], ["--resolve"]])
-def test_settings_are_shown(kind, resolve, hostile, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["sgns", "train", "--cfg", kind, *resolve])
-    assert main() == 0
-    said = capsys.readouterr().out
+def test_settings_are_shown(kind, resolve, hostile) -> None:
+    done = call("train", "--cfg", kind, *resolve)
+    assert done.returncode == 0, done.stderr
+    said = done.stdout
     assert ("num_modes:" in said) == (kind != "hydra") and ("hydra:" in said) == (kind != "job")
     assert ("${" in said) == (not resolve)
 
@@ -228,14 +210,7 @@ def test_settings_are_shown(kind, resolve, hostile, capsys, monkeypatch) -> None
 def test_the_launcher_for_several_processes(hostile) -> None:
     if importlib.util.find_spec("hydra_plugins") is None:
         pytest.skip("hydra-joblib-launcher is not installed")
-    command = [
-        sys.executable,
-        "-m",
-        "sgns",
-        "advise",
-        "-m",
-        "hydra/launcher=joblib",
-        "hydra.launcher.n_jobs=2",
-    ]
-    done = subprocess.run([*command, "time=0.01,0.1"], capture_output=True, text=True, timeout=100)
+    launcher = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    command = [sys.executable, "-m", "sgns", "advise", *launcher, "time=0.01,0.1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stderr

@@ -68,9 +68,7 @@ def test_a_good_run_has_no_problems(tmp_path, kw):
 FAULTS = [
     # values that Run would read without complaint
     (put("particles/soil/position/value", (3, 7, 1), np.nan), "position of particle 7 is not finite"),
-    (put("particles/soil/velocity/value", (0, 2), np.inf), "velocity of particle 2 is not finite at frame 0"),
     (put("particles/soil/position/value", (3, 7, 1), 0.1), "changed or damaged"),
-    (put("observables/body/force/value", (4, 0), 1.0), "changed or damaged"),
     (put("observables/body/torque/value", 4, np.nan), "torque is not finite at frame 4"),
     (put("observables/body/pose/value", (2, 6), 0.5), "quaternion of frame 2"),
     (put("observables/body/pose/value", (5, 0), 0.3), "of frame 5 is .* from where the pose puts it"),
@@ -82,9 +80,6 @@ FAULTS = [
     (replace("observables/body/force/time", np.arange(12) / 30), "force/time differs"),
     # structure
     (replace("observables/body/pose/value", np.zeros((12, 6))), r"shape \(12, 6\), expected \(12, 7\)"),
-    (replace("observables/body/force/value", np.zeros((11, 3))), r"shape \(11, 3\), expected \(12, 3\)"),
-    (replace("particles/soil/velocity/value", np.zeros((12, 49, 3))), r"expected \(12, 50, 3\)"),
-    (replace("particles/soil/velocity/value", np.zeros((12, 150))), r"shape \(12, 150\), expected"),
     (replace("particles/soil/position/step", np.zeros(12)), "step has the wrong type"),
     (lambda file: file.pop("h5md"), "/h5md is missing"),
     (lambda file: file.pop("h5md/author"), "name of /h5md/author"),
@@ -94,19 +89,14 @@ FAULTS = [
     (attribute("scene", "just text"), "'scene' is not a group of keys"),
     (attribute("effects", "yielding: true"), "effect 'yielding'"),
     (attribute("producer", "me"), "producer is 'me'"),
-    (attribute("frame_rate", -1.0), "frame_rate is -1.0; it must be above 0 Hz"),
     (attribute("frame_rate", 0.0), "frame_rate is 0.0; it must be above 0 Hz"),
     (attribute("wall_time_s", np.nan), "wall_time_s is nan; it must be 0 s or more"),
-    (attribute("scene", "speed: fast"), "scene.speed is 'fast', not a finite number"),
-    (attribute("scene", "diameter: .nan"), "scene.diameter is nan"),
     (attribute("scene", "blade: {width: [1], length: 1, thickness: 1}"), r"scene.blade.width is \[1\]"),
     (attribute("scene", "blade: plate"), "scene.blade is 'plate', not a group of keys"),
     (attribute("frame_rate", "fast"), "'frame_rate' has the wrong type"),
-    (attribute("content_hash", "0" * 32), "changed or damaged"),
     # the view
     (lambda file: file.pop("VTKHDF"), "/VTKHDF is missing"),
     (lambda file: file.pop("VTKHDF/Points"), "/VTKHDF/Points is missing"),
-    (lambda file: file.pop("VTKHDF/Steps/PointOffsets"), "Steps/PointOffsets is missing"),
     (put("VTKHDF/NumberOfPoints", 0, 3), "NumberOfPoints does not fit"),
     (lambda file: file["VTKHDF"].attrs.__delitem__("Version"), r"Version of /VTKHDF is not \(2, 0\)"),
     (lambda file: file["VTKHDF"].attrs.create("Type", "Image"), "Type of /VTKHDF is not PolyData"),
@@ -145,35 +135,6 @@ def bad_values(file):
 def test_all_problems_are_listed(problems_after, change, listed):
     text = "\n".join(problems_after(change))
     assert [words for words in listed if words not in text] == []
-
-
-def test_a_file_that_cannot_be_opened_is_one_problem(tmp_path):
-    (tmp_path / "text.h5").write_text("x")
-    for name in ("none.h5", "text.h5", "."):
-        (problem,) = check_run(tmp_path / name)
-        assert str(tmp_path) in problem
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_random_damage_never_surprises(tmp_path, seed):
-    """Whatever bytes change, `Run` and `check_run` answer in words."""
-    rng = np.random.default_rng(seed)
-    good = make_run(tmp_path / "good.h5", frames=3, n=5, m=3).read_bytes()
-    noticed = 0
-    for _ in range(25):
-        data = bytearray(good)
-        at = int(rng.integers(48, len(data) - 16))
-        data[at : at + 8] = rng.bytes(8)
-        path = tmp_path / "bad.h5"
-        path.write_bytes(data)
-        problems = check_run(path)
-        noticed += bool(problems)
-        try:
-            with Run(path) as run:
-                run.positions(), run.velocities(), run.force, run.scene, run.effects, run.content_hash
-        except UserError as error:
-            assert problems and "\n" not in str(error)
-    assert noticed > 0
 
 
 CORNERS = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])

@@ -13,7 +13,6 @@ from omegaconf import OmegaConf
 from sgns.cli.help import options_of
 from sgns.simulate import command as simulate
 from sgns.simulate.campaign import plan, run_cost
-from sgns_testing.commands import refusal
 
 
 @cache
@@ -73,8 +72,3 @@ def test_the_command_line_comes_after_what_the_dataset_changes():
     assert recorded() == 5
     assert recorded("dataset.runs=3", "scene.bed.store_every=2") == 2
     assert recorded("dataset.runs=3", "dataset.change={bed.store_every: 4}") == 4
-
-
-def test_a_change_that_is_no_group_is_refused(tmp_path):
-    said = refusal(tmp_path, "simulate", "dataset=desktop_excavation", "dataset.change=3")
-    assert "dataset.change is 3; it must be" in said

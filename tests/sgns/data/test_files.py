@@ -206,14 +206,6 @@ def test_places_that_cannot_be_written_are_named(tmp_path):
         assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_without_permission_is_named(tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(UserError, match="Permission denied"):
-        make_writer(tmp_path / "a.h5")
-    tmp_path.chmod(0o700)
-
-
 # Writes a run of 160 kB in the folder named on the command line again and again, with other limits for files.
 LIMITED = """
 import resource, sys
@@ -313,7 +305,6 @@ def test_what_is_no_file_or_never_ends(tmp_path, read) -> None:
     ("read", "content", "words"),
     [
         (read_text, b"\xff\xfe", "decode"),
-        (read_json, b"", "Expecting value"),
         (read_json, b'{"a": ', "Expecting value"),
         (read_json, b"[" * 100_000, "nested too deep"),
         (read_json, b"1" * 5000, "digits"),
@@ -323,7 +314,6 @@ def test_what_is_no_file_or_never_ends(tmp_path, read) -> None:
         (read_table, b"a\n" + b"x" * 200_000, "field larger"),
         (read_table, b"a" + b"\n,,,,," * 100_000, "line 2 has 6 values"),
         (read_arrays, b"", "zip"),
-        (read_arrays, b"PK\x03\x04", "zip"),
     ],
 )
 def test_damaged_content_is_one_line(tmp_path, read, content, words) -> None:

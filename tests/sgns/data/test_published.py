@@ -70,18 +70,6 @@ def test_a_wheel_of_a_case_and_cases_that_are_not_there():
         wheel_case(0)
 
 
-@pytest.mark.parametrize("damage", ["missing", "short", "foreign", "count"])
-def test_what_is_not_published_data_is_refused(tmp_path, damage):
-    good = record([[[0.0] * 3] * 2] * 3, [3, 6], [[0.0] * 3] * 3)
-    write(tmp_path, [b"not a message" if damage == "foreign" else good], [1, 2] if damage == "count" else [1])
-    if damage == "missing":
-        (tmp_path / "metadata.json").unlink()
-    if damage == "short":
-        (tmp_path / "valid.tfrecord").write_bytes((tmp_path / "valid.tfrecord").read_bytes()[:-9])
-    with pytest.raises(UserError):
-        read_published(tmp_path)
-
-
 def blade(case, frames=8, points=15):
     """A record of a blade that moves on, with two modes, and its case."""
     rng = np.random.default_rng(case)
@@ -149,8 +137,3 @@ def test_training_and_judging_from_the_command_line(tmp_path):
     done = sgns(tmp_path, *judge, f"dataset.path={train}")
     assert done.returncode == 0 and "was trained on all of these runs" in done.stdout + done.stderr
     assert "it needs metadata.json" in refusal(tmp_path, *judge, f"dataset.path={tmp_path}")
-
-
-def test_published_runs_are_not_simulated(tmp_path):
-    said = refusal(tmp_path, "simulate", "dataset=published")
-    assert "dataset=published has no scene: its runs come from elsewhere" in said

@@ -10,7 +10,7 @@ import pytest
 
 from sgns.config import UserError
 from sgns.data.run import Run
-from sgns_testing.runs import make_run, make_writer, random_frame
+from sgns_testing.runs import make_run
 
 
 @pytest.mark.parametrize(
@@ -88,17 +88,6 @@ def test_truncated(tmp_path, share):
     assert "cut short" in refused(path)
 
 
-def test_a_file_that_was_never_closed(tmp_path):
-    with make_writer(tmp_path / "a.h5", n=5000) as writer:
-        for i in range(3):
-            writer.append(**random_frame(i, n=5000))
-        (hidden,) = tmp_path.iterdir()
-        copied = tmp_path / "b.h5"
-        copied.write_bytes(hidden.read_bytes())
-    assert copied.exists()
-    refused(copied)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -125,12 +114,3 @@ def test_what_is_missing_or_newer_is_named(tmp_path, change, words):
         change(file)
     said = refused(path)
     assert all(word in said for word in words)
-
-
-@pytest.mark.parametrize("text", ["!!python/object/apply:os.getcwd []", "- 1"])
-def test_a_scene_is_plain_data(tmp_path, text):
-    path = make_run(tmp_path / "a.h5")
-    with h5py.File(path, "r+") as file:
-        file.attrs["scene"] = text
-    with Run(path) as run, pytest.raises(UserError, match="scene is damaged"):
-        run.scene  # noqa: B018

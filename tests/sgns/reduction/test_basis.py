@@ -134,49 +134,27 @@ def test_a_wrong_state_is_named(basis, change, message):
         Basis.from_state({})
 
 
-def test_damaged_files_are_refused(basis, tmp_path):
+def test_damaged_missing_and_foreign_files_are_refused(basis, tmp_path):
     saved = tmp_path / "basis.h5"
+    with pytest.raises(UserError, match="no basis file at"):
+        Basis.load(saved)
     basis.save(saved)
     whole = saved.read_bytes()
-    with h5py.File(saved) as file:
+    with h5py.File(saved, "a") as file:
         where = file["modes"].id.get_chunk_info(0).byte_offset
+        del file["modes"]
+    lacking = saved.read_bytes()
     flipped = bytearray(whole)
     flipped[where + 12] ^= 1
-    for damaged in (whole[: len(whole) // 2], whole[:100], b"", b"not HDF5 at all", bytes(flipped)):
+    for damaged in (whole[: len(whole) // 2], b"", b"not HDF5 at all", bytes(flipped), lacking):
         saved.write_bytes(damaged)
         with pytest.raises(UserError, match="truncated or damaged") as caught:
             Basis.load(saved)
         assert "\n" not in str(caught.value)
-
-
-def test_missing_and_foreign_files_are_refused(basis, tmp_path):
-    saved = tmp_path / "basis.h5"
-    basis.save(saved)
-    with pytest.raises(UserError, match="no basis file at"):
-        Basis.load(tmp_path / "none.h5")
-    with h5py.File(saved, "a") as file:
-        del file["modes"]
-    with pytest.raises(UserError, match="truncated or damaged"):
-        Basis.load(saved)
     with h5py.File(saved, "w") as file:
         file["modes"] = np.eye(3)
     with pytest.raises(UserError, match="not a basis"):
         Basis.load(saved)
-
-
-def test_a_failed_save_leaves_nothing_behind(basis, tmp_path, monkeypatch):
-    (tmp_path / "basis.h5").write_text("old")
-    with pytest.raises(UserError, match="cannot write"):
-        basis.save(tmp_path / "basis.h5" / "basis.h5")
-
-    def fail(*_):
-        raise OSError("disk full")
-
-    monkeypatch.setattr("os.replace", fail)
-    with pytest.raises(UserError, match="disk full"):
-        basis.save(tmp_path / "basis.h5")
-    assert [p.name for p in tmp_path.iterdir()] == ["basis.h5"]
-    assert (tmp_path / "basis.h5").read_text() == "old"
 
 
 def test_reconstruction_curve_is_the_error_of_projecting(tmp_path):

@@ -125,19 +125,6 @@ def test_no_more_modes_than_the_data_has(tmp_path) -> None:
         reduce_dataset(dataset, REDUCTION | {"num_modes": 6, "max_modes": 9})
 
 
-@pytest.mark.parametrize(
-    ("change", "line"),
-    [
-        ({"num_modes": "many"}, "allowed: auto, 1 or more"),
-        ({"num_modes": 7}, "max_modes"),
-        ({"centring": "median"}, "particle_axis"),
-    ],
-)
-def test_wrong_settings(tmp_path, change, line) -> None:
-    with pytest.raises(UserError, match=line):
-        reduce_dataset(make_dataset(tmp_path), REDUCTION | change)
-
-
 def test_a_mixture_of_beds_is_refused(tmp_path) -> None:
     dataset = make_dataset(tmp_path)
     make_run(dataset.runs("validation")[0], frames=14, n=40)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -12,8 +11,7 @@ from omegaconf import OmegaConf
 from mpm_warp import Effects, Scene, effects_for
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
-from sgns.simulate import campaign as cost
-from sgns.simulate.campaign import duration_words, finishing_time, plan, require_space, run_cost, size_words
+from sgns.simulate.campaign import duration_words, finishing_time, plan, run_cost, size_words
 from sgns.simulate.run import simulate_scene
 from sgns_testing.campaigns import BASE, EFFECTS, campaign
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
@@ -43,33 +41,21 @@ def test_work_and_size_are_those_of_the_run(tmp_path, store_every):
         ([5.0, 4.0, 3.0, 3.0, 3.0], [], 2, 10.0),
         ([3.0, 3.0, 3.0, 4.0, 5.0], [], 2, 11.0),  # the longest last: worse
         ([2.0], [1.0, 6.0], 2, 6.0),
-        ([2.0], [5.0], 2, 5.0),
     ],
 )
 def test_end_of_the_last_run(waiting, running, workers, end):
     assert finishing_time(waiting, running, workers) == end
 
 
-def test_a_disk_that_is_too_full_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(cost.shutil, "disk_usage", lambda path: SimpleNamespace(free=10**9))
-    require_space(tmp_path / "not" / "there", 10**9)
-    with pytest.raises(UserError, match=r"there needs 1.4 GB of disk and 1.0 GB are free; .*store_every"):
-        require_space(tmp_path / "not" / "there", 14 * 10**8)
-
-
 @pytest.mark.parametrize(
     ("say", "value", "words"),
     [
         (duration_words, 0.0, "1 s"),
-        (duration_words, 99.0, "99 s"),
         (duration_words, 100.0, "2 min"),
         (duration_words, 5990.0, "1 h 40 min"),
-        (duration_words, 12000.0, "3 h 20 min"),
         (duration_words, 2e5, "2 d 8 h"),
         (size_words, 100, "0.1 kB"),
-        (size_words, 56_300_000, "56 MB"),
         (size_words, 999_600_000, "1.0 GB"),
-        (size_words, 3e12, "3.0 TB"),
         (size_words, 3e15, "3000 TB"),
     ],
 )
@@ -115,9 +101,7 @@ def test_several_grids_are_joined(tmp_path):
     [
         ({"runs": 13}, "allowed: 3 to 12"),
         ({"draw": {"rake": 3.0}}, "dataset.draw.rake is 3.0"),
-        ({"draw": None}, "dataset.draw is missing"),
         ({"draw": [3]}, "must be a grid"),
-        ({"split": [0.8, 0.1]}, "list of 3 values"),
         ({"split": [0.8, 0.1, 0.2]}, "sum to 1"),
     ],
 )
@@ -184,7 +168,6 @@ def test_a_dataset_file_with_odd_effects_is_another_dataset(tmp_path, effects):
         (None, "sgns simulate dataset="),
         ("split: [", "cannot read"),
         ("- 1", "has no split"),
-        ("!!python/object/apply:os.system [ls]", "cannot read"),
     ],
 )
 def test_what_is_no_dataset_is_refused(tmp_path, text, words):

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 import mpm_warp
@@ -15,6 +14,7 @@ import sgns.conf
 from mpm_warp import Box, Cylinder, Effects, Material, MeshBody, Scene
 from mpm_warp.auto_effects import EFFECTS
 from sgns.simulate.scene import scene_from_config
+from sgns_testing.commands import composed
 
 CONF = Path(sgns.conf.__path__[0])
 KINDS = ("body", "column", "excavation", "incline", "wheel")
@@ -28,13 +28,12 @@ SOILS = options("material")
 PATH = [[0.0, 0.3, 0.3, 0.2, 0, 0, 0, 1]]
 
 
-def composed(*overrides: str) -> Scene:
-    with initialize_config_module("sgns.conf", version_base="1.3"):
-        return scene_from_config(compose("simulate", list(overrides)))
+def scene_of(*overrides: str) -> Scene:
+    return scene_from_config(composed(*overrides))
 
 
 def soil(name: str, *overrides: str) -> Material:
-    return composed(f"material={name}", *overrides).material
+    return scene_of(f"material={name}", *overrides).material
 
 
 def stated(group: str, name: str, base: str = "") -> dict[str, Any]:
@@ -61,14 +60,14 @@ def test_a_kind_is_the_class_of_its_name(kind: str, tmp_path: Path) -> None:
     if kind == "body":
         file = tmp_path / "path.csv"
         file.write_text("t,x,y,z,qx,qy,qz,qw\n" + ",".join(map(str, PATH[0])) + "\n")
-        assert composed("scene=body", f"scene.path={file}") == cls(path=PATH)
+        assert scene_of("scene=body", f"scene.path={file}") == cls(path=PATH)
     else:
-        assert composed(f"scene={kind}") == cls()
+        assert scene_of(f"scene={kind}") == cls()
 
 
 @pytest.mark.parametrize("name", [name for name in options("scene") if name not in KINDS])
 def test_a_preset_differs_from_its_kind_in_what_it_states(name: str) -> None:
-    scene = composed(f"scene={name}")
+    scene = scene_of(f"scene={name}")
     changes = stated("scene", name, scene.kind)
     expected = OmegaConf.merge(type(scene)().to_dict(), changes, {"bed": {"seed": 0}})
     assert scene == Scene.from_dict(OmegaConf.to_container(expected))

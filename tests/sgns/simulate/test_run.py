@@ -23,8 +23,6 @@ from mpm_warp import (
     bodies,
     effects_for,
 )
-from mpm_warp import bodies as mesh_file
-from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run
@@ -32,7 +30,6 @@ from sgns.data.writer import stopped_path
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.run import restart_from, simulate_scene
 from sgns.simulate.scene import recorded
-from sgns_testing.campaigns import job
 from sgns_testing.commands import SHORT, refusal, sgns
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
@@ -156,21 +153,11 @@ def test_it_may_stop_again(stopped, monkeypatch):
     assert third.changed_scene.courant == 0.3 and third.wall_time == took
 
 
-def test_a_campaign_says_where_its_run_is_kept(stops, tmp_path, monkeypatch):
-    monkeypatch.setattr(campaign_runs, "_frames_done", [0])
-    output = tmp_path / "runs" / "1.h5"
-    ((_, (kind, words)),) = run_concurrently([campaign_runs._make(job(small(), output))], 1, "cpu")
-    assert kind == "failed"
-    assert f"continue_from={stopped_path(output)}" in words
-    assert check_run(stopped_path(output))[0].startswith("the run stopped after 4 good frames")
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["scene.depth=0.03"], "leave out scene.depth"),
         (["scene=wheel"], "leave out scene"),
-        (["material.youngs_modulus=1e6"], "leave out material.youngs_modulus"),
         (["scene.courant=2"], "scene.courant is 2"),
         (["dataset=quick"], "leave out dataset="),
     ],
@@ -233,7 +220,6 @@ def test_a_run_brings_its_mesh(stopped_mesh, tmp_path, monkeypatch):
         raise AssertionError("a file is read because a run names it")
 
     monkeypatch.setattr(bodies, "read_bytes", never)
-    monkeypatch.setattr(mesh_file, "read_bytes", never)
     with pytest.raises(UserError, match=r"brings its own tool; leave out scene\.tool\.file"):
         restarted(kept, "+scene.tool.file=box.obj")
     restart = restarted(kept, "scene.courant=0.3")

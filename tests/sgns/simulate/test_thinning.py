@@ -9,7 +9,6 @@ from mpm_warp import Effects, Scene
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run
-from sgns.reduction.reduce import check_one_bed
 from sgns.rollout import require_known_bed, rollout_scene
 from sgns.simulate.run import simulate_scene
 from sgns_testing.campaigns import campaign
@@ -48,12 +47,6 @@ def test_the_recorded_particles_are_those_of_the_whole_run(scenes, runs):
         assert part.scene["bed"]["store_every"] == 3
         assert part.extra["particles_simulated"] == 200
     assert check_run(runs[0]) == []
-
-
-def test_a_mixture_is_refused(runs):
-    check_one_bed(runs[:3])
-    with pytest.raises(UserError, match="differ in particle arrangement"):
-        check_one_bed(runs)
 
 
 def test_a_basis_of_thinned_runs_rolls_out_thinned_scenes_only(scenes, runs, tmp_path):

@@ -87,33 +87,6 @@ def test_one_run_alone_can_be_fitted(data, tmp_path) -> None:
     assert run(without_validation(data, 1), tmp_path) > 0.5
 
 
-def test_what_chooses_is_the_best_there_is(data) -> None:
-    runs, choosing = data.runs("train"), data.runs("validation")
-    best = fitted(runs, choosing)
-    for noise in FIT["noises"]:
-        for penalty in FIT["penalties"]:
-            other = fitted(runs, choosing, noises=[noise], penalties=[penalty])
-            assert other.score.skill <= best.score.skill
-
-
-@pytest.mark.parametrize(
-    ("model", "training", "line"),
-    [
-        ({}, TRAINING, "training has no key 'batch_size'"),
-        (
-            {"hidden_width": 8},
-            FIT,
-            "model has no key 'hidden_width'; allowed: context, degree, history, kind",
-        ),
-        ({"degree": 3}, FIT, "model.degree is 3; allowed: 1, 2"),
-        ({"kind": "tree"}, FIT, "model.kind is 'tree'; allowed: network, polynomial"),
-    ],
-)
-def test_wrong_settings_name_their_key(data, tmp_path, model, training, line) -> None:
-    with pytest.raises(UserError, match=line.replace(".", r"\.")):
-        run(data, tmp_path, POLYNOMIAL | model, training)
-
-
 def test_what_polynomials_have_no_use_for(data, tmp_path) -> None:
     with pytest.raises(UserError, match="but polynomials start from nothing"):
         run(data, tmp_path, start_from="a.ckpt")

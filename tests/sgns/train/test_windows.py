@@ -149,13 +149,6 @@ def test_runs_shorter_than_the_horizon_are_left_out_and_named_if_all_are(data) -
         TrainingWindows([short], 4, 3, "pose", horizon=4)
 
 
-def test_context_is_that_of_the_run(data) -> None:
-    windows = TrainingWindows(data.runs("train"), 4, 3, "pose", context=["depth", "blade.width"])
-    batch = windows.windows(windows.targets[[0, 13, 26]])
-    for row, run in zip(batch.context, data.runs("train"), strict=False):
-        assert row.tolist() == [run.scene["depth"], run.scene["blade"]["width"]]
-
-
 def test_normalised_training_quantities_are_of_order_one(data) -> None:
     windows = windows_of(data)
     dynamics = LatentDynamics(ModelSettings(**MODEL), 4)
