@@ -93,19 +93,6 @@ def soil(xi, mu=0.8, **kw):
 BOTH_LAWS = pytest.mark.parametrize("law", ["saturating", "linear"])
 
 
-@BOTH_LAWS
-def test_fluidity_decays_to_a_rough_floor_as_a_cosh(law):
-    """Uniform stress above mu_s: g = g_loc (1 - cosh((H - z) / xi) / cosh(H / xi)), flat at the free surface."""
-    xi = 0.04
-    column = Column(STEADY, soil(xi, rate_law=law))
-    column.impose(0.8)
-    column.solve(60)
-    g_loc = column.nodes("source")
-    np.testing.assert_allclose(g_loc, g_loc[0], rtol=1e-9)
-    exact = 1.0 - np.cosh((0.2 - column.z) / xi) / math.cosh(0.2 / xi)
-    assert np.abs(column.nodes("g") / g_loc - exact).max() < 0.02
-
-
 @pytest.mark.parametrize("effects", [STEADY, DYNAMIC])
 def test_nodes_that_hardly_hold_soil_do_no_harm(effects):
     """A particle just beyond the middle of its cell gives the next nodes so little that float32 has hardly a number for
@@ -230,27 +217,6 @@ def test_fluidity_is_kept_by_the_step():
     assert np.abs(g - source).max() > 0.02
     # What the Jacobi sweeps leave undone is not conserved: a per cent of the change.
     assert abs(np.sum(filled * (g - source))) < 0.01 * np.sum(filled * np.abs(g - source))
-
-
-@BOTH_LAWS
-@pytest.mark.parametrize("height", [0.9, 1.0, 1.25, 2.0])
-def test_stopping_height(law, height):
-    """A layer with g = 0 at its base flows if it is higher than (pi / 2) xi. Here it is `height` times as high, and mu
-    close to mu_s, so that xi is many grains. Small fluidity grows as m (mu - mu_s) / t_0 (1 - 1 / height^2)."""
-    mu = 0.77
-    material = soil(0.2 / height / (0.5 * math.pi), mu, rate_law=law)
-    column = Column(DYNAMIC, material)
-    mode = np.sin(0.5 * math.pi / 0.2 * column.height)
-    column.g.assign(0.01 * mode)
-    size = []
-    for _ in range(21):
-        column.impose(mu, 10.0 * PRESSURE)  # stiff against the flow, so that g stays small in every respect
-        size.append(np.sum(column.g.numpy() * mode))
-        column.solve(1)
-        column.move()
-    growth = math.log(size[-1] / size[0]) / (20 * column.solver.time_step)
-    local = (cooperative_length(material) / material.cooperativity_length(mu)) ** 2 / material.fluidity_time
-    assert growth / local == pytest.approx(1.0 - 1.0 / height**2, abs=0.03)
 
 
 def sheared(effects, material, profile):
