@@ -1,7 +1,5 @@
 """Effects decided from the scene: by which numbers, what may be asked for, and that what is left out is not missed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

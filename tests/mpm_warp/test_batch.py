@@ -1,7 +1,5 @@
 """Many scenes at once: the same frames as one by one, and one that fails leaves the others alone."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from unittest import mock

@@ -1,7 +1,5 @@
 """Floor and walls: sticking, sliding, friction, periodic ends, and a tilted bin."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import product

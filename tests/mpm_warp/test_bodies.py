@@ -1,7 +1,5 @@
 """Bodies and mesh files: what they are, what they refuse."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Mirror symmetry: half the bed computed is the whole bed computed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -72,8 +72,7 @@ def speed_in_theory(material, effects, angle, height):
     """Heights and velocity of the steady layer: the one-dimensional equation of g with mu = tan(angle)."""
     z = np.linspace(0.0, height, 300)
     mu, span = math.tan(angle), material.limit_friction - material.static_friction
-    steep = span / (material.limit_friction - mu) if material.rate_law == "saturating" else 1.0
-    growth = steep * (mu - material.static_friction)
+    growth = span / (material.limit_friction - mu) * (mu - material.static_friction)
     length = material.nonlocal_amplitude * GRAIN
 
     def quadratic(z):

@@ -1,7 +1,5 @@
 """Scenes: what they hold, what they refuse."""
 
-from __future__ import annotations
-
 import json
 import math
 

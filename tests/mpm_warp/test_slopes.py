@@ -1,7 +1,5 @@
 """Columns and slopes: what the scenes hold and refuse, and that soil on them does what it must."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

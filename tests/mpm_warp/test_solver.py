@@ -1,7 +1,5 @@
 """The solver against cases with known answers (physics that must hold whatever the parameters)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
