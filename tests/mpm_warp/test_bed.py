@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 from scipy.spatial import cKDTree
 
-from mpm_warp import Bed, Effects, Scene, Solver, Walls, arrange
+from mpm_warp import Bed, Effects, Scene, SceneError, Solver, Walls, arrange
 from mpm_warp.bed import POISSON_RADIUS
 from mpm_warp.kernels.grid import grid_step
 from sgns_testing.scenes import BlockBed, block
@@ -128,3 +128,8 @@ def test_poisson_points_keep_their_distance_and_are_as_dense_as_the_published():
     assert len(points) * volume / np.prod(SIZE) == pytest.approx(0.797, abs=0.02)
     top = np.mean(points[:, 2] > -2 * spacing) / (2 * spacing / SIZE[2])
     assert top == pytest.approx(1.0, abs=0.06)
+
+
+def test_unknown_arrangement():
+    with pytest.raises(SceneError, match="allowed: lattice, jittered, poisson"):
+        arrange("heap", SIZE, 0.01, 0)

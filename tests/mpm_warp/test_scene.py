@@ -144,7 +144,6 @@ REFUSED = {
     Bed: [
         ({"size": (0.8, 0.6)}, "three lengths"),
         ({"spacing": 0.2}, "half the bin"),
-        ({"arrangement": "heap"}, "allowed: lattice, jittered, poisson"),
         ({"spacing": 1e-4}, "particles; at most"),
         ({"spacing": 1e-320}, "inf particles; at most"),
         ({"headroom": 1e300}, r"bed.headroom is 1e\+300 m .* at most 2e\+08 are allowed: lower bed.headroom"),

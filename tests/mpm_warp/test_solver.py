@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from mpm_warp import Bed, Effects, Material, Scene, Solver
+from mpm_warp import Bed, Effects, Material, Scene, SceneError, Solver
 from sgns_testing.scenes import block, cut
 from sgns_testing.solvers import momenta
 
@@ -156,3 +156,9 @@ def test_cuda_agrees_with_the_cpu(effects):
 def test_step_follows_the_wave_speed():
     slow, fast = (Solver(cut(material=Material(youngs_modulus=e))) for e in (1e6, 4e6))
     assert fast.substeps_per_frame == pytest.approx(2 * slow.substeps_per_frame, abs=2)
+
+
+@pytest.mark.parametrize(("key", "value"), [("device", "tpu"), ("precision", "float16")])
+def test_unknown_device_or_precision(key, value):
+    with pytest.raises(SceneError, match=f"{key} is '{value}'; allowed"):
+        Solver(cut(), **{key: value})
