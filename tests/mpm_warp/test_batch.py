@@ -1,7 +1,5 @@
 """Many scenes at once: the same frames as one by one, and one that fails leaves the others alone."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from unittest import mock
@@ -155,23 +153,6 @@ def test_scenes_that_fail_leave_the_others():
     assert len(whole) == sound.frame_count
 
 
-def test_tasks_go_side_by_side_and_the_next_begins_when_one_ends():
-    log = []
-
-    def task(name, turns):
-        log.append(f"{name} begins")
-        for turn in range(turns):
-            yield Job(Program([]), 0)
-            yield name, turn
-        log.append(f"{name} ends")
-
-    given = list(
-        run_concurrently((task(name, turns) for name, turns in [("a", 2), ("b", 1), ("c", 2)]), 2, "cpu")
-    )
-    assert given == [(0, ("a", 0)), (1, ("b", 0)), (0, ("a", 1)), (2, ("c", 0)), (2, ("c", 1))]
-    assert log == ["a begins", "b begins", "b ends", "c begins", "a ends", "c ends"]
-
-
 def test_when_one_breaks_the_others_are_closed():
     closed = []
 
@@ -189,14 +170,3 @@ def test_when_one_breaks_the_others_are_closed():
     with pytest.raises(ZeroDivisionError):
         list(run_concurrently([waits("a"), breaks(), waits("b")], 3, "cpu"))
     assert sorted(closed) == ["a", "b"]
-
-
-@pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
-def test_many_scenes_on_cuda_agree_with_the_cpu():
-    scenes = [cut(duration=0.15, depth=depth) for depth in np.linspace(0.02, 0.06, 9)]
-    for scene, frames in zip(
-        scenes, by_scene(frames_together(scenes, device="cuda", at_once=8)), strict=True
-    ):
-        one, two = frames[-1], list(Solver(scene).frames())[-1]
-        np.testing.assert_allclose(one.force, two.force, atol=0.01 * np.linalg.norm(two.force))
-        assert np.abs(one.position - two.position).max() < 1e-4

@@ -1,7 +1,5 @@
 """Floor and walls: sticking, sliding, friction, periodic ends, and a tilted bin."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import product
@@ -11,10 +9,10 @@ import pytest
 import warp as wp
 from scipy.spatial import cKDTree
 
-from mpm_warp import Bed, Effects, Incline, Material, Scene, SceneError, Solver, Walls, arrange
+from mpm_warp import Bed, Effects, Scene, SceneError, Solver, Walls, arrange
 from mpm_warp.bed import POISSON_RADIUS
 from mpm_warp.kernels.grid import grid_step
-from sgns_testing.scenes import BlockBed, block, cut
+from sgns_testing.scenes import BlockBed, block
 
 # --- Floor and walls: sticking, sliding, friction, periodic ends, and a tilted bin ----------------------
 
@@ -91,19 +89,6 @@ def test_a_periodic_seam_is_nowhere(axis):
     np.testing.assert_allclose(last[1] - start[1], last[0] - start[0], atol=1e-7)
 
 
-def test_momentum_along_periodic_axes_is_conserved():
-    """On a slippery floor nothing takes momentum along x and y, however the soil is shaken."""
-    bed = Bed(
-        size=(0.06, 0.06, 0.06), spacing=0.01, headroom=0.05, walls=Walls("periodic", "periodic", "slip")
-    )
-    solver = Solver(Scene(bed=bed, duration=0.05, frame_rate=200.0), precision="float64")
-    kick = np.random.default_rng(0).normal(size=(solver.particle_count, 3)) * 0.1
-    solver.particles.velocity.assign(kick)
-    list(solver.frames())
-    after = solver.particles.velocity.numpy().sum(axis=0)
-    np.testing.assert_allclose(after[:2], kick.sum(axis=0)[:2], atol=1e-12 * np.abs(kick).sum())
-
-
 def test_no_two_kinds_of_walls_share_a_kernel():
     """Warp takes kernels for the same, here and in its cache, whose text and functions are the same, whatever the names
     under which the text calls the functions."""
@@ -112,31 +97,6 @@ def test_no_two_kinds_of_walls_share_a_kernel():
     for form in ("alone", "together"):
         kernels = [getattr(grid_step(wp.float32, kinds).step, form) for kinds in walls]
         assert len({kernel.module.get_module_hash() for kernel in kernels}) == len(walls) == 48
-
-
-def test_slippery_walls_hold_no_flow_whatever_ran_before():
-    """Soil flows down a slope between walls: after one where they stick, one where they do not."""
-    slowest = []
-    for y in ("no_slip", "slip"):
-        bed = Bed(size=(0.06, 0.06, 0.05), spacing=0.01, walls=Walls("periodic", y))
-        *_, frame = Solver(
-            Incline(bed=bed, material=Material(), tilt=40.0, flowing=True, duration=0.05)
-        ).frames()
-        at_top = np.isclose(frame.position[:, 2], frame.position[:, 2].max(), atol=0.002)
-        slowest.append(frame.velocity[at_top, 0].min() / frame.velocity[at_top, 0].max())
-    assert slowest[0] < 0.8
-    assert slowest[1] > 0.99
-
-
-def test_plain_walls_cost_nothing():
-    """Without ghost nodes a step is scatter, grid, gather and material, and nothing counts turns."""
-    plain, periodic = (
-        Solver(cut(bed=Bed(size=(0.48, 0.4, 0.16), spacing=0.02, walls=Walls(y=y))))
-        for y in ("no_slip", "periodic")
-    )
-    assert len(plain._steps.step) == 4
-    assert plain._turns == {}
-    assert len(periodic._steps.step) == 6
 
 
 # --- Beds: full, inside, reproducible -------------------------------------------------------------------

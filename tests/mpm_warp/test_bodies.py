@@ -1,11 +1,10 @@
 """Bodies and mesh files: what they are, what they refuse."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from mpm_warp import Box, Cylinder, MeshBody, SceneError
+from mpm_warp.bodies import closed_mesh
 from sgns_testing.meshes import BOX_FACES, box_corners, box_triangles, write_obj, write_stl, write_text_stl
 
 SIZE = (0.1, 0.2, 0.3)
@@ -28,8 +27,6 @@ def test_a_mesh_is_about_its_centre_of_mass(tmp_path, form):
 
 def test_an_uneven_mesh_has_its_volumes_centre():
     """A pyramid's centre of mass lies a quarter of its height above its base."""
-    from mpm_warp.bodies import closed_mesh
-
     vertices = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 2]]) + 7.0
     faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
     about, _, turned = closed_mesh(vertices, faces, "pyramid")
@@ -98,16 +95,6 @@ def test_nodes_lie_on_the_bodies(tmp_path):
     assert Box().points().shape == (8, 3)
     file = write_obj(tmp_path / "box.obj", CORNERS, BOX_FACES)
     assert np.unique(MeshBody(file=str(file)).points().round(9), axis=0).shape == (8, 3)
-
-
-def test_a_known_mesh_opens_no_file(tmp_path):
-    file = write_obj(tmp_path / "box.obj", CORNERS, BOX_FACES)
-    body = MeshBody(file=str(file))
-    file.unlink()
-    again = MeshBody.of_mesh(*body.mesh[:2], file=str(file), digest=body.digest)
-    assert again == body
-    for one, other in zip(again.mesh, body.mesh, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,10 @@
-"""Kernels in Warp's cache, launches for one scene or many, and the work that scenes ask of the device."""
+"""Kernels in Warp's cache, damaged ones as well, and that they compile for a GPU."""
 
 import os
 import shutil
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 import warp as wp
 
@@ -14,9 +13,7 @@ from mpm_warp import launch as launch_module
 from mpm_warp.kernels.contact import ContactLaw
 from mpm_warp.kernels.grid import grid_step
 from mpm_warp.kernels.transfer import transfer
-from mpm_warp.launch import Executor, Job, Launch, Program, find_device, load_kernel, scene_kernel
-
-# --- Kernels that are damaged in Warp's cache -----------------------------------------------------------
+from mpm_warp.launch import find_device, load_kernel
 
 
 @pytest.fixture
@@ -108,77 +105,6 @@ def test_no_place_for_a_cache_is_one_line(tmp_path):
     (line,) = done.stdout.splitlines()
     assert "cannot make its folder" in line and "WARP_CACHE_PATH" in line
     assert done.stderr == ""
-
-
-# --- One function over one scene's items and over those of many, and programs of such kernels -----------
-
-
-@wp.struct
-class Pair:
-    to: wp.array(dtype=float)
-    factor: float
-
-
-def kernels():
-    @scene_kernel()
-    def add(i: int, pair: Pair, given: wp.array(dtype=float)):
-        if i >= given.shape[0]:
-            return
-        pair.to[i] = pair.to[i] + pair.factor * given[i]
-
-    @scene_kernel()
-    def double(i: int, to: wp.array(dtype=float)):
-        to[i] = 2.0 * to[i]
-
-    return add, double
-
-
-def scene(add, double, factor, numbers):
-    """Add `factor` times the numbers, double, add so many times, double."""
-    device, pair = find_device("cpu"), Pair()
-    pair.to, pair.factor = wp.zeros(len(numbers), dtype=float, device=device), factor
-    given = wp.array(numbers, dtype=float, device=device)
-    adds = Launch(add, len(numbers), [pair, given], device)
-    doubles = Launch(double, len(numbers), [pair.to], device)
-    return pair.to, Program([adds, doubles], [adds], [doubles])
-
-
-def test_programs_together_are_the_programs_alone():
-    """Of different sizes, numbers and steps."""
-    device, both = find_device("cpu"), kernels()
-    cases = [(1.0, [1.0, 2.0, 3.0], 2), (-0.5, [4.0], 5), (3.0, [1.0, 0.1], 1)]
-    alone, together = ([scene(*both, *case[:2]) for case in cases] for _ in range(2))
-    for (_, program), (*_, steps) in zip(alone, cases, strict=True):
-        Executor(device).run([Job(program, steps)])
-    Executor(device).run([Job(p, steps) for (_, p), (*_, steps) in zip(together, cases, strict=True)])
-    for (one, _), (two, _), (factor, numbers, steps) in zip(alone, together, cases, strict=True):
-        np.testing.assert_array_equal(one.numpy(), two.numpy())
-        np.testing.assert_allclose(two.numpy(), 2.0 * (2 + steps) * factor * np.array(numbers), rtol=1e-6)
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_jobs_without_steps_load_the_kernels_only(count):
-    both = kernels()
-    found = [scene(*both, 1.0, [1.0, 2.0]) for _ in range(count)]
-    Executor(find_device("cpu")).run([Job(program, 0) for _, program in found])
-    assert all(not to.numpy().any() for to, _ in found)
-
-
-def test_those_who_have_no_steps_to_do_wait():
-    both, executor = kernels(), Executor(find_device("cpu"))
-    (one, first), (two, second) = (scene(*both, 1.0, [1.0]) for _ in range(2))
-    for steps, wanted in (((1, 0), (6.0, 0.0)), ((0, 2), (6.0, 8.0))):
-        executor.run([Job(first, steps[0]), Job(second, steps[1])])
-        assert (one.numpy()[0], two.numpy()[0]) == wanted
-
-
-def test_programs_of_other_kernels_are_done_apart():
-    add, double = kernels()
-    to, first = scene(add, double, 1.0, [1.0])
-    jobs = [Job(first, 1), Job(Program([Launch(double, 1, [to], find_device("cpu"))]), 1)]
-    Executor(find_device("cpu")).run(jobs)
-    assert to.numpy()[0] == 12.0
-    assert [job.shared_by for job in jobs] == [2, 2]
 
 
 def test_kernels_compile_for_a_gpu(tmp_path):

@@ -1,7 +1,5 @@
 """Leakage: what it counts, and that plates do not leak."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from leakage import leakage, leaked, pushed_plate

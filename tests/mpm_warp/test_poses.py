@@ -1,7 +1,5 @@
 """Rotations, points carried along, and poses that are refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

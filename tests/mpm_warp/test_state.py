@@ -1,7 +1,5 @@
 """Going on from a recorded frame, and from where a solver stopped."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

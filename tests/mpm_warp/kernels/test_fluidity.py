@@ -123,24 +123,6 @@ def test_start_of_shear_against_a_reference_integrator(material, rate):
     assert errors[2] < 0.6 * errors[1]
 
 
-@pytest.mark.parametrize(
-    ("material", "g", "low", "high"),
-    [
-        (replace(LINEAR, youngs_modulus=1e6), 0.1, 2.52, 2.57),
-        (replace(LINEAR, youngs_modulus=15e6), 0.1, 5.51, 5.61),
-        (replace(SAND, youngs_modulus=15e6), 0.0, 0.95, SAND.limit_friction),
-    ],
-    ids=["soft", "stiff", "saturating"],
-)
-def test_overshoot_of_the_dynamic_form(material, g, low, high):
-    """Sheared suddenly (1 kPa, 7.5 1/s) friction overshoots many times before it settles, but for the saturating law,
-    which bounds it."""
-    mu, _ = shear(material, 7.5, 1000.0, 0.1, 2e-5, g, every=2)
-    assert low < mu.max() < high
-    if material.rate_law == "linear":
-        assert mu[-1] == pytest.approx(0.7626, abs=1e-3)
-
-
 @BOTH_PRECISIONS
 @BOTH_LAWS
 def test_step_solves_its_equation(material, real):
@@ -173,17 +155,6 @@ def test_step_solves_its_equation(material, real):
         np.testing.assert_allclose(mu * (1.0 + a * g_new), mu_trial, rtol=1e-9)
 
 
-@BOTH_LAWS
-def test_precisions_agree(material):
-    rng = np.random.default_rng(1)
-    p, mu = 10.0 ** rng.uniform(0, 5, 500), rng.uniform(0.1, 2.0, 500)
-    g = 10.0 ** rng.uniform(-3, 3, 500)
-    single, double = (Laws(real)(material, mu, p, g, 1e-4) for real in (wp.float32, wp.float64))
-    np.testing.assert_allclose(single[0][:, 0], double[0][:, 0], rtol=2e-5)
-    np.testing.assert_allclose(single[0][:, 1], double[0][:, 1], rtol=2e-4)
-    np.testing.assert_allclose(single[1][:, 0], double[1][:, 0], rtol=2e-5)
-
-
 @BOTH_PRECISIONS
 @BOTH_LAWS
 def test_limits_are_finite(material, real):
@@ -195,14 +166,6 @@ def test_limits_are_finite(material, real):
         for g in (0.0, 1e3):
             for found in Laws(real)(replace(material, grain_diameter=grain), mu, p, g, 1e-4):
                 assert np.all(np.isfinite(found)) and np.all(found >= 0.0)
-
-
-def test_no_dynamics_is_the_rate_law():
-    """With t0 far below the step the dynamics are the closed form of mu(I)."""
-    fast = replace(SAND, fluidity_time=1e-12)
-    mu = np.linspace(0.77, 3.0, 50)
-    dynamic, steady = Laws()(fast, mu, 1000.0, 0.0, 1e-4)
-    np.testing.assert_allclose(dynamic[:, 0], steady[:, 0], rtol=1e-6)
 
 
 @BOTH_LAWS
