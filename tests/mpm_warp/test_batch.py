@@ -170,3 +170,14 @@ def test_when_one_breaks_the_others_are_closed():
     with pytest.raises(ZeroDivisionError):
         list(run_concurrently([waits("a"), breaks(), waits("b")], 3, "cpu"))
     assert sorted(closed) == ["a", "b"]
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
+def test_many_scenes_on_cuda_agree_with_the_cpu():
+    scenes = [cut(duration=0.15, depth=depth) for depth in np.linspace(0.02, 0.06, 9)]
+    for scene, frames in zip(
+        scenes, by_scene(frames_together(scenes, device="cuda", at_once=8)), strict=True
+    ):
+        one, two = frames[-1], list(Solver(scene).frames())[-1]
+        np.testing.assert_allclose(one.force, two.force, atol=0.01 * np.linalg.norm(two.force))
+        assert np.abs(one.position - two.position).max() < 1e-4

@@ -133,3 +133,16 @@ def test_poisson_points_keep_their_distance_and_are_as_dense_as_the_published():
 def test_unknown_arrangement():
     with pytest.raises(SceneError, match="allowed: lattice, jittered, poisson"):
         arrange("heap", SIZE, 0.01, 0)
+
+
+def test_momentum_along_periodic_axes_is_conserved():
+    """On a slippery floor nothing takes momentum along x and y, however the soil is shaken."""
+    bed = Bed(
+        size=(0.06, 0.06, 0.06), spacing=0.01, headroom=0.05, walls=Walls("periodic", "periodic", "slip")
+    )
+    solver = Solver(Scene(bed=bed, duration=0.05, frame_rate=200.0), precision="float64")
+    kick = np.random.default_rng(0).normal(size=(solver.particle_count, 3)) * 0.1
+    solver.particles.velocity.assign(kick)
+    list(solver.frames())
+    after = solver.particles.velocity.numpy().sum(axis=0)
+    np.testing.assert_allclose(after[:2], kick.sum(axis=0)[:2], atol=1e-12 * np.abs(kick).sum())
