@@ -142,9 +142,6 @@ class FigureGroup:
     scene: str = ""  # what the note begins with: of which run they are
 
 
-# --- The page -------------------------------------------------------------------------------------------
-
-
 def write_report(evaluation: Evaluation, output: Path) -> Path:
     """Draws the figures into `figures/` and writes `report.html`; every file is complete or not there at all.
 

@@ -16,7 +16,7 @@ Shapes: B batch, V nodes, E edges, H hidden width.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -175,11 +175,9 @@ class IndexedAdjacency:
         self.degree = torch.bincount(self.receiver, minlength=node_count)[:, None]
 
     def spread(self, edges: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
-        """As `CompleteAdjacency.spread`."""
         return edges + receiver.index_select(1, self.receiver) + sender.index_select(1, self.sender)
 
     def gather(self, edges: Tensor) -> Tensor:
-        """As `CompleteAdjacency.gather`."""
         empty = edges.new_zeros(len(edges), self.node_count, edges.shape[-1])
         return empty.index_add(1, self.receiver, edges)
 
@@ -212,6 +210,11 @@ def keep_freed_memory() -> None:
     M_MMAP_THRESHOLD): one such block is enough, and it is never touched.
     """
     torch.empty(2**25 - 2**16, dtype=torch.uint8)
+
+
+def in_place(activation: nn.Module) -> Callable[[Tensor], Tensor]:
+    """The activation, overwriting its input where it can."""
+    return torch.relu_ if isinstance(activation, nn.ReLU) else activation
 
 
 class MLP(nn.Module):
@@ -251,11 +254,6 @@ class MLP(nn.Module):
         last = self.rest[-1]
         return last if isinstance(last, nn.LayerNorm) else None
 
-    def activate(self, x: Tensor) -> Tensor:
-        """The activation; ReLU overwrites `x`."""
-        activation = self.rest[0]
-        return x.relu_() if isinstance(activation, nn.ReLU) else activation(x)
-
     def layers(self, x: Tensor, linears: Sequence[nn.Linear]) -> Tensor:
         """Some of the linear layers, each with its activation."""
         relu = isinstance(self.rest[0], nn.ReLU)
@@ -268,10 +266,6 @@ class MLP(nn.Module):
     def hidden(self, x: Tensor) -> Tensor:
         """The last hidden layer, (..., inputs) to (..., hidden)."""
         return self.layers(x, self.linears[:-1])
-
-    def hidden_after_first(self, x: Tensor) -> Tensor:
-        """The last hidden layer from what the first linear layer gives, which is overwritten."""
-        return self.layers(self.activate(x), self.linears[1:-1])
 
     def ending(self, hidden: Tensor) -> Tensor | Unapplied:
         """The output from the last hidden layer; where the last step is linear it is left for later."""
@@ -360,7 +354,8 @@ class InteractionNetwork(MessagePassing):
         spread = adjacency.spread(
             own, nn.functional.linear(nodes, receiver_weight), nn.functional.linear(nodes, sender_weight)
         )
-        updated = self.edge_mlp.ending(self.edge_mlp.hidden_after_first(spread))
+        hidden = self.edge_mlp.layers(in_place(self.edge_mlp.rest[0])(spread), self.edge_mlp.linears[1:-1])
+        updated = self.edge_mlp.ending(hidden)
         summed = updated.gathered(adjacency) if isinstance(updated, Unapplied) else adjacency.gather(updated)
         moved = value_of(self.node_mlp.ending(self.node_mlp.hidden(torch.cat([nodes, summed], dim=-1))))
         if self.residual:

@@ -85,7 +85,6 @@ class LatentDynamics(Dynamics):
 
     @classmethod
     def from_card(cls, card: Mapping[str, Any], state: Mapping[str, Tensor]) -> LatentDynamics:
-        """As for all `Dynamics`."""
         model = card["model"]
         for key in ("hidden_layers", "message_passing_steps"):
             if model[key] > len(state):
@@ -209,7 +208,6 @@ class LatentDynamics(Dynamics):
         return Step(following, force.sum(-2), torque.sum(-2), displacement)
 
     def latent_statistics(self) -> tuple[Tensor, Tensor]:
-        """As for all `Dynamics`."""
         return self.position.mean, self.position.scale
 
     def body_displacement(self, prediction: Prediction, body: BodyTrack) -> Tensor:
@@ -380,7 +378,6 @@ class PathStepper(Stepper):
         return following, load
 
     def advance(self, latent: Tensor, body: BodyTrack) -> Step:
-        """As for all steppers."""
         with torch.inference_mode():
             features, places = self.windows(body)
             decoded = self.decoded(latent[0], features[0], places[0])
