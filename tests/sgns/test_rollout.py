@@ -8,7 +8,7 @@ from sgns.data import run as chunks
 from sgns.data.check import check_run
 from sgns.data.run import Run
 from sgns.model.training_range import Excess
-from sgns.rollout import RolloutTiming, bed_differences, require_known_bed, rollout_scene, unlearned
+from sgns.rollout import bed_differences, require_known_bed, rollout_scene, unlearned
 from sgns_testing.meshes import box_corners, box_triangles
 from sgns_testing.surrogates import FakeSimulator, fitted, small_dataset
 
@@ -132,12 +132,6 @@ def test_a_path_unlike_the_training_runs_is_told_and_recorded(simulator, tmp_pat
     with Run(tmp_path / "a.h5") as run:
         assert run.extra["outside_training"] == 0.7
         assert run.extra["outside_training_words"].startswith(words)
-
-
-def test_rates_are_per_simulated_second():
-    timing = RolloutTiming(simulated=4.0, inference=2.0, writing=6.0)
-    assert timing.inference_rate == 0.5
-    assert timing.complete_rate == 2.0
 
 
 def test_changes_that_the_network_cannot_feel_are_named():

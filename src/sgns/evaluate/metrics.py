@@ -14,8 +14,6 @@ from sgns.config import UserError
 from sgns.data.run import frame_chunks
 from sgns.model.features import is_wheel
 
-# --- The body of a recorded scene -----------------------------------------------------------------------
-
 
 def forward_force(scene: Mapping[str, Any]) -> tuple[str, float]:
     """Name of the forward force and the sign that F_x is reported with."""

@@ -186,14 +186,9 @@ def render_report(evaluation: Evaluation, groups: Sequence[FigureGroup]) -> str:
 # --- Which pictures it shows, of which runs, with which words -------------------------------------------
 
 
-def file_name(text: str) -> str:
-    """The text with everything but letters, digits, - and _ replaced."""
-    return re.sub(r"[^A-Za-z0-9_-]+", "-", text)
-
-
 def picture(name: str, title: str, caption: str, figure: Figure) -> ReportFigure:
-    """A picture with its words; the name becomes that of a file."""
-    return ReportFigure(file_name(name), title, caption, png(figure))
+    """A picture with its words; of its name everything but letters, digits, - and _ is replaced."""
+    return ReportFigure(re.sub(r"[^A-Za-z0-9_-]+", "-", name), title, caption, png(figure))
 
 
 @contextmanager
