@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from numbers import Real
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,10 +13,7 @@ from torch import Tensor
 
 from mpm_warp.poses import fitted_rotations, rotation_matrices, rotation_vectors
 from sgns.config import UserError
-
-if TYPE_CHECKING:
-    from sgns.reduction.reduce import ReducedRun
-
+from sgns.reduction.reduce import ReducedRun
 
 # --- The graph the network sees: one node per mode, one or more for the body, and edges between them ----
 # Shapes: B batch, V nodes, E edges, d history positions, r modes.
