@@ -11,7 +11,6 @@ from mpm_warp.settings import Settings, setting, settings
 from sgns.config import UserError
 
 Device = Literal["cpu", "cuda"]
-_MOST_SEED = 10**18
 
 
 class Group(Settings):
@@ -258,7 +257,7 @@ class _Command(Group):
 
 
 def _seed(words: str) -> Any:
-    return setting(0, words, ge=0, le=_MOST_SEED, words="; it must be a whole number, 0 or more")
+    return setting(0, words, ge=0, le=10**18, words="; it must be a whole number, 0 or more")
 
 
 def _device() -> Any:
