@@ -19,6 +19,7 @@ from sgns.settings import Advise
 
 log = logging.getLogger(__name__)
 
+TABLE = Path(str(files("sgns.frontier").joinpath("table.csv")))  # that ships with the package
 STEP = 1.0 / 60.0  # simulated time of one step: what `time` is the wall time of [s]
 # Key of `error` → column, what one of its units is of the key's, and words. Lengths are metres in settings.
 ERRORS = {
@@ -154,16 +155,11 @@ def commands(point: Point) -> list[str]:
 
 def main(cfg: DictConfig) -> float:
     """The command; returns the wall time of a step [s]."""
-    points = read_points(table(cfg.table))
+    points = read_points(Path(cfg.table or TABLE))
     wish = wished(OmegaConf.to_container(cfg, resolve=True), points)
     for line in advice(points, wish):
         log.info("%s", line)
     return wish.step_time(chosen(points, wish)[0])
-
-
-def table(asked: str | None) -> Path:
-    """The file asked for, or the one that ships with the package."""
-    return Path(asked) if asked else Path(str(files("sgns.frontier").joinpath("table.csv")))
 
 
 def wished(cfg: Any, points: Sequence[Point]) -> Wish:

@@ -6,9 +6,8 @@ import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,24 +28,12 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class RolloutTiming:
-    """Time simulated, wall time of the network's steps with force and torque, and of decoding every frame and writing
-    the run file [s]."""
+class RolloutTiming(NamedTuple):
+    """Time simulated [s], and wall seconds per simulated second."""
 
     simulated: float
-    inference: float
-    writing: float
-
-    @property
-    def inference_rate(self) -> float:
-        """Wall seconds per simulated second: steps with force, no particles decoded."""
-        return self.inference / self.simulated
-
-    @property
-    def complete_rate(self) -> float:
-        """Wall seconds per simulated second: steps, and every frame decoded and written."""
-        return (self.inference + self.writing) / self.simulated
+    inference_rate: float  # of steps with force and torque, no particles decoded
+    complete_rate: float  # of steps, and of decoding every frame and writing the run file
 
 
 @contextmanager
@@ -221,8 +208,8 @@ def rollout_scene(
         path, simulator, scene.to_dict(), rollout, seed=seed, checkpoint=checkpoint, mesh=scene.mesh
     )
     writing = elapsed(began, time.perf_counter())
-    steps = len(rollout.latent) - 1
-    return RolloutTiming(steps / float(simulator.frame_rate), float(rollout.wall_time_s), writing)
+    simulated, stepping = (len(rollout.latent) - 1) / simulator.frame_rate, rollout.wall_time_s
+    return RolloutTiming(simulated, stepping / simulated, (stepping + writing) / simulated)
 
 
 def main(cfg: DictConfig) -> float:

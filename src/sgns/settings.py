@@ -11,7 +11,6 @@ from mpm_warp.settings import Settings, setting, settings
 from sgns.config import UserError
 
 Device = Literal["cpu", "cuda"]
-_MOST_SEED = 10**18
 
 
 class Group(Settings):
@@ -174,10 +173,6 @@ class LossWeights(Group):
     torque: float = setting(0.1, "of the torque", ge=0)
 
 
-def _resume(words: str) -> Any:
-    return setting("auto", words)
-
-
 def _threads() -> Any:
     return setting(2, "CPU threads of torch; null: torch's own choice", ge=1, le=1024)
 
@@ -206,8 +201,8 @@ class TrainingSettings(Group):
     loss: LossWeights = setting(LossWeights, "weights of the parts of the loss")
     validate_every: int = setting(500, "steps between rollouts of the validation runs", ge=1)
     log_every: int = setting(50, "steps between points in TensorBoard", ge=1)
-    resume: Literal["auto", False] = _resume(
-        "go on from last.ckpt in `output`; false: start anew and overwrite"
+    resume: Literal["auto", False] = setting(
+        "auto", "go on from last.ckpt in `output`; false: start anew and overwrite"
     )
     threads: int | None = _threads()
 
@@ -242,7 +237,9 @@ class FitSettings(Group):
     linear: bool = setting(True, "with model.degree=2, fits without products of inputs may be chosen, too")
     draws: int = setting(2, "how often all windows are taken, each time with other noise", ge=1, le=1000)
     normalisation_floor: float = setting(0.01, "smallest scale, share of the largest", ge=0)
-    resume: Literal["auto", False] = _resume("answer from what is complete in `output`; false: start anew")
+    resume: Literal["auto", False] = setting(
+        "auto", "answer from what is complete in `output`; false: start anew"
+    )
     threads: int | None = _threads()
 
     def __post_init__(self) -> None:
@@ -261,7 +258,7 @@ class _Command(Group):
 
 
 def _seed(words: str) -> Any:
-    return setting(0, words, ge=0, le=_MOST_SEED, words="; it must be a whole number, 0 or more")
+    return setting(0, words, ge=0, le=10**18, words="; it must be a whole number, 0 or more")
 
 
 def _device() -> Any:

@@ -145,8 +145,6 @@ class Simulator:
     ) -> None:
         if not isinstance(rate_independent, (bool, np.bool_)):
             raise UserError(f"rate_independent is {rate_independent!r}; it must be True or False")
-        if num_modes is not None:
-            surrogate.dynamics.check_modes(num_modes)
         try:
             self.device = torch.device(device)
             # On others, such as "meta", tensors hold no values or no float64.

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from sgns.advise import advice, bands, main, shipped, table, wished
+from sgns.advise import TABLE, advice, bands, main, shipped, wished
 from sgns.config import UserError
 from sgns.frontier.point import Point, read_points, write_points
 from sgns_testing.commands import composed
@@ -101,8 +101,8 @@ def test_the_command_reads_a_table_of_one_s_own(tmp_path: Path) -> None:
 
 def test_the_table_that_ships_is_the_committed_study_and_answers() -> None:
     committed = Path(__file__).parents[2] / "experiments" / "accuracy_vs_time" / "full" / "points.csv"
-    assert table(None).read_bytes() == committed.read_bytes()
-    points = read_points(table(None))
+    assert TABLE.read_bytes() == committed.read_bytes()
+    points = read_points(TABLE)
     assert {p.kind for p in points} >= {"solver", "surrogate"}
     references = [p for p in points if p.axis == "reference"]
     assert len(references) == len({p.scene for p in points})

@@ -12,10 +12,10 @@ import statistics
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from omegaconf import DictConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
@@ -23,11 +23,13 @@ from mpm_warp.inputs import open_file
 from mpm_warp.poses import in_body_frame
 from sgns.config import UserError
 from sgns.data.check import scene_problems
+from sgns.data.dataset import Dataset
 from sgns.data.files import only_here, require_replaceable
 from sgns.data.run import Run
 from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory, provenance
 from sgns.evaluate.figures import VALIDATION
 from sgns.evaluate.metrics import body_errors, mean_prediction, position_errors, surface_grid
+from sgns.evaluate.published import evaluate_published
 from sgns.evaluate.report import describe, forward_name, seen_warning, short_names, write_report
 from sgns.evaluate.results import (
     EvaluatedRun,
@@ -43,12 +45,7 @@ from sgns.numbers import elapsed
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout
 from sgns.settings import ModelSettings, model_settings
-
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
-    from sgns.data.dataset import Dataset
-    from sgns.simulator import Rollout, Simulator
+from sgns.simulator import Rollout, Simulator
 
 log = logging.getLogger(__name__)
 
@@ -279,9 +276,6 @@ def log_summary(evaluation: Evaluation, report: Path) -> None:
 
 def main(cfg: DictConfig) -> float:
     """The `sgns evaluate` command; returns the position skill against frozen over all runs of the split."""
-    from sgns.data.dataset import Dataset
-    from sgns.simulator import Simulator
-
     new_rollouts = [cfg.new_rollouts] if isinstance(cfg.new_rollouts, str) else cfg.new_rollouts or []
     checkpoint, output = Path(cfg.checkpoint), Path(cfg.output)
     published = cfg.dataset.get("format") == "published"
@@ -290,8 +284,6 @@ def main(cfg: DictConfig) -> float:
     simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
     with only_here(output / "metrics.json"):
         if published:
-            from sgns.evaluate.published import evaluate_published
-
             return evaluate_published(simulator, cfg.dataset, cfg.split, output, checkpoint)
         evaluation = evaluate(
             simulator,

@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,10 +26,7 @@ from sgns.model.checkpoint import SUMMARY, load_surrogate, read_summary
 from sgns.numbers import elapsed
 from sgns.rollout import single_thread
 from sgns.settings import ModelSettings
-
-if TYPE_CHECKING:
-    from sgns.simulator import Simulator
-
+from sgns.simulator import Simulator
 
 # --- How a result was made: command, checkpoint, versions, machine --------------------------------------
 

@@ -48,16 +48,7 @@ def radius_graph(points: Tensor, radius: float) -> Tensor:
 
     Returns:
         Senders in row 0 and receivers in row 1, int64, shape (2, E).
-
-    Raises:
-        UserError: The radius is not positive, or a position is not finite.
     """
-    if not radius > 0:
-        raise UserError(f"the radius of the neighbours is {radius}; it must be above 0 m")
-    if not bool(torch.isfinite(points).all()):
-        raise UserError(
-            "positions are not finite, so they have no neighbours; the rollout ran away or the run is damaged"
-        )
     pairs = KDTree(points.detach().numpy()).query_pairs(radius, output_type="ndarray")
     edges = np.concatenate([pairs, pairs[:, ::-1]]).T
     return torch.from_numpy(edges[:, np.lexsort(edges)])
@@ -83,11 +74,6 @@ class FullSpaceDynamics(nn.Module):
 
     def __init__(self, settings: ModelSettings, radius: float, bin_size: Tensor) -> None:
         super().__init__()
-        if settings.body_nodes != "points":
-            raise UserError(
-                f"model.body_nodes is {settings.body_nodes!r}; a node acts on the soil near it, so full space "
-                "needs model.body_nodes=points"
-            )
         self.history = settings.history
         """d, positions of history."""
         self.radius = radius
@@ -200,7 +186,7 @@ class FullSpaceRun:
             self.track = body_track(run.pose, points, "points")
             self.force = torch.as_tensor(run.force)
             self.bin_size = torch.tensor(run.scene["bed"]["size"], dtype=torch.float64)
-            self.arrangement_hash, self.frame_rate = run.arrangement_hash, run.frame_rate
+            self.frame_rate = run.frame_rate
 
     def __len__(self) -> int:
         """T."""
@@ -215,28 +201,11 @@ class FullSpaceRun:
 class FullSpaceWindows:
     """Windows of d positions of history drawn from runs of one bed with replacement; every frame but the first is a
     target, and before frame 0 a run is at rest. `seed` is that of order and noise.
-
-    Raises:
-        UserError: No runs, or runs that do not belong together.
     """
 
     def __init__(self, runs: Sequence[FullSpaceRun], history: int, seed: int = 0) -> None:
         self.runs, self.history, self.seed = list(runs), history, seed
         self.targets = [(run, frame) for run in self.runs for frame in range(1, len(run))]
-        if not self.targets:
-            raise UserError(
-                "there are no training runs of two frames or more; make some: sgns simulate dataset=quick"
-            )
-        for run in self.runs[1:]:
-            one, other = (
-                (r.arrangement_hash, r.frame_rate, r.track.position.shape[1], r.bin_size.tolist())
-                for r in (self.runs[0], run)
-            )
-            if one != other:
-                raise UserError(
-                    f"{self.runs[0].path} and {run.path} differ in bed, frame rate or number of body nodes; train on "
-                    "runs of one bed"
-                )
 
     def __len__(self) -> int:
         """The number of windows."""

@@ -14,8 +14,6 @@ from sgns.config import UserError
 from sgns.data.run import frame_chunks
 from sgns.model.features import is_wheel
 
-# --- The body of a recorded scene -----------------------------------------------------------------------
-
 
 def forward_force(scene: Mapping[str, Any]) -> tuple[str, float]:
     """Name of the forward force and the sign that F_x is reported with."""
@@ -62,18 +60,16 @@ def particle_spacing(positions: np.ndarray) -> float:
     return float(spacing)
 
 
-def surface_grid(positions: np.ndarray, column: float | None = None) -> SurfaceGrid:
+def surface_grid(positions: np.ndarray) -> SurfaceGrid:
     """Height-map columns that cover an undisturbed bed (n, 3) [m].
 
-    Their edge is the nearest to `column` [m], by default two particle spacings, that divides the bed's length and
-    width.
+    Their edge is the nearest to two particle spacings that divides the bed's length and width.
     """
     positions = np.asarray(positions, dtype=np.float64)
     spacing = particle_spacing(positions)
-    column = SPACINGS_PER_COLUMN * spacing if column is None else column
     # The bed reaches half a spacing beyond its outermost particles.
     low, high = positions.min(axis=0) - 0.5 * spacing, positions.max(axis=0) + 0.5 * spacing
-    counts = [max(1, round(length / column)) for length in high - low]
+    counts = [max(1, round(length / (SPACINGS_PER_COLUMN * spacing))) for length in high - low]
     return SurfaceGrid(*(np.linspace(low[axis], high[axis], counts[axis] + 1) for axis in (0, 1)))
 
 
@@ -185,11 +181,6 @@ class VectorErrors:
         return self.absolute / self.samples
 
     @property
-    def rms_truth(self) -> float:
-        """Root mean square of the truth's length [N or N m]."""
-        return math.sqrt(self.truth_squared.sum() / self.samples)
-
-    @property
     def nrmse(self) -> np.ndarray:
         """RMS error / RMS of the truth per axis, shape (3,); NaN where the truth is negligible."""
         significant = self.truth_squared > NEGLIGIBLE_SHARE**2 * self.truth_squared.sum()
@@ -207,7 +198,8 @@ class VectorErrors:
 
         NaN where the mean of the truth is negligible beside the RMS length of the vector.
         """
-        significant = np.abs(self.truth_sum) / self.samples > NEGLIGIBLE_SHARE * self.rms_truth
+        rms_length = math.sqrt(self.truth_squared.sum() / self.samples)
+        significant = np.abs(self.truth_sum) / self.samples > NEGLIGIBLE_SHARE * rms_length
         return 100.0 * _ratio(self.prediction_sum - self.truth_sum, self.truth_sum, significant)
 
     @property
@@ -246,34 +238,20 @@ def mean_prediction(histories: Iterable[np.ndarray], history: int) -> np.ndarray
     return total / max(count, 1)
 
 
-def require_comparable(truth: Any, prediction: Any, history: int) -> None:
-    """Refuses pairs of runs that cannot be compared frame by frame and particle by particle."""
-    for what, a, b in (
-        ("particles", truth.particle_count, prediction.particle_count),
-        ("frames", truth.frame_count, prediction.frame_count),
-        ("arrangement", truth.arrangement_hash, prediction.arrangement_hash),
-    ):
-        if a != b:
-            raise UserError(
-                f"{prediction.path} cannot be compared with {truth.path}: {what} {b} against {a}; "
-                "compare runs of the same scene"
-            )
+def position_errors(
+    truth: Any, prediction: Any, basis: Any, history: int, grid: SurfaceGrid
+) -> PositionErrors:
+    """Position errors of a predicted `Run` of the same scene at every frame after the history of d frames that it was
+    given.
+
+    With orthonormal modes the network's error needs no decoding: it is ‖Uᵀ(prediction − truth)‖² / 3n, for a
+    prediction that lies in the subspace of the basis.
+    """
     if truth.frame_count <= history:
         raise UserError(
             f"{truth.path} has {truth.frame_count} frames, the network needs {history} as its history; "
             "nothing is left to compare: use a longer run"
         )
-
-
-def position_errors(
-    truth: Any, prediction: Any, basis: Any, history: int, grid: SurfaceGrid
-) -> PositionErrors:
-    """Position errors of a predicted `Run` at every frame after the history of d frames that it was given.
-
-    With orthonormal modes the network's error needs no decoding: it is ‖Uᵀ(prediction − truth)‖² / 3n, for a
-    prediction that lies in the subspace of the basis.
-    """
-    require_comparable(truth, prediction, history)
     given = np.asarray(truth.positions(slice(max(history - 2, 0), history)), dtype=np.float64)
     last, step = given[-1], given[-1] - given[0]
     last_heights = height_map(last, grid)

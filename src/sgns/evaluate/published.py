@@ -10,7 +10,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +23,7 @@ from sgns.evaluate.metrics import PositionErrors
 from sgns.evaluate.results import Scores, aggregate, run_scores, write_csv, write_json
 from sgns.reduction.reduce import ReducedRun
 from sgns.rollout import single_thread
-
-if TYPE_CHECKING:
-    from sgns.simulator import Simulator
+from sgns.simulator import Simulator
 
 log = logging.getLogger(__name__)
 

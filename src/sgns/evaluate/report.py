@@ -142,9 +142,6 @@ class FigureGroup:
     scene: str = ""  # what the note begins with: of which run they are
 
 
-# --- The page -------------------------------------------------------------------------------------------
-
-
 def write_report(evaluation: Evaluation, output: Path) -> Path:
     """Draws the figures into `figures/` and writes `report.html`; every file is complete or not there at all.
 
@@ -189,14 +186,9 @@ def render_report(evaluation: Evaluation, groups: Sequence[FigureGroup]) -> str:
 # --- Which pictures it shows, of which runs, with which words -------------------------------------------
 
 
-def file_name(text: str) -> str:
-    """The text with everything but letters, digits, - and _ replaced."""
-    return re.sub(r"[^A-Za-z0-9_-]+", "-", text)
-
-
 def picture(name: str, title: str, caption: str, figure: Figure) -> ReportFigure:
-    """A picture with its words; the name becomes that of a file."""
-    return ReportFigure(file_name(name), title, caption, png(figure))
+    """A picture with its words; of its name everything but letters, digits, - and _ is replaced."""
+    return ReportFigure(re.sub(r"[^A-Za-z0-9_-]+", "-", name), title, caption, png(figure))
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,10 +24,7 @@ from sgns.evaluate.metrics import (
     skill,
 )
 from sgns.reduction.basis import Basis, ReductionCurves
-
-if TYPE_CHECKING:
-    from sgns.simulator import Simulator
-
+from sgns.simulator import Simulator
 
 # --- All metrics of one predicted run, or of several together, as one row of a table --------------------
 

@@ -28,7 +28,7 @@ MOST_THROUGH_TIME = 14  # points of the fronts whose errors through the run are 
 def main(cfg: DictConfig) -> None:
     """The command."""
     study = Study.from_settings(OmegaConf.to_container(cfg.study, resolve=True), Path(cfg.output))
-    axes = axes_of(cfg.axis)
+    axes = {"all": AXES, "none": ()}.get(cfg.axis, (cfg.axis,))
     folder = study.folder
     measured = (*(folder / "points").glob("*.json"), *(folder / "observations").glob("*.npz"))
     require_replaceable(
@@ -50,15 +50,6 @@ def main(cfg: DictConfig) -> None:
     with file_lock(folder / PAGE, wait=True):  # of several that gather at once the last sees all points
         page = write_study(study, points_with_errors(study))
     log.info("%s and the table and figures beside it", page)
-
-
-def axes_of(asked: str | None) -> tuple[str, ...]:
-    """The axes that one command measures."""
-    if asked is None or asked == "all":
-        return AXES
-    if asked == "none":
-        return ()
-    return (asked,)
 
 
 def points_with_errors(study: Study) -> list[Point]:

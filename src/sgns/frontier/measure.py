@@ -327,17 +327,12 @@ def own_errors(simulator: Simulator, dataset: Dataset) -> Scores:
         with Run(path) as truth:
             rollout = roll_out(simulator, truth)
             latent = torch.as_tensor(rollout.latent)
-            prediction: Any = (
-                SimpleNamespace(  # what the metrics read of a run; frames are decoded when asked for
-                    path=f"rollout of {path.stem}",
-                    frame_count=len(latent),
-                    particle_count=len(simulator.start_positions),
-                    arrangement_hash=simulator.arrangement_hash,
-                    pose=rollout.poses,
-                    force=rollout.force,
-                    torque=rollout.torque,
-                    positions=lambda frames, latent=latent: basis.inverse(latent[frames]).numpy(),
-                )
+            # What the metrics read of a run; frames are decoded when asked for.
+            prediction: Any = SimpleNamespace(
+                pose=rollout.poses,
+                force=rollout.force,
+                torque=rollout.torque,
+                positions=lambda frames, latent=latent: basis.inverse(latent[frames]).numpy(),
             )
             errors = position_errors(truth, prediction, basis, d, grid)
             body = body_errors(truth, prediction, d)

@@ -7,7 +7,7 @@ import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -22,9 +22,7 @@ from sgns.model.network_dynamics import LatentDynamics
 from sgns.model.polynomial import PolynomialDynamics
 from sgns.model.training_range import TrainingRange
 from sgns.reduction.basis import Basis
-
-if TYPE_CHECKING:
-    from sgns.reduction.reduce import ReducedDataset
+from sgns.reduction.reduce import ReducedDataset
 
 DYNAMICS: dict[str, type[Dynamics]] = {"network": LatentDynamics, "polynomial": PolynomialDynamics}
 """Every kind of latent dynamics, by `model.kind`."""

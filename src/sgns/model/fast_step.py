@@ -5,7 +5,7 @@ Shapes: V nodes, E edges, H hidden width.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -15,14 +15,10 @@ from sgns.model.network import (
     CompleteAdjacency,
     EncodeProcessDecode,
     adjacency_of,
+    in_place,
     prefers_onednn,
     product,
 )
-
-
-def in_place(activation: nn.Module) -> Callable[[Tensor], Tensor]:
-    """The activation, overwriting its input where it can."""
-    return torch.relu_ if isinstance(activation, nn.ReLU) else activation
 
 
 class Layer:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from numbers import Real
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,10 +13,7 @@ from torch import Tensor
 
 from mpm_warp.poses import fitted_rotations, rotation_matrices, rotation_vectors
 from sgns.config import UserError
-
-if TYPE_CHECKING:
-    from sgns.reduction.reduce import ReducedRun
-
+from sgns.reduction.reduce import ReducedRun
 
 # --- The graph the network sees: one node per mode, one or more for the body, and edges between them ----
 # Shapes: B batch, V nodes, E edges, d history positions, r modes.
@@ -29,8 +26,8 @@ def edge_indices(
     self_loops: bool = False,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """The edges between modes, which come first, and body nodes: senders in row 0 and receivers, ascending, in row 1
-    (PyG's order), shape (2, E).
+    """The edges between modes, which come first, and body nodes: senders in row 0 and receivers, ascending, in row 1,
+    shape (2, E).
 
     "complete" is every ordered pair of different nodes; "star" only those with one mode and one body node.
     """

@@ -16,13 +16,12 @@ Shapes: B batch, V nodes, E edges, H hidden width.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
-from torch_geometric.nn import MessagePassing
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "silu": nn.SiLU, "gelu": nn.GELU, "tanh": nn.Tanh}
 # Edges that go through the network at once on a CPU when nothing is kept for gradients.
@@ -175,11 +174,9 @@ class IndexedAdjacency:
         self.degree = torch.bincount(self.receiver, minlength=node_count)[:, None]
 
     def spread(self, edges: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
-        """As `CompleteAdjacency.spread`."""
         return edges + receiver.index_select(1, self.receiver) + sender.index_select(1, self.sender)
 
     def gather(self, edges: Tensor) -> Tensor:
-        """As `CompleteAdjacency.gather`."""
         empty = edges.new_zeros(len(edges), self.node_count, edges.shape[-1])
         return empty.index_add(1, self.receiver, edges)
 
@@ -212,6 +209,11 @@ def keep_freed_memory() -> None:
     M_MMAP_THRESHOLD): one such block is enough, and it is never touched.
     """
     torch.empty(2**25 - 2**16, dtype=torch.uint8)
+
+
+def in_place(activation: nn.Module) -> Callable[[Tensor], Tensor]:
+    """The activation, overwriting its input where it can."""
+    return torch.relu_ if isinstance(activation, nn.ReLU) else activation
 
 
 class MLP(nn.Module):
@@ -251,11 +253,6 @@ class MLP(nn.Module):
         last = self.rest[-1]
         return last if isinstance(last, nn.LayerNorm) else None
 
-    def activate(self, x: Tensor) -> Tensor:
-        """The activation; ReLU overwrites `x`."""
-        activation = self.rest[0]
-        return x.relu_() if isinstance(activation, nn.ReLU) else activation(x)
-
     def layers(self, x: Tensor, linears: Sequence[nn.Linear]) -> Tensor:
         """Some of the linear layers, each with its activation."""
         relu = isinstance(self.rest[0], nn.ReLU)
@@ -268,10 +265,6 @@ class MLP(nn.Module):
     def hidden(self, x: Tensor) -> Tensor:
         """The last hidden layer, (..., inputs) to (..., hidden)."""
         return self.layers(x, self.linears[:-1])
-
-    def hidden_after_first(self, x: Tensor) -> Tensor:
-        """The last hidden layer from what the first linear layer gives, which is overwritten."""
-        return self.layers(self.activate(x), self.linears[1:-1])
 
     def ending(self, hidden: Tensor) -> Tensor | Unapplied:
         """The output from the last hidden layer; where the last step is linear it is left for later."""
@@ -306,7 +299,7 @@ def value_of(features: Tensor | Unapplied) -> Tensor:
     return features.value() if isinstance(features, Unapplied) else features
 
 
-class InteractionNetwork(MessagePassing):
+class InteractionNetwork(nn.Module):
     r"""One message-passing step of an interaction network (Battaglia et al. 2016, arXiv:1612.00222).
 
     .. math::
@@ -325,7 +318,7 @@ class InteractionNetwork(MessagePassing):
         residual: bool = False,
         activation: str = "relu",
     ) -> None:
-        super().__init__(aggr="sum", node_dim=-2)
+        super().__init__()
         self.width = width
         self.residual = residual
         self.edge_mlp = MLP(3 * width, hidden, hidden_layers, width, layer_norm, activation)
@@ -333,19 +326,12 @@ class InteractionNetwork(MessagePassing):
 
     def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
         """New nodes (..., V, width) and edges (..., E, width) from old ones; senders are row 0 of edge_index (2, E)."""
-        updated = self.edge_updater(edge_index, nodes=nodes, edges=edges)
-        count = nodes.shape[-2]
-        summed = self.propagate(edge_index, edges=updated, size=(count, count))
+        sender, receiver = edge_index
+        seen = [edges, nodes.index_select(-2, receiver), nodes.index_select(-2, sender)]
+        updated = self.edge_mlp(torch.cat(seen, dim=-1))
+        summed = torch.zeros_like(nodes).index_add(-2, receiver, updated)
         moved = self.node_mlp(torch.cat([nodes, summed], dim=-1))
         return (nodes + moved, edges + updated) if self.residual else (moved, updated)
-
-    def edge_update(self, nodes_i: Tensor, nodes_j: Tensor, edges: Tensor) -> Tensor:
-        """The edge MLP on edge, receiver and sender; shape (..., E, width)."""
-        return self.edge_mlp(torch.cat([edges, nodes_i, nodes_j], dim=-1))
-
-    def message(self, edges: Tensor) -> Tensor:
-        """What an edge sends is its updated feature."""
-        return edges
 
     def rearranged(
         self, nodes: Tensor, edges: Tensor | Unapplied, adjacency: Adjacency
@@ -360,7 +346,8 @@ class InteractionNetwork(MessagePassing):
         spread = adjacency.spread(
             own, nn.functional.linear(nodes, receiver_weight), nn.functional.linear(nodes, sender_weight)
         )
-        updated = self.edge_mlp.ending(self.edge_mlp.hidden_after_first(spread))
+        hidden = self.edge_mlp.layers(in_place(self.edge_mlp.rest[0])(spread), self.edge_mlp.linears[1:-1])
+        updated = self.edge_mlp.ending(hidden)
         summed = updated.gathered(adjacency) if isinstance(updated, Unapplied) else adjacency.gather(updated)
         moved = value_of(self.node_mlp.ending(self.node_mlp.hidden(torch.cat([nodes, summed], dim=-1))))
         if self.residual:

@@ -85,7 +85,6 @@ class LatentDynamics(Dynamics):
 
     @classmethod
     def from_card(cls, card: Mapping[str, Any], state: Mapping[str, Tensor]) -> LatentDynamics:
-        """As for all `Dynamics`."""
         model = card["model"]
         for key in ("hidden_layers", "message_passing_steps"):
             if model[key] > len(state):
@@ -174,16 +173,6 @@ class LatentDynamics(Dynamics):
         numbers = self.context.normalise(self.known_context(context))[:, None].expand(-1, modes + nodes, -1)
         return torch.cat([told, numbers], dim=-1)
 
-    def force_contributions(self, prediction: Prediction) -> tuple[Tensor, Tensor]:
-        """Force [N] and torque [N m] that each node adds, float64, shape (B, V, 3) each.
-
-        Every node carries 1/V of the mean, so that the sum over nodes, not the average, is the physical quantity.
-        """
-        count = prediction.force.shape[-2]
-        force = prediction.force.double() * self.force.scale + self.force.mean / count
-        torque = prediction.torque.double() * self.torque.scale + self.torque.mean / count
-        return force, torque
-
     def advance(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Step:
         """As for all `Dynamics`: z+ = z + (z - z-) + a, or z + v; a predicted body of points kept rigid if so set."""
         return self.stepped(self(latent, body, context), latent, body)
@@ -198,7 +187,10 @@ class LatentDynamics(Dynamics):
 
     def taken(self, prediction: Prediction, latent: Tensor, body: BodyTrack) -> Step:
         """The step of a prediction, as it is."""
-        force, torque = self.force_contributions(prediction)
+        # Every node carries 1/V of the mean, so that the sum over nodes, not the average, is the physical quantity.
+        nodes = prediction.force.shape[-2]
+        force = prediction.force.double() * self.force.scale + self.force.mean / nodes
+        torque = prediction.torque.double() * self.torque.scale + self.torque.mean / nodes
         following = latent[:, -1] + self.change.denormalise(prediction.change[:, : self.num_modes])
         if self.settings.predicts == "acceleration":
             following = following + (latent[:, -1] - latent[:, -2])
@@ -209,7 +201,6 @@ class LatentDynamics(Dynamics):
         return Step(following, force.sum(-2), torque.sum(-2), displacement)
 
     def latent_statistics(self) -> tuple[Tensor, Tensor]:
-        """As for all `Dynamics`."""
         return self.position.mean, self.position.scale
 
     def body_displacement(self, prediction: Prediction, body: BodyTrack) -> Tensor:
@@ -380,7 +371,6 @@ class PathStepper(Stepper):
         return following, load
 
     def advance(self, latent: Tensor, body: BodyTrack) -> Step:
-        """As for all steppers."""
         with torch.inference_mode():
             features, places = self.windows(body)
             decoded = self.decoded(latent[0], features[0], places[0])

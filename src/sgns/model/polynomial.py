@@ -73,7 +73,6 @@ class PolynomialDynamics(Dynamics):
 
     @classmethod
     def from_card(cls, card: Mapping[str, Any], state: Mapping[str, Tensor]) -> PolynomialDynamics:
-        """As for all `Dynamics`."""
         model, num_modes, used = card["model"], int(card["num_modes"]), card["used"]
         most = len(used) * (len(used) + 1) // 2 if model["degree"] == 2 else len(used)
         groups = len(state["inputs.mean"]) // (3 * num_modes)
@@ -83,7 +82,6 @@ class PolynomialDynamics(Dynamics):
         return cls(PolynomialSettings(**model), num_modes, *told, used)
 
     def card(self) -> dict[str, Any]:
-        """As for all `Dynamics`."""
         return super().card() | {"used": self.used.tolist()}
 
     @property

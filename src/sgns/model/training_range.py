@@ -7,16 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mpm_warp.poses import in_world_frame
 from sgns.model.features import body_track, context_of
-
-if TYPE_CHECKING:
-    from sgns.reduction.reduce import ReducedRun
-
+from sgns.reduction.reduce import ReducedRun
 
 NOTEWORTHY = 0.05
 """Excess above which a path is called unlike the training runs; held-out runs of the same kind stay below it

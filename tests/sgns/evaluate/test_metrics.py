@@ -218,18 +218,10 @@ def test_one_frame_of_history_has_no_velocity():
     assert errors.constant_velocity == pytest.approx(errors.frozen)
 
 
-@pytest.mark.parametrize(
-    ("shown", "history", "words"),
-    [
-        (np.s_[:-1], 2, "frames 8 against 9"),
-        (np.s_[:, :-1], 2, "particles 6 against 7"),
-        (np.s_[:], 9, "nothing is left to compare"),
-    ],
-)
-def test_incomparable_runs_are_refused(shown, history, words):
+def test_a_run_of_nothing_but_its_history_is_refused():
     truth = random_walk()
-    with pytest.raises(UserError, match=words):
-        compared(truth, truth[shown], history=history)
+    with pytest.raises(UserError, match="nothing is left to compare"):
+        compared(truth, truth, history=9)
 
 
 def test_force_metrics_by_hand():

@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from sgns.evaluate.metrics import ParticleErrors, PositionErrors, VectorErrors
 from sgns.evaluate.report import (
     FigureGroup,
     ReportFigure,
     describe,
-    file_name,
     fixed,
     number,
+    picture,
     render_report,
     short_names,
 )
@@ -214,7 +215,7 @@ def test_description_and_file_name():
     wheel = {"diameter": 0.15, "load": 100.0, "slip": 0.4, "friction_angle": 30.0, "gravity": 3.72}
     assert describe(wheel) == "15 cm wheel, 100 N, slip 40 %, friction angle 30°, gravity 3.72 m/s²"
     assert describe({"kind": "bed"}) == ""
-    assert file_name("../a b/ü.h5") == "-a-b-h5"
+    assert picture("../a b/ü.h5", "", "", Figure()).name == "-a-b-h5"
 
 
 def test_short_names_still_tell_runs_apart():

@@ -18,9 +18,9 @@ from sgns.config import UserError
 from sgns.data.dataset import SPLITS
 from sgns.frontier import measure
 from sgns.frontier import study as timing
-from sgns.frontier.command import axes_of, main, points_with_errors, scene_figures, with_errors
+from sgns.frontier.command import main, points_with_errors, scene_figures, with_errors
 from sgns.frontier.point import Point, read_points
-from sgns.frontier.study import AXES, Study, composed, composed_scene
+from sgns.frontier.study import Study, composed, composed_scene
 from sgns.simulate.campaign import plan
 from sgns.simulate.scene import asked_effects
 
@@ -139,10 +139,6 @@ def test_a_damaged_point_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "points" / "a.json").write_text(text)
     with pytest.raises(UserError, match=r"a\.json is no operating point"):
         main(settings(tmp_path, "none"))
-
-
-def test_axes() -> None:
-    assert axes_of("all") == AXES and axes_of("none") == () and axes_of("solver") == ("solver",)
 
 
 def shipped_study(name: str) -> Study:

@@ -34,15 +34,14 @@ def test_force_is_the_sum_of_contributions(data, body_nodes) -> None:
     batch = windows.windows(windows.targets[5:9])
     prediction = dynamics(batch.history, batch.body)
     nodes = 4 + (1 if body_nodes == "pose" else 15)
-    contributions, turning = dynamics.force_contributions(prediction)
-    assert contributions.shape == turning.shape == (4, nodes, 3)
+    assert prediction.force.shape == prediction.torque.shape == (4, nodes, 3)
     _, force, torque, _ = dynamics.advance(batch.history, batch.body)
-    torch.testing.assert_close(contributions.sum(1), force)
-    torch.testing.assert_close(turning.sum(1), torque)
     # The mean is in the sum once, however many nodes share it.
-    torch.testing.assert_close(
-        force, dynamics.force.mean + dynamics.force.scale * prediction.force.sum(1).double()
-    )
+    for found, unit, shares in (
+        (force, dynamics.force, prediction.force),
+        (torque, dynamics.torque, prediction.torque),
+    ):
+        torch.testing.assert_close(found, unit.mean + unit.scale * shares.sum(1).double())
 
 
 def test_position_update(data) -> None:
