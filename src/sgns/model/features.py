@@ -26,8 +26,8 @@ def edge_indices(
     self_loops: bool = False,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """The edges between modes, which come first, and body nodes: senders in row 0 and receivers, ascending, in row 1,
-    shape (2, E).
+    """The edges between modes, which come first, and body nodes: senders in row 0 and receivers, ascending, in row 1
+    (PyG's order), shape (2, E).
 
     "complete" is every ordered pair of different nodes; "star" only those with one mode and one body node.
     """

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+from torch_geometric.nn import MessagePassing
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "silu": nn.SiLU, "gelu": nn.GELU, "tanh": nn.Tanh}
 # Edges that go through the network at once on a CPU when nothing is kept for gradients.
@@ -299,7 +300,7 @@ def value_of(features: Tensor | Unapplied) -> Tensor:
     return features.value() if isinstance(features, Unapplied) else features
 
 
-class InteractionNetwork(nn.Module):
+class InteractionNetwork(MessagePassing):
     r"""One message-passing step of an interaction network (Battaglia et al. 2016, arXiv:1612.00222).
 
     .. math::
@@ -318,7 +319,7 @@ class InteractionNetwork(nn.Module):
         residual: bool = False,
         activation: str = "relu",
     ) -> None:
-        super().__init__()
+        super().__init__(aggr="sum", node_dim=-2)
         self.width = width
         self.residual = residual
         self.edge_mlp = MLP(3 * width, hidden, hidden_layers, width, layer_norm, activation)
@@ -326,12 +327,19 @@ class InteractionNetwork(nn.Module):
 
     def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
         """New nodes (..., V, width) and edges (..., E, width) from old ones; senders are row 0 of edge_index (2, E)."""
-        sender, receiver = edge_index
-        seen = [edges, nodes.index_select(-2, receiver), nodes.index_select(-2, sender)]
-        updated = self.edge_mlp(torch.cat(seen, dim=-1))
-        summed = torch.zeros_like(nodes).index_add(-2, receiver, updated)
+        updated = self.edge_updater(edge_index, nodes=nodes, edges=edges)
+        count = nodes.shape[-2]
+        summed = self.propagate(edge_index, edges=updated, size=(count, count))
         moved = self.node_mlp(torch.cat([nodes, summed], dim=-1))
         return (nodes + moved, edges + updated) if self.residual else (moved, updated)
+
+    def edge_update(self, nodes_i: Tensor, nodes_j: Tensor, edges: Tensor) -> Tensor:
+        """The edge MLP on edge, receiver and sender; shape (..., E, width)."""
+        return self.edge_mlp(torch.cat([edges, nodes_i, nodes_j], dim=-1))
+
+    def message(self, edges: Tensor) -> Tensor:
+        """What an edge sends is its updated feature."""
+        return edges
 
     def rearranged(
         self, nodes: Tensor, edges: Tensor | Unapplied, adjacency: Adjacency
