@@ -117,7 +117,9 @@ def _run(arguments: list[str]) -> int:
         if arguments[0] == "--version":
             write_output(f"sgns {__version__}\n")
             return 0
-        command, rest = _split(arguments)
+        command, *rest = arguments
+        if command not in COMMANDS:
+            raise UserError(f"unknown command {command!r}; commands: {', '.join(COMMANDS)}; see sgns --help")
         name = f"sgns {command}"
         if "--help" in rest or "-h" in rest:
             from sgns.cli.help import command_help
@@ -198,7 +200,7 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
         # Not `hydra.main`: it takes no loader, and has flags of its own that run what they find in a file.
-        hydra.config_loader = CheckedLoader(hydra.config_loader, settings)
+        hydra.config_loader = CheckedLoader(hydra.config_loader.get_search_path(), settings)
         if arguments.cfg is not None:
             _show_settings(hydra, command, arguments)
         elif arguments.info is not None:
@@ -206,13 +208,8 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
         else:
             mode = hydra.get_mode(config_name=command, overrides=settings)
             sweep = arguments.multirun or (mode == RunMode.MULTIRUN and not arguments.run)
-            run = hydra.multirun if sweep else hydra.run
-            mode = RunMode.MULTIRUN if sweep else RunMode.RUN
-            run(
-                config_name=command,
-                task_function=run_command,
-                overrides=[*settings, f"hydra.mode={mode.name}"],
-            )
+            run, mode = (hydra.multirun, RunMode.MULTIRUN) if sweep else (hydra.run, RunMode.RUN)
+            run(command, task_function=run_command, overrides=[*settings, f"hydra.mode={mode.name}"])
 
 
 def _show_settings(hydra: Any, command: str, arguments: argparse.Namespace) -> None:
@@ -257,14 +254,6 @@ Examples:
   sgns simulate scene=excavation scene.depth=0.08 scene.speed=0.10 scene.rake=10 output=run.h5
   sgns train dataset=quick reduction.num_modes=8 output=outputs/first
 """
-
-
-def _split(arguments: list[str]) -> tuple[str, list[str]]:
-    """The command and what follows it."""
-    command, *rest = arguments
-    if command not in COMMANDS:
-        raise UserError(f"unknown command {command!r}; commands: {', '.join(COMMANDS)}; see sgns --help")
-    return command, rest
 
 
 def _parsed(command: str, arguments: list[str]) -> argparse.Namespace:

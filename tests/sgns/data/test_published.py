@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import runpy
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mpm_warp import Wheel
 from sgns.config import UserError
-from sgns.data.published import excavation_case, fingerprint, published_dataset, read_published, wheel_case
+from sgns.data.published import fingerprint, published_dataset, read_published
 from sgns_testing.commands import refusal, sgns
 from sgns_testing.published import record
+
+SCRIPT = runpy.run_path(str(Path(__file__).parents[3] / "experiments" / "published_forces" / "run.py"))
+excavation_case, wheel_case = SCRIPT["excavation_case"], SCRIPT["wheel_case"]
 
 
 def write(folder, records, cases, split="valid"):
