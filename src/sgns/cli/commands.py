@@ -85,15 +85,10 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class _Stopped(BaseException):
-    """Ends the process with one line.
+    """Ends the process with one line and a status.
 
     Not an `Exception`: Hydra would write a line of its own about those before it passes them on.
     """
-
-    def __init__(self, line: str, status: int) -> None:
-        super().__init__(line)
-        self.line = line
-        self.status = status
 
 
 def main() -> int:
@@ -129,14 +124,14 @@ def _run(arguments: list[str]) -> int:
         _run_hydra(command, _parsed(command, rest))
         return 0
     except _Stopped as stop:
-        write_error(f"{name}: {stop.line}")
-        return stop.status
+        line, status = stop.args
+        write_error(f"{name}: {line}")
+        return status
     except KeyboardInterrupt:
         write_error(f"{name}: interrupted")
         return 130
     except Exception as error:
-        line = _line_of(error)
-        if line is None:
+        if (line := _line_of(error)) is None:
             raise
         _show_traceback()
         write_error(f"{name}: {line}")
@@ -167,8 +162,7 @@ def run_command(cfg: DictConfig) -> float | None:
             raise
         interrupted = True
     except Exception as error:
-        line = _line_of(error)
-        if line is None:
+        if (line := _line_of(error)) is None:
             raise
         _drop_empty_output(hydra_cfg)
         if not hydra_cfg.launcher._target_.endswith("BasicLauncher"):

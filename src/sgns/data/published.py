@@ -20,7 +20,6 @@ from mpm_warp.poses import fitted_poses
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
 from sgns.data.files import parse_json
-from sgns.numbers import is_whole
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, ReducedRun
 
@@ -218,11 +217,11 @@ def published_dataset(settings: Mapping[str, Any], num_modes: int | str) -> Redu
     else:
         split["train"] = everything = [run for found in runs.values() for run in found]
         if folds is not None:
-            if not is_whole(folds) or not 2 <= folds <= len(everything):
+            if folds > len(everything):
                 raise UserError(
                     f"dataset.folds is {folds!r}; allowed: 2 to {len(everything)}, the number of runs, or null"
                 )
-            if not is_whole(fold) or not 0 <= fold < folds:
+            if fold >= folds:
                 raise UserError(f"dataset.fold is {fold!r}; allowed: 0 to {folds - 1}")
             split["test"] = everything[fold::folds]
             split["train"] = [run for i, run in enumerate(everything) if i % folds != fold]

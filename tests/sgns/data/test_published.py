@@ -114,7 +114,7 @@ def test_a_folder_becomes_a_dataset(tmp_path):
         np.testing.assert_allclose(run.pose[0, :3], [0.1, 0.3, 0.05], atol=1e-6)
         np.testing.assert_allclose(run.pose[:, 0], 0.1 + 0.01 * np.arange(8), atol=1e-6)
         np.testing.assert_allclose(run.latent[1] - run.latent[0], [[-0.1, 0.1, 0.1]] * 2, atol=1e-6)
-    for wrong in ({"folds": 5}, {"folds": 2, "fold": 2}, {"folds": 2.5}):
+    for wrong in ({"folds": 5}, {"folds": 2, "fold": 2}):
         with pytest.raises(UserError, match=r"dataset\.fold"):
             published_dataset(settings | wrong, 2)
     with pytest.raises(UserError, match="holds 2 modes"):
