@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
-from typing import Any, ClassVar
+from typing import Any
 
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
@@ -231,16 +230,6 @@ def _refusal(path: Keys, value: Any, hint: str = "") -> UserError:
 
 
 # --- How settings are put together: by Hydra, with a look at each result before anybody acts on it ------
-
-
-class ConfigDir(SearchPathPlugin):
-    """Adds the folder of `--config-dir` to the places where options of groups are found."""
-
-    folder: ClassVar[str | None] = None
-
-    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        if ConfigDir.folder is not None:
-            search_path.append("command-line", f"file://{ConfigDir.folder}")
 
 
 class CheckedLoader(ConfigLoaderImpl):
