@@ -149,18 +149,13 @@ def run_command(cfg: DictConfig) -> float | None:
     assert name is not None and hydra_cfg.mode is not None
     in_sweep = hydra_cfg.mode.name == "MULTIRUN"
     label = f"job {hydra_cfg.job.num} ({_one_line(hydra_cfg.job.override_dirname)}): " if in_sweep else ""
-    interrupted = False
     try:
         _place_output(cfg, hydra_cfg, COMMANDS[name], in_sweep)
         check_shared(cfg, name, COMMANDS[name].needs)
         return importlib.import_module(COMMANDS[name].module).main(cfg)
     except KeyboardInterrupt:
-        interrupted = True
-    except SystemExit as error:
-        # Lightning turns Ctrl-C into an exit with status 1
-        if not isinstance(error.__context__, KeyboardInterrupt):
-            raise
-        interrupted = True
+        kept = _drop_empty_output(hydra_cfg)
+        raise _Stopped(label + _interruption(cfg, name, kept), 130) from None
     except Exception as error:
         if (line := _line_of(error)) is None:
             raise
@@ -169,9 +164,6 @@ def run_command(cfg: DictConfig) -> float | None:
             raise  # this is another process; the line is made in the first one
         _show_traceback()
         raise _Stopped(label + line, 2) from None
-    assert interrupted
-    kept = _drop_empty_output(hydra_cfg)
-    raise _Stopped(label + _interruption(cfg, name, kept), 130) from None
 
 
 def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
@@ -309,10 +301,10 @@ def _place_output(cfg: DictConfig, hydra_cfg: Any, command: Command, in_sweep: b
         cfg.output = str(folder.relative_to(here) if folder.is_relative_to(here) else folder)
     elif command.output == "file" and in_sweep and cfg.output is not None:
         path = Path(cfg.output).expanduser()
-        folder = (
-            path.parent / str(hydra_cfg.job.num) if path.is_absolute() else Path(hydra_cfg.runtime.output_dir)
-        )
-        cfg.output = str(folder / (path.name if path.is_absolute() else path))
+        if path.is_absolute():
+            cfg.output = str(path.parent / str(hydra_cfg.job.num) / path.name)
+        else:
+            cfg.output = str(Path(hydra_cfg.runtime.output_dir) / path)
 
 
 def _drop_empty_output(hydra_cfg: Any) -> bool:
