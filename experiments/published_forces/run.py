@@ -13,14 +13,17 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from omegaconf import OmegaConf
 
 from mpm_warp import Scene, Wheel
-from sgns.data.published import PublishedRun, excavation_case, read_published, wheel_case
+from sgns.config import UserError
+from sgns.data.published import DIAMETERS, PublishedRun, read_published
 from sgns.data.run import Run
 from sgns.simulate.campaign import Campaign
 from sgns.simulate.command import simulate_campaign
@@ -33,7 +36,6 @@ from common import composed, write_rows  # noqa: E402
 
 WINDOW = 15  # frames of the centred mean: ours are frame means, theirs samples of one substep
 FIRST = 10  # the frames before hold the published runs' settling spike; they enter nowhere
-CASE = {"excavation": excavation_case, "wheel": wheel_case}
 RESULT = {  # kind and whether at the reference setting -> names of table and figure
     ("excavation", False): ("table", "histories"),
     ("excavation", True): ("table_excavation", "histories_excavation"),
@@ -51,6 +53,44 @@ THEIR_WHEEL = (  # what scene=published_wheel has of the wheel and its motion, b
 )
 
 
+DEPTHS = (0.02, 0.04, 0.05, 0.08, 0.10)  # [m]
+SPEEDS = (0.01, 0.04, 0.08, 0.10, 0.15)  # [m/s]
+RAKES = (0.0, 3.8, 10.0, 30.8, 45.0)  # [degrees]
+MOTIONS = ("ramp", "curved")
+GRAVITIES = (1.62, 3.72, 9.81)  # [m/s^2]
+# Forward speeds 15.60, 12.00, 5.85 mm/s at a rim speed of 19.5; named 20, 40, 70 %.
+SLIPS = (0.2, 5.0 / 13.0, 0.7)
+LOADS = (100.0, 164.0, 225.0)  # [N]
+WIDTHS = {0.05: 0.25 / 3, 0.15: 0.25 / 3, 0.30: 0.125}  # of each diameter [m]
+ANGLES = (30.0, 37.0, 43.0)  # friction angles [degrees]
+
+
+def _case(kind: str, case: int, **values: tuple[Any, ...]) -> dict[str, Any]:
+    """The combination of values that has this number, counted from 1, the last one changing fastest."""
+    grid = list(product(*values.values()))
+    if not 1 <= case <= len(grid):
+        raise UserError(f"published {kind} case {case}: allowed are 1 to {len(grid)}")
+    return dict(zip(values, grid[case - 1], strict=True))
+
+
+def excavation_case(case: int) -> dict[str, float | str]:
+    """Depth [m], speed [m/s], rake [degrees] and motion of a published excavation run, numbered from 1."""
+    return _case("excavation", case, depth=DEPTHS, speed=SPEEDS, rake=RAKES, motion=MOTIONS)
+
+
+def wheel_case(case: int) -> dict[str, float]:
+    """Gravity [m/s^2], slip, load [N], diameter [m], friction angle [degrees] and width [m] of a published wheel run,
+    numbered from 1. The 5 cm wheel carries a ninth of the loads."""
+    values = {"gravity": GRAVITIES, "slip": SLIPS, "load": LOADS, "diameter": DIAMETERS}
+    found = _case("wheel", case, **values, friction_angle=ANGLES)
+    if found["diameter"] == DIAMETERS[0]:
+        found["load"] /= 9.0
+    return found | {"width": WIDTHS[found["diameter"]]}
+
+
+CASE = {"excavation": excavation_case, "wheel": wheel_case}
+
+
 def smoothed(series: np.ndarray) -> np.ndarray:
     """Centred mean over WINDOW of the frames from FIRST on; frames without a full window are left out."""
     return np.convolve(series[FIRST:], np.ones(WINDOW) / WINDOW, mode="valid")
@@ -64,8 +104,7 @@ def nrmse(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 def campaign_of(options: argparse.Namespace) -> tuple[list[PublishedRun], Campaign]:
     """The published runs in the order of their cases, and the campaign that makes them."""
-    bin_size = scene_from_config(composed("simulate", f"scene=published_{options.kind}")).bed.size
-    published = read_published(options.published, bin_size)
+    published = read_published(options.published)
     wanted = [run for run in published if not options.cases or run.case in options.cases]
     published = sorted(wanted, key=lambda run: run.case)
     name = options.kind if options.reference else f"published_{options.kind}"

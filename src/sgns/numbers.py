@@ -147,13 +147,10 @@ def _unit_poses(poses: np.ndarray, what: str, where: str = " at frame {}") -> np
 
 # --- From a clock ---------------------------------------------------------------------------------------
 
-LEAST_TIME = 1.0e-9
-"""[s]; the clocks count in such steps."""
-
 
 def elapsed(began: float, now: float) -> float:
     """Time between two readings of a clock [s], above 0, so that one may divide by it.
 
     The clock of a virtual machine that was paused may stand still or go back.
     """
-    return max(now - began, LEAST_TIME)
+    return max(now - began, 1e-9)  # the clocks count in such steps

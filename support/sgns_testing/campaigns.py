@@ -32,5 +32,7 @@ def job(scene: Scene, file: Path) -> Any:
     """A run as a campaign sends it to a worker process."""
     from sgns.simulate.workers import _Job
 
-    effects, reasons = Effects(), Effects().described()
-    return _Job("tiny", 0, scene.to_dict(), scene.mesh, file, effects, reasons, 0, "cpu", "float32")
+    effects = Effects()
+    physics = {"effects": effects, "reasons": effects.described(), "seed": 0}
+    physics |= {"device": "cpu", "precision": "float32"}
+    return _Job("tiny", 0, scene.to_dict(), scene.mesh, file, physics)

@@ -148,7 +148,7 @@ def test_soil_is_decoded_from_the_modes(trained) -> None:
 
 def test_it_knows_where_it_comes_from(trained) -> None:
     data, simulator = trained.data, trained.simulator("pose")
-    assert simulator.arrangement_hash == data.arrangement_hash
+    assert simulator.arrangement_hash == data.basis.arrangement_hash
     assert simulator.scene == data.runs("train")[0].scene
     assert (simulator.num_modes, simulator.history, simulator.frame_rate) == (4, 3, 60.0)
     assert simulator.basis.fitted_on == ["a", "b", "c", "d"]

@@ -85,15 +85,10 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class _Stopped(BaseException):
-    """Ends the process with one line.
+    """Ends the process with one line and a status.
 
     Not an `Exception`: Hydra would write a line of its own about those before it passes them on.
     """
-
-    def __init__(self, line: str, status: int) -> None:
-        super().__init__(line)
-        self.line = line
-        self.status = status
 
 
 def main() -> int:
@@ -117,7 +112,9 @@ def _run(arguments: list[str]) -> int:
         if arguments[0] == "--version":
             write_output(f"sgns {__version__}\n")
             return 0
-        command, rest = _split(arguments)
+        command, *rest = arguments
+        if command not in COMMANDS:
+            raise UserError(f"unknown command {command!r}; commands: {', '.join(COMMANDS)}; see sgns --help")
         name = f"sgns {command}"
         if "--help" in rest or "-h" in rest:
             from sgns.cli.help import command_help
@@ -127,14 +124,14 @@ def _run(arguments: list[str]) -> int:
         _run_hydra(command, _parsed(command, rest))
         return 0
     except _Stopped as stop:
-        write_error(f"{name}: {stop.line}")
-        return stop.status
+        line, status = stop.args
+        write_error(f"{name}: {line}")
+        return status
     except KeyboardInterrupt:
         write_error(f"{name}: interrupted")
         return 130
     except Exception as error:
-        line = _line_of(error)
-        if line is None:
+        if (line := _line_of(error)) is None:
             raise
         _show_traceback()
         write_error(f"{name}: {line}")
@@ -152,30 +149,21 @@ def run_command(cfg: DictConfig) -> float | None:
     assert name is not None and hydra_cfg.mode is not None
     in_sweep = hydra_cfg.mode.name == "MULTIRUN"
     label = f"job {hydra_cfg.job.num} ({_one_line(hydra_cfg.job.override_dirname)}): " if in_sweep else ""
-    interrupted = False
     try:
         _place_output(cfg, hydra_cfg, COMMANDS[name], in_sweep)
         check_shared(cfg, name, COMMANDS[name].needs)
         return importlib.import_module(COMMANDS[name].module).main(cfg)
     except KeyboardInterrupt:
-        interrupted = True
-    except SystemExit as error:
-        # Lightning turns Ctrl-C into an exit with status 1
-        if not isinstance(error.__context__, KeyboardInterrupt):
-            raise
-        interrupted = True
+        kept = _drop_empty_output(hydra_cfg)
+        raise _Stopped(label + _interruption(cfg, name, kept), 130) from None
     except Exception as error:
-        line = _line_of(error)
-        if line is None:
+        if (line := _line_of(error)) is None:
             raise
         _drop_empty_output(hydra_cfg)
         if not hydra_cfg.launcher._target_.endswith("BasicLauncher"):
             raise  # this is another process; the line is made in the first one
         _show_traceback()
         raise _Stopped(label + line, 2) from None
-    assert interrupted
-    kept = _drop_empty_output(hydra_cfg)
-    raise _Stopped(label + _interruption(cfg, name, kept), 130) from None
 
 
 def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
@@ -183,22 +171,24 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
     # With this variable Hydra passes errors on as they are, in place of its own block of text and status 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     from hydra import initialize_config_module
+    from hydra.core.config_search_path import SearchPathQuery
     from hydra.core.global_hydra import GlobalHydra
-    from hydra.core.plugins import Plugins
     from hydra.types import RunMode
 
-    from sgns.cli.settings import CheckedLoader, ConfigDir
+    from sgns.cli.settings import CheckedLoader
 
     if arguments.config_dir is not None and not os.path.isdir(arguments.config_dir):
         raise UserError(f"--config-dir: folder '{arguments.config_dir}' not found")
-    Plugins.instance().register(ConfigDir)
-    ConfigDir.folder = None if arguments.config_dir is None else os.path.abspath(arguments.config_dir)
     settings = arguments.settings
     with initialize_config_module("sgns.conf", job_name="sgns", version_base="1.3"):
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
+        places = hydra.config_loader.get_search_path()
+        if arguments.config_dir is not None:
+            folder = f"file://{os.path.abspath(arguments.config_dir)}"
+            places.append("command-line", folder, SearchPathQuery("main"))
         # Not `hydra.main`: it takes no loader, and has flags of its own that run what they find in a file.
-        hydra.config_loader = CheckedLoader(hydra.config_loader, settings)
+        hydra.config_loader = CheckedLoader(places, settings)
         if arguments.cfg is not None:
             _show_settings(hydra, command, arguments)
         elif arguments.info is not None:
@@ -206,13 +196,8 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
         else:
             mode = hydra.get_mode(config_name=command, overrides=settings)
             sweep = arguments.multirun or (mode == RunMode.MULTIRUN and not arguments.run)
-            run = hydra.multirun if sweep else hydra.run
-            mode = RunMode.MULTIRUN if sweep else RunMode.RUN
-            run(
-                config_name=command,
-                task_function=run_command,
-                overrides=[*settings, f"hydra.mode={mode.name}"],
-            )
+            run, mode = (hydra.multirun, RunMode.MULTIRUN) if sweep else (hydra.run, RunMode.RUN)
+            run(command, task_function=run_command, overrides=[*settings, f"hydra.mode={mode.name}"])
 
 
 def _show_settings(hydra: Any, command: str, arguments: argparse.Namespace) -> None:
@@ -257,14 +242,6 @@ Examples:
   sgns simulate scene=excavation scene.depth=0.08 scene.speed=0.10 scene.rake=10 output=run.h5
   sgns train dataset=quick reduction.num_modes=8 output=outputs/first
 """
-
-
-def _split(arguments: list[str]) -> tuple[str, list[str]]:
-    """The command and what follows it."""
-    command, *rest = arguments
-    if command not in COMMANDS:
-        raise UserError(f"unknown command {command!r}; commands: {', '.join(COMMANDS)}; see sgns --help")
-    return command, rest
 
 
 def _parsed(command: str, arguments: list[str]) -> argparse.Namespace:
@@ -324,10 +301,10 @@ def _place_output(cfg: DictConfig, hydra_cfg: Any, command: Command, in_sweep: b
         cfg.output = str(folder.relative_to(here) if folder.is_relative_to(here) else folder)
     elif command.output == "file" and in_sweep and cfg.output is not None:
         path = Path(cfg.output).expanduser()
-        folder = (
-            path.parent / str(hydra_cfg.job.num) if path.is_absolute() else Path(hydra_cfg.runtime.output_dir)
-        )
-        cfg.output = str(folder / (path.name if path.is_absolute() else path))
+        if path.is_absolute():
+            cfg.output = str(path.parent / str(hydra_cfg.job.num) / path.name)
+        else:
+            cfg.output = str(Path(hydra_cfg.runtime.output_dir) / path)
 
 
 def _drop_empty_output(hydra_cfg: Any) -> bool:

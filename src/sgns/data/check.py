@@ -10,11 +10,10 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
-from omegaconf import OmegaConf
 from scipy.spatial import cKDTree
 
 from mpm_warp.poses import in_body_frame, rotation_matrices
@@ -314,9 +313,7 @@ def main(cfg: DictConfig) -> float:
     Raises:
         UserError: A path is missing or a file has a problem; all problems have been listed before.
     """
-    settings = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
-    named = [settings["files"]] if isinstance(settings["files"], str) else settings["files"]
-    files = run_files(named)
+    files = run_files([cfg.files] if isinstance(cfg.files, str) else cfg.files)
     bad = 0
     for path in files:
         if problems := check_run(path):

@@ -249,9 +249,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         finally:
             new.discard()
     except OSError as error:
-        if error.filename is None or str(error.filename).endswith(
-            _SUFFIX
-        ):  # a full disk is reported without a name
+        # A full disk is reported without a name.
+        if error.filename is None or str(error.filename).endswith(_SUFFIX):
             error.filename = str(path)
         raise
 

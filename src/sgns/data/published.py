@@ -8,7 +8,6 @@ import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,7 +20,6 @@ from mpm_warp.poses import fitted_poses
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
 from sgns.data.files import parse_json
-from sgns.numbers import is_whole
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, ReducedRun
 
@@ -41,17 +39,7 @@ _MOST_METADATA = 1 << 22
 _LONGEST = 63  # bits before the last part of a number
 _MARGIN = 0.1  # the authors' bin starts at this coordinate on each axis [m]
 _BINS = {"excavation": (0.80, 0.60, 0.15), "wheel": (0.40, 0.19, 0.0583)}  # Lx, Ly, Lz [m]
-DEPTHS = (0.02, 0.04, 0.05, 0.08, 0.10)  # [m]
-SPEEDS = (0.01, 0.04, 0.08, 0.10, 0.15)  # [m/s]
-RAKES = (0.0, 3.8, 10.0, 30.8, 45.0)  # [degrees]
-MOTIONS = ("ramp", "curved")
-GRAVITIES = (1.62, 3.72, 9.81)  # [m/s^2]
-# Forward speeds 15.60, 12.00, 5.85 mm/s at a rim speed of 19.5; named 20, 40, 70 %.
-SLIPS = (0.2, 5.0 / 13.0, 0.7)
-LOADS = (100.0, 164.0, 225.0)  # [N]
-DIAMETERS = (0.05, 0.15, 0.30)  # [m]
-WIDTHS = {0.05: 0.25 / 3, 0.15: 0.25 / 3, 0.30: 0.125}  # of each diameter [m]
-ANGLES = (30.0, 37.0, 43.0)  # friction angles [degrees]
+DIAMETERS = (0.05, 0.15, 0.30)  # of the wheels [m]
 
 
 @dataclass(frozen=True)
@@ -71,29 +59,6 @@ class PublishedRun:
     shape (T, 0)."""
     case: int | None = None
     """Number of the run among all of its kind, from 1; None where metadata.json does not say."""
-
-
-def _case(kind: str, case: int, **values: tuple[Any, ...]) -> dict[str, Any]:
-    """The combination of values that has this number, counted from 1, the last one changing fastest."""
-    grid = list(product(*values.values()))
-    if not 1 <= case <= len(grid):
-        raise UserError(f"published {kind} case {case}: allowed are 1 to {len(grid)}")
-    return dict(zip(values, grid[case - 1], strict=True))
-
-
-def excavation_case(case: int) -> dict[str, float | str]:
-    """Depth [m], speed [m/s], rake [degrees] and motion of a published excavation run, numbered from 1."""
-    return _case("excavation", case, depth=DEPTHS, speed=SPEEDS, rake=RAKES, motion=MOTIONS)
-
-
-def wheel_case(case: int) -> dict[str, float]:
-    """Gravity [m/s^2], slip, load [N], diameter [m], friction angle [degrees] and width [m] of a published wheel run,
-    numbered from 1. The 5 cm wheel carries a ninth of the loads."""
-    values = {"gravity": GRAVITIES, "slip": SLIPS, "load": LOADS, "diameter": DIAMETERS}
-    found = _case("wheel", case, **values, friction_angle=ANGLES)
-    if found["diameter"] == DIAMETERS[0]:
-        found["load"] /= 9.0
-    return found | {"width": WIDTHS[found["diameter"]]}
 
 
 def read_published(folder: str | Path, split: str = "valid") -> list[PublishedRun]:
@@ -252,11 +217,11 @@ def published_dataset(settings: Mapping[str, Any], num_modes: int | str) -> Redu
     else:
         split["train"] = everything = [run for found in runs.values() for run in found]
         if folds is not None:
-            if not is_whole(folds) or not 2 <= folds <= len(everything):
+            if folds > len(everything):
                 raise UserError(
                     f"dataset.folds is {folds!r}; allowed: 2 to {len(everything)}, the number of runs, or null"
                 )
-            if not is_whole(fold) or not 0 <= fold < folds:
+            if fold >= folds:
                 raise UserError(f"dataset.fold is {fold!r}; allowed: 0 to {folds - 1}")
             split["test"] = everything[fold::folds]
             split["train"] = [run for i, run in enumerate(everything) if i % folds != fold]

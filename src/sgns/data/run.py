@@ -98,11 +98,7 @@ SERIES = {
 """What is recorded in every frame."""
 MESH = {
     "vertices": Recorded(
-        "parameters/tool/vertices",
-        ("V", 3),
-        "<f8",
-        "m",
-        "of the tool, about its centre of mass, body frame",
+        "parameters/tool/vertices", ("V", 3), "<f8", "m", "of the tool, about its centre of mass, body frame"
     ),
     "triangles": Recorded(
         "parameters/tool/triangles", ("F", 3), "<i4", "", "vertices of each triangle, facing outwards"

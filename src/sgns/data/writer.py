@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 import os
 from collections.abc import Mapping
 from pathlib import Path, PurePath
@@ -27,7 +26,6 @@ from sgns.data.run import (
     FORMAT,
     FORMAT_VERSION,
     MESH,
-    PRODUCERS,
     SERIES,
     STATE,
     STOPPED,
@@ -167,7 +165,7 @@ class RunWriter:
     Raises:
         UserError: the folder cannot be written, the disk is full, something else than a run of before would be
             destroyed, or a frame is not finite.
-        ValueError: an argument or frame has the wrong shape or value.
+        ValueError: a frame has the wrong shape or value.
     """
 
     def __init__(
@@ -185,12 +183,6 @@ class RunWriter:
         extra: Mapping[str, Any] | None = None,
         mesh: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        if producer not in PRODUCERS:
-            raise ValueError(f"producer is {producer!r}; allowed: {', '.join(PRODUCERS)}")
-        if particle_count < 1 or body_points < 0:
-            raise ValueError(f"{particle_count} particles, {body_points} body points; need at least 1 and 0")
-        if not (math.isfinite(frame_rate) and frame_rate > 0):
-            raise ValueError(f"frame_rate is {frame_rate}; it must be above 0 Hz")
         self.path = Path(path)
         counts = {"n": int(particle_count), "M": int(body_points)}
         self._shapes = {  # of one frame

@@ -221,7 +221,7 @@ def surrogate_point(study: Study, scene: StudyScene, entry: PointSettings, workl
     rate = f"scene.frame_rate={reduced.frame_rate}"
     scenes = {case: composed_scene([*changes, rate])[0] for case, changes in scene.cases.items()}
     for case, case_scene in scenes.items():
-        if case_scene.arrangement_hash != reduced.arrangement_hash:
+        if case_scene.arrangement_hash != reduced.basis.arrangement_hash:
             raise UserError(
                 f"study.scenes.{scene.name}.cases.{case} has another bed of particles than dataset={scene.dataset}, "
                 "so that no surrogate of it can be judged there; use the dataset's scene and bed"

@@ -31,7 +31,7 @@ def main(cfg: DictConfig) -> float:
         curves = reduction_curves(basis, validation)
         write_energy_table(curves, table)
     log.info("%s", "\n".join(energy_lines(curves, used)))
-    log.info("errors on %d training and %d validation runs", len(basis.fitted_on or []), len(validation))
+    log.info("errors on %d training and %d validation runs", len(basis.fitted_on), len(validation))
     log.info("every number of modes: %s; basis and reduced runs: %s", table, reduced.folder)
     return float(basis.residual_mse(used))
 

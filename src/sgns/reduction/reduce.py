@@ -59,9 +59,6 @@ def require_positions(path: Path, first: int, positions: np.ndarray) -> None:
 
 # --- How many modes are enough: `reduction.num_modes=auto` ----------------------------------------------
 
-MEASURES = ("position", "energy", "displacement_energy")
-"""What the number of modes is chosen by: error of positions, or one of the two energies."""
-
 
 def choose_modes(basis: Basis, settings: Mapping[str, Any], validation: Sequence[Path]) -> tuple[int, str]:
     """The fewest modes that are good enough, and why, as part of a sentence.
@@ -155,15 +152,8 @@ class ReducedDataset:
     start_positions: np.ndarray  # common start of the soil [m], shape (n, 3), float64
     _runs: Mapping[str, Sequence[ReducedRun]] = field(repr=False)
 
-    @property
-    def arrangement_hash(self) -> str:
-        """Of the particle arrangement all runs share."""
-        return self.basis.arrangement_hash
-
     def runs(self, split: str) -> list[ReducedRun]:
         """The runs of "train", "validation" or "test"."""
-        if split not in self._runs:
-            raise UserError(f"no split {split!r}; allowed: {', '.join(SPLITS)}")
         return list(self._runs[split])
 
 

@@ -106,18 +106,8 @@ def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
     precision = cfg.solver.precision
     if not any(o.startswith("solver.precision=") for o in overrides):
         precision = str(extra.get("precision", precision))
-    return Restart(
-        path,
-        Scene.from_dict(scene, mesh),
-        changes,
-        effects,
-        reasons,
-        precision,
-        run.seed,
-        state,
-        run.wall_time_s,
-        earlier,
-    )
+    whole, took = Scene.from_dict(scene, mesh), run.wall_time_s
+    return Restart(path, whole, changes, effects, reasons, precision, run.seed, state, took, earlier)
 
 
 def _effects(reasons: Mapping[str, Any], path: Path) -> Effects:

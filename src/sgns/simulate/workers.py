@@ -136,11 +136,8 @@ class _Job:
     """With the mesh, for `Scene.from_dict`."""
     mesh: tuple[np.ndarray, np.ndarray] | None
     file: Path
-    effects: Effects
-    reasons: dict[str, dict[str, Any]]
-    seed: int
-    device: str
-    precision: str
+    physics: dict[str, Any]
+    """As `scene_stages` takes it: effects, reasons, seed, device and precision."""
 
     def read_scene(self) -> Scene:
         return Scene.from_dict(self.scene, self.mesh)
@@ -157,16 +154,10 @@ class _Workers:
         self._jobs = []
         for number, name in enumerate(costs):
             scene, (effects, decisions) = campaign.scenes[name], campaign.physics[name]
-            run = (
-                name,
-                number,
-                scene.to_dict(),
-                scene.mesh,
-                campaign.file(name),
-                effects,
-                recorded(decisions),
-            )
-            self._jobs.append(_Job(*run, campaign.seed, device, campaign.precision))
+            physics = {"effects": effects, "reasons": recorded(decisions), "seed": campaign.seed}
+            physics |= {"device": device, "precision": campaign.precision}
+            file = campaign.file(name)
+            self._jobs.append(_Job(name, number, scene.to_dict(), scene.mesh, file, physics))
         context = multiprocessing.get_context("spawn")
         # Frames done of every run, and whether it has ended; each entry has one writer, so there is no lock.
         self._frames_done, self._ended = context.RawArray("q", len(costs)), context.RawArray("b", len(costs))
@@ -290,8 +281,9 @@ def _start_worker(frames_done: Any, ended: Any, barrier: Any) -> None:
 
 def _try(jobs: list[_Job]) -> tuple[list[int], float]:
     """Frames made of each run and the seconds they took all together, while the other workers do the same."""
-    scenes, effects = [job.read_scene() for job in jobs], [job.effects for job in jobs]
-    frames = frames_together(scenes, effects, jobs[0].device, jobs[0].precision, at_once=len(jobs))
+    scenes, effects = [job.read_scene() for job in jobs], [job.physics["effects"] for job in jobs]
+    device, precision = jobs[0].physics["device"], jobs[0].physics["precision"]
+    frames = frames_together(scenes, effects, device, precision, at_once=len(jobs))
     for _ in jobs:
         next(frames)  # the state at the start
     with suppress(threading.BrokenBarrierError):
@@ -307,7 +299,7 @@ def _try(jobs: list[_Job]) -> tuple[list[int], float]:
 def _make_share(jobs: list[_Job], batch: int) -> dict[str, tuple[str, str]]:
     """Make the runs, `batch` at once; gives what `_make` says of each."""
     outcomes = {}
-    for number, outcome in run_concurrently(map(_make, jobs), batch, jobs[0].device):
+    for number, outcome in run_concurrently(map(_make, jobs), batch, jobs[0].physics["device"]):
         outcomes[jobs[number].name] = outcome
         _ended[jobs[number].number] = True
     return outcomes
@@ -327,16 +319,7 @@ def _make(job: _Job) -> Generator[tuple[str, str] | Job, None, None]:
             if not ours or _done(job.file, scene):
                 outcome = "elsewhere", ""
             else:
-                for stage in scene_stages(
-                    scene,
-                    job.file,
-                    effects=job.effects,
-                    reasons=job.reasons,
-                    seed=job.seed,
-                    device=job.device,
-                    precision=job.precision,
-                    progress=count_frame,
-                ):
+                for stage in scene_stages(scene, job.file, **job.physics, progress=count_frame):
                     if isinstance(stage, Job):
                         yield stage
     except (UserError, SceneError, SolverStopped) as error:

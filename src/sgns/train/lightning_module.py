@@ -33,12 +33,7 @@ from sgns.settings import ModelSettings, TrainingSettings
 from sgns.train import Fit, Fitted, Task
 from sgns.train.callbacks import RolloutValidation, StepProgress
 from sgns.train.validation import ValidationRollouts
-from sgns.train.windows import (
-    Batch,
-    TrainingWindows,
-    WindowLoader,
-    fit_normalisation,
-)
+from sgns.train.windows import Batch, TrainingWindows, WindowLoader, fit_normalisation
 
 if TYPE_CHECKING:
     from sgns.reduction.reduce import ReducedDataset
@@ -165,12 +160,9 @@ def fit_network(task: Task) -> Fitted:
     surrogate, data = prepared(
         task.reduced, task.num_modes, model, settings, task.seed, task.card, task.start_from
     )
+    context = surrogate.dynamics.context_keys
     rollouts = ValidationRollouts(
-        task.validation_runs,
-        task.num_modes,
-        model.history,
-        model.body_nodes,
-        surrogate.dynamics.context_keys,
+        task.validation_runs, task.num_modes, model.history, model.body_nodes, context
     )
     module = SurrogateTraining(surrogate, settings)
     last = output / "last.ckpt" if task.resumed else None
@@ -180,7 +172,7 @@ def fit_network(task: Task) -> Fitted:
         trainer = make_trainer(task, [validation, StepProgress(bar)])
         began = time.perf_counter()
         if last is not None:
-            require_resumable(last, trainer, module, settings)
+            require_resumable(last, trainer, module)
         try:
             run_trainer(trainer, module, data, last)
         except UserError as error:
@@ -218,7 +210,7 @@ def prepared(
         given = load_surrogate(start_from)
         other = given.dynamics
         known = (other.settings, other.context_keys, other.predicts_body, given.basis.arrangement_hash)
-        wanted = (model, context, dynamics.predicts_body, reduced.arrangement_hash)
+        wanted = (model, context, dynamics.predicts_body, reduced.basis.arrangement_hash)
         if not isinstance(other, LatentDynamics) or known != wanted:
             raise UserError(
                 f"{start_from} has another model or another bed; use the same model.* and "
@@ -234,9 +226,7 @@ def prepared(
     return surrogate, WindowLoader(windows, settings.batch_size, noise)
 
 
-def require_resumable(
-    last: Path, trainer: L.Trainer, module: SurrogateTraining, settings: TrainingSettings
-) -> None:
+def require_resumable(last: Path, trainer: L.Trainer, module: SurrogateTraining) -> None:
     """Refuses a checkpoint that lacks, or has in odd shape, what a training goes on from."""
     load_surrogate(last)
     content = read_checkpoint(last)
@@ -246,8 +236,9 @@ def require_resumable(
         (optimizer,), (schedule,) = content["optimizer_states"], content["lr_schedulers"]
         step = content["global_step"]
         done = content["loops"]["fit_loop"]["epoch_loop.automatic_optimization.optim_progress"]
-        if type(step) is not int or not 0 <= step <= settings.max_steps:
-            raise ValueError(f"global_step is {step!r:.40}, of {settings.max_steps} steps")
+        steps = module.settings.max_steps
+        if type(step) is not int or not 0 <= step <= steps:
+            raise ValueError(f"global_step is {step!r:.40}, of {steps} steps")
         if done["optimizer"]["step"]["total"]["completed"] != step:
             raise ValueError("it disagrees with itself about its steps")
         require_alike(content["loops"]["fit_loop"], trainer.fit_loop.state_dict(), "loops")
@@ -352,10 +343,8 @@ def run_trainer(trainer: L.Trainer, module: SurrogateTraining, data: WindowLoade
     except SystemExit as error:
         # Lightning turns Ctrl-C into an exit of its own.
         raise KeyboardInterrupt from error
-    except UserError:
-        raise
     except Exception as error:
-        if last is None or module.begun:
+        if last is None or module.begun or isinstance(error, UserError):
             raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise UserError(f"{last} cannot be gone on from ({reason:.200}); {_ANEW}") from error

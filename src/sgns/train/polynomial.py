@@ -266,12 +266,7 @@ def fit_polynomial(task: Task) -> Fitted:
         raise UserError(f"device is {task.device}, but polynomials are fitted on the CPU; use device=cpu")
     began = time.perf_counter()
     best = best_polynomial(
-        task.reduced.runs("train"),
-        task.validation_runs,
-        task.num_modes,
-        task.model,
-        task.settings,
-        task.seed,
+        task.reduced.runs("train"), task.validation_runs, task.num_modes, task.model, task.settings, task.seed
     )
     seconds = elapsed(began, time.perf_counter())
     surrogate = Surrogate.of(best.dynamics, task.reduced, task.card)

@@ -89,10 +89,6 @@ class TrainingWindows:
         horizon: int = 1,
         context: Sequence[str] = (),
     ) -> None:
-        if not runs:
-            raise UserError(
-                "the training split has no runs; simulate the dataset first: sgns simulate dataset=<name>"
-            )
         self.history, self.horizon, self.seed = history, horizon, seed
         for run in runs:
             require_finite(run)

@@ -278,12 +278,6 @@ def test_an_interruption_says_how_to_go_on(written: bool, empty_folder: Path) ->
     assert ("output=here" in said) == written == Path("here").exists()
 
 
-def test_an_exit_that_lightning_makes_of_an_interruption(empty_folder: Path) -> None:
-    body = "try: raise KeyboardInterrupt\n    except KeyboardInterrupt: raise SystemExit(1)"
-    result = call_fake(body)
-    assert result.returncode == 130 and "interrupted" in result.stderr
-
-
 @pytest.mark.parametrize("streams", ["2>&-", ">&-", "<&- >&- 2>&-", "2>&1 | true", "> /dev/full"])
 def test_standard_streams_that_lead_nowhere(streams: str, empty_folder: Path) -> None:
     """Neither a traceback nor another exit status."""

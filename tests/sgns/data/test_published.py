@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import runpy
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mpm_warp import Wheel
 from sgns.config import UserError
-from sgns.data.published import excavation_case, fingerprint, published_dataset, read_published, wheel_case
+from sgns.data.published import fingerprint, published_dataset, read_published
 from sgns_testing.commands import refusal, sgns
 from sgns_testing.published import record
+
+SCRIPT = runpy.run_path(str(Path(__file__).parents[3] / "experiments" / "published_forces" / "run.py"))
+excavation_case, wheel_case = SCRIPT["excavation_case"], SCRIPT["wheel_case"]
 
 
 def write(folder, records, cases, split="valid"):
@@ -97,7 +102,7 @@ def test_a_folder_becomes_a_dataset(tmp_path):
         np.testing.assert_allclose(run.pose[0, :3], [0.1, 0.3, 0.05], atol=1e-6)
         np.testing.assert_allclose(run.pose[:, 0], 0.1 + 0.01 * np.arange(8), atol=1e-6)
         np.testing.assert_allclose(run.latent[1] - run.latent[0], [[-0.1, 0.1, 0.1]] * 2, atol=1e-6)
-    for wrong in ({"folds": 5}, {"folds": 2, "fold": 2}, {"folds": 2.5}):
+    for wrong in ({"folds": 5}, {"folds": 2, "fold": 2}):
         with pytest.raises(UserError, match=r"dataset\.fold"):
             published_dataset(settings | wrong, 2)
     with pytest.raises(UserError, match="holds 2 modes"):

@@ -68,6 +68,17 @@ def test_resuming_equals_not_stopping(data, trained, tmp_path, monkeypatch) -> N
         assert torch.equal(value, b["state_dict"][name]), name
 
 
+def test_an_interruption_stays_one(data, tmp_path, monkeypatch) -> None:
+    """Lightning makes an exit with status 1 of it."""
+
+    def interrupt(*_) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module.StepProgress, "on_train_batch_end", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run(data, tmp_path)
+
+
 def test_lightning_says_nothing(data, tmp_path, capfd) -> None:
     run(data, tmp_path, max_steps=2)
     (tmp_path / "training.json").unlink()
