@@ -171,24 +171,22 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
     # With this variable Hydra passes errors on as they are, in place of its own block of text and status 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     from hydra import initialize_config_module
-    from hydra.core.config_search_path import SearchPathQuery
     from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.plugins import Plugins
     from hydra.types import RunMode
 
-    from sgns.cli.settings import CheckedLoader
+    from sgns.cli.settings import CheckedLoader, ConfigDir
 
     if arguments.config_dir is not None and not os.path.isdir(arguments.config_dir):
         raise UserError(f"--config-dir: folder '{arguments.config_dir}' not found")
+    Plugins.instance().register(ConfigDir)
+    ConfigDir.folder = None if arguments.config_dir is None else os.path.abspath(arguments.config_dir)
     settings = arguments.settings
     with initialize_config_module("sgns.conf", job_name="sgns", version_base="1.3"):
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
-        places = hydra.config_loader.get_search_path()
-        if arguments.config_dir is not None:
-            folder = f"file://{os.path.abspath(arguments.config_dir)}"
-            places.append("command-line", folder, SearchPathQuery("main"))
         # Not `hydra.main`: it takes no loader, and has flags of its own that run what they find in a file.
-        hydra.config_loader = CheckedLoader(places, settings)
+        hydra.config_loader = CheckedLoader(hydra.config_loader, settings)
         if arguments.cfg is not None:
             _show_settings(hydra, command, arguments)
         elif arguments.info is not None:
