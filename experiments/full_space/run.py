@@ -44,7 +44,7 @@ from sgns.simulator import Simulator
 from sgns.train.command import train as train_subspace
 from sgns.train.lightning_module import SurrogateTraining, prepared
 
-HERE = Path(__file__).parent
+TABLE = Path(__file__).with_name("table.csv")
 SPACING = 0.015  # of the particles of dataset=quick, and the largest of the body nodes [m]
 RADIUS = 0.020  # of the neighbourhood [m]: 6 neighbours in the bed at rest, about 10 where it is disordered
 STEPPED = {"body_nodes": "points", "layer_norm": True, "residual": True}
@@ -202,7 +202,7 @@ def cost_full_space(path: Path, name: str, repeats: int) -> dict[str, Any]:
     )
 
 
-def cost_subspace(path: Path, name: str, repeats: int) -> dict[str, Any]:
+def cost_subspace(path: Path, repeats: int) -> dict[str, Any]:
     """Of the default network on modes."""
     plain = settings(path, batch_size=BATCH)
     reduced = reduce_dataset(Dataset.open(path), plain["reduction"], progress=False)
@@ -231,14 +231,12 @@ def cost_subspace(path: Path, name: str, repeats: int) -> dict[str, Any]:
     )
 
 
-def errors(
-    path: Path, count: int | None, predict: Callable[[Path], tuple[np.ndarray, np.ndarray]], d: int
-) -> dict[str, float]:
-    """Skill and force NRMSE over the first `count` test runs of a dataset, d frames given, beside the baselines.
+def errors(path: Path, predict: Callable[[Path], tuple[np.ndarray, np.ndarray]], d: int) -> dict[str, float]:
+    """Skill and force NRMSE over the test runs of a dataset, d frames given, beside the baselines.
 
     `predict` gives positions [m] (T, n, 3) and force [N] (T, 3) of a run.
     """
-    forces, paths = [], Dataset.open(path).runs("test")[:count]
+    forces, paths = [], Dataset.open(path).runs("test")
     for file in Dataset.open(path).runs("train"):
         with Run(file) as run:
             forces.append(run.force)
@@ -271,9 +269,9 @@ def errors(
     }
 
 
-def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
+def learn_full_space(path: Path, minutes: float) -> dict[str, Any]:
     """Train for a processor time and predict test runs."""
-    plain = settings(path, FULL_SPACE[name], **FULL_SPACE_TRAINING)
+    plain = settings(path, FULL_SPACE[TRAINED], **FULL_SPACE_TRAINING)
     dynamics, training_runs = full_space(path, plain["model"], "train")
     windows = FullSpaceWindows(training_runs, dynamics.history)
     given = plain["training"]
@@ -288,7 +286,7 @@ def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) ->
     last = max(1, steps // 10)
     logging.warning(
         "%s: %d steps; mean loss of the last tenth: acceleration %.3f, force %.3f",
-        name, steps, *map(statistics.fmean, zip(*record[-last:], strict=True)),
+        TRAINED, steps, *map(statistics.fmean, zip(*record[-last:], strict=True)),
     )  # fmt: skip
     _, predicted = full_space(path, plain["model"], "test")
     by_path = {run.path: run for run in predicted}
@@ -300,11 +298,11 @@ def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) ->
             positions, force = unroll(dynamics, run.soil(slice(0, dynamics.history))[None], body)
         return positions[0].numpy(), force[0].numpy()
 
-    found = errors(path, runs, predict, dynamics.history)
+    found = errors(path, predict, dynamics.history)
     return {"trained_processor_s": taken, "trained_steps": steps} | found
 
 
-def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
+def learn_subspace(path: Path, minutes: float) -> dict[str, Any]:
     """The same for the network on modes, with `sgns.train`."""
     plain = settings(path)
     reduced = reduce_dataset(Dataset.open(path), plain["reduction"], progress=False)
@@ -330,17 +328,16 @@ def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> d
         rollout = simulator.rollout(run.pose, latent_history=run.latent[: simulator.history, :modes])
         return simulator.basis.inverse(torch.as_tensor(rollout.latent)).numpy(), rollout.force
 
-    found = errors(path, runs, predict, simulator.history)
+    found = errors(path, predict, simulator.history)
     return {"trained_processor_s": taken, "trained_steps": steps} | found
 
 
 def solver(path: Path) -> dict[str, Any]:
     """Wall time of the solver, as its runs recorded it."""
     found = []
-    for split in ("train", "validation", "test"):
-        for file in Dataset.open(path).runs(split):
-            with Run(file) as run:
-                found.append(run.wall_time_s / float(run.time[-1]))
+    for file in (path / "runs").glob("*.h5"):
+        with Run(file) as run:
+            found.append(run.wall_time_s / float(run.time[-1]))
     return {"rollout_s_per_simulated_s": statistics.median(found), "repeats": len(found)}
 
 
@@ -382,30 +379,24 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data/quick"))
     parser.add_argument("--minutes", type=float, default=10.0, help="processor time of each training")
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--runs", type=int, help="how many of the test runs to predict; all by default")
-    parser.add_argument("--table", type=Path, default=HERE / "table.csv")
     options = parser.parse_args()
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     os.environ["OMP_NUM_THREADS"] = "1"
     # Freed blocks are kept for the next step: otherwise a third of the time goes into getting zeroed pages anew.
     os.environ |= {"MALLOC_MMAP_THRESHOLD_": "4294967296", "MALLOC_TRIM_THRESHOLD_": "17179869184"}
-    rows: dict[str, dict[str, Any]] = {row["case"]: row for row in read_rows(options.table)}
-    for name in ("solver", SUBSPACE, *FULL_SPACE):
+    rows: dict[str, dict[str, Any]] = {row["case"]: row for row in read_rows(TABLE)}
+    path, minutes, repeats = options.data, options.minutes, options.repeats
+    costs = {"solver": (solver, path), SUBSPACE: (cost_subspace, path, repeats)}
+    costs |= {name: (cost_full_space, path, name, repeats) for name in FULL_SPACE}
+    for name, cost in costs.items():
         if name not in rows:
-            if name == "solver":
-                found = solver(options.data)
-            else:
-                cost = cost_subspace if name == SUBSPACE else cost_full_space
-                found = in_fresh_process(cost, options.data, name, options.repeats)
-            rows[name] = {"case": name, **found}
-            write_rows(options.table, rows.values())
-            print(rows[name], flush=True)
+            rows[name] = {"case": name, **in_fresh_process(*cost)}
+            write_rows(TABLE, rows.values())
     for name, learn in ((SUBSPACE, learn_subspace), (TRAINED, learn_full_space)):
         if not rows[name].get("trained_steps"):
-            rows[name] |= in_fresh_process(learn, options.data, name, options.minutes, options.runs)
-            write_rows(options.table, rows.values())
-            print(rows[name], flush=True)
-    draw(read_rows(options.table), HERE / "bars.png")
+            rows[name] |= in_fresh_process(learn, path, minutes)
+            write_rows(TABLE, rows.values())
+    draw(read_rows(TABLE), TABLE.with_name("bars.png"))
 
 
 if __name__ == "__main__":
