@@ -3,7 +3,7 @@
     python experiments/full_space/run.py --minutes 10
 
 Needs the runs of `sgns simulate dataset=quick`. Every case runs in a fresh process bound to one core, torch on one
-thread. First the cost: processor time of a training step and of a rollout, and the largest memory. Then the errors on
+thread. First the cost: time of a training step and of a rollout, and the memory that training adds. Then the errors on
 the test runs, for two networks trained for at most a given processor time. Every case adds its line to table.csv
 beside this script, and a line that is there is not made again; bars.png is drawn last.
 """
@@ -33,7 +33,7 @@ from torch import Tensor
 
 from sgns.data.dataset import Dataset
 from sgns.data.run import Run
-from sgns.evaluate.costs import forget_peak, peak_memory
+from sgns.evaluate.costs import forget_peak, full_space_cost, peak_memory
 from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
 from sgns.evaluate.metrics import VectorErrors, mean_prediction, skill
 from sgns.model.dynamics import Standardiser
@@ -164,42 +164,19 @@ def timed(action: Callable[[], object], repeats: int) -> list[float]:
     return found
 
 
-def rates(
-    step: Callable[[], object], frame: Callable[[], object], frame_rate: float, repeats: int, parameters: int
-) -> dict[str, Any]:
-    """Cost of rolling out frames and of training steps; memory is the most that each adds to the process."""
+def cost_full_space(path: Path, name: str, repeats: int) -> dict[str, Any]:
+    """Of a network on all particles; memory is the most that training adds to the process."""
     forget_peak()
     before = peak_memory()
-    # Not inference_mode: the subspace network keeps its edges, and those made there cannot be trained with.
-    with torch.no_grad():
-        frames = timed(frame, repeats)
-    rolled = peak_memory()
-    steps = timed(step, repeats)
+    model = ModelSettings(**settings(path, FULL_SPACE[name])["model"])
+    cost = full_space_cost(Dataset.open(path).runs("train")[0], model, repeats)
     return {
-        "parameters": parameters,
-        "training_s_per_step": statistics.median(steps),
-        "training_memory_MB": (peak_memory() - before) / 2**20,
-        "rollout_s_per_simulated_s": statistics.median(frames) * frame_rate,
-        "rollout_memory_MB": (rolled - before) / 2**20,
+        "parameters": cost.parameters,
+        "training_s_per_step": cost.training_step,
+        "training_memory_MB": (cost.peak_bytes - before) / 2**20,
+        "rollout_s_per_simulated_s": cost.rollout,
         "repeats": repeats,
     }
-
-
-def cost_full_space(path: Path, name: str, repeats: int) -> dict[str, Any]:
-    """Of a network on all particles, with the tool in the soil."""
-    plain = settings(path, FULL_SPACE[name], max_steps=1, warmup_steps=0, batch_size=BATCH)
-    dynamics, runs = full_space(path, plain["model"], "train")
-    windows = FullSpaceWindows(runs[:1], dynamics.history)
-    window = windows.window(len(windows) // 2)
-    still = torch.zeros(3, dtype=torch.float64)
-    training = TrainingSettings.from_dict(plain["training"])
-    return rates(
-        lambda: train(dynamics, windows, training, still),
-        lambda: dynamics.advance(window.history, window.body),
-        runs[0].frame_rate,
-        repeats,
-        sum(p.numel() for p in dynamics.network.parameters()),
-    )
 
 
 def cost_subspace(path: Path, repeats: int) -> dict[str, Any]:
@@ -222,13 +199,19 @@ def cost_subspace(path: Path, repeats: int) -> dict[str, Any]:
         torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
         optimiser.step()
 
-    return rates(
-        step,
-        lambda: surrogate.dynamics.advance(window.history, window.shown_body),
-        float(reduced.frame_rate),
-        20 * repeats,
-        sum(p.numel() for p in surrogate.dynamics.network.parameters()),
-    )
+    forget_peak()
+    before = peak_memory()
+    # Not inference_mode: the network keeps its edges, and those made there cannot be trained with.
+    with torch.no_grad():
+        frames = timed(lambda: surrogate.dynamics.advance(window.history, window.shown_body), 20 * repeats)
+    steps = timed(step, 20 * repeats)
+    return {
+        "parameters": sum(p.numel() for p in surrogate.dynamics.network.parameters()),
+        "training_s_per_step": statistics.median(steps),
+        "training_memory_MB": (peak_memory() - before) / 2**20,
+        "rollout_s_per_simulated_s": statistics.median(frames) * float(reduced.frame_rate),
+        "repeats": 20 * repeats,
+    }
 
 
 def errors(path: Path, predict: Callable[[Path], tuple[np.ndarray, np.ndarray]], d: int) -> dict[str, float]:
