@@ -57,14 +57,3 @@ def measure() -> list[dict]:
         case = {"spacing": spacing, "particles_per_cell": ppc, "courant": courant}
         rows += [case | {"height": z, "speed": speed, "theory": steady} for z, speed, steady in layers]
     return rows
-
-
-PLOT = {
-    "x": "height",
-    "y": "speed",
-    "theory": "theory",
-    "curves": ["spacing", "courant"],
-    "panels": ["particles_per_cell"],
-    "xlabel": "height [m]",
-    "ylabel": "speed after 2 s [m/s]",
-}

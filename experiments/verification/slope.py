@@ -46,13 +46,3 @@ def measure() -> list[dict]:
         for ppc in (1, 8)
         for tilt in (25.0, 30.0, 34.0, 35.0, 36.0, 36.5, 37.0, 37.5, 38.0, 39.0, 41.0, 44.0)
     ]
-
-
-PLOT = {
-    "x": "tilt",
-    "y": "acceleration",
-    "theory": "theory",
-    "curves": ["particles_per_cell"],
-    "xlabel": "tilt [degrees]",
-    "ylabel": "acceleration down the slope [m/s²]",
-}

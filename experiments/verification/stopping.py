@@ -66,13 +66,3 @@ def measure() -> list[dict]:
             found = {"stopping_height": grains[1] - speed[1] / slope, "theory": theory}
             rows += [case | {"grains": g, "speed": v} | found for g, v in zip(grains, speed, strict=True)]
     return rows
-
-
-PLOT = {
-    "x": "tilt",
-    "y": "stopping_height",
-    "theory": "theory",
-    "curves": ["law", "cells_per_grain"],
-    "xlabel": "tilt [degrees]",
-    "ylabel": "height at which flow stops [grains]",
-}

@@ -121,7 +121,6 @@ def tiny_grains(effects: Effects) -> float:
 
 
 def huge_grains() -> tuple[float, str]:
-    """Share by which the force of a cut through grains of 10 m exceeds that with constant friction mu_2 [%]."""
     force = []
     for effects, material in (
         (Effects(), replace(SAND, grain_diameter=10.0)),

@@ -7,10 +7,8 @@ Letters: T frames, r modes.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +20,7 @@ from sgns.rollout import write_rollout
 from sgns.simulator import Rollout, Simulator
 
 from .measures import unsaid
-from .networks import quick_data, quick_network, simulator_of, synthetic_data, synthetic_network
+from .networks import new_folder, quick_data, quick_network, simulator_of, synthetic_data, synthetic_network
 
 Change = Callable[[np.ndarray], np.ndarray]
 
@@ -56,7 +54,6 @@ def to_and_fro(path: np.ndarray, times: int) -> np.ndarray:
 
 
 def long_path(kind: str, times: int) -> tuple[float, str]:
-    """Movement of the soil at its largest, in share of the largest of a training run."""
     simulator, run = simulator_of(kind), a_run(kind)
     rollout = simulator.rollout(to_and_fro(run.pose, times), values=run.scene)
     share = float(moved(simulator, rollout.latent).max()) / largest_movement(kind, simulator)
@@ -84,7 +81,6 @@ def slowly(kind: str, times: int) -> tuple[float, str]:
 
 
 def rest(start: str, seconds: float = 60.0) -> tuple[float, str]:
-    """Drift under a tool at rest [mm]: in a bed that was never touched, or after a cut."""
     run = a_run("quick")
     drifts = []
     for hold in (True, False):
@@ -101,7 +97,6 @@ def rest(start: str, seconds: float = 60.0) -> tuple[float, str]:
 
 
 def creeping(kind: str) -> tuple[float, str]:
-    """Movement of the soil under a tool that advances by a micrometre in every frame, for a minute [mm]."""
     simulator, run = simulator_of(kind), a_run(kind)
     path = run.pose[:1].repeat(3601, axis=0)
     path[:, 0] += 1e-6 * np.arange(len(path))
@@ -110,7 +105,6 @@ def creeping(kind: str) -> tuple[float, str]:
 
 
 def vibrating(kind: str) -> tuple[float, str]:
-    """Movement of the soil under a tool that shakes by 0.1 mm to and fro at 15 Hz for a minute, before it cuts [mm]."""
     simulator, run = simulator_of(kind), a_run(kind)
     path = run.pose[:1].repeat(3601, axis=0)
     path[:, 0] += 1e-4 * np.sin(2 * np.pi * 15.0 * np.arange(len(path)) / simulator.frame_rate)
@@ -154,7 +148,6 @@ def backwards(path: np.ndarray) -> np.ndarray:
 
 
 def unlike(kind: str, change: Change) -> tuple[float, str]:
-    """How often a path that is unlike the training runs is not flagged, or its rollout not finite or beyond bounds."""
     simulator = simulator_of(kind)
     runs = data_of(kind).runs("test")
     failures, least, most, words = 0, math.inf, 0.0, ""
@@ -179,7 +172,6 @@ def sound(found: Rollout) -> bool:
 
 
 def held_out() -> tuple[float, str]:
-    """Excess of runs of the same kind as the training's, at its largest."""
     simulator = simulator_of("quick")
     runs = [run for split in ("validation", "test") for run in quick_data().runs(split)]
     found = [simulator.rollout(run.pose, values=run.scene).excess.largest for run in runs]
@@ -187,7 +179,6 @@ def held_out() -> tuple[float, str]:
 
 
 def far_away(kind: str) -> tuple[float, str]:
-    """How far modes go beyond their bound when the tool jumps about by 1000 km for 1000 frames [m]."""
     simulator, run = simulator_of(kind), a_run(kind)
     path = run.pose[:1].repeat(1000, axis=0)
     path[10:, :3] += 1e6 * np.sin(np.arange(990))[:, None]
@@ -215,22 +206,21 @@ def breakdown() -> tuple[float, str]:
 
 
 def broken_path() -> tuple[float, str]:
-    """Frames lost of a rollout that is not finite from frame 9 on."""
     simulator, run = simulator_of("pose"), a_run("pose")
     path = run.pose.copy()
     path[9, 0] = 1e300
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "r.h5"
-        found = simulator.rollout(path)
-        lacking, note = unsaid(
-            lambda: write_rollout(target, simulator, run.scene, found),
-            "not finite from frame 9",
-            "r.stopped.h5",
-        )
-        kept = Path(folder) / "r.stopped.h5"
-        problems = [line for line in check_run(kept) if "stopped after 9 good frames" not in line]
-        with Run(kept) as stopped:
-            return lacking + len(problems) + abs(stopped.frame_count - 9) + target.exists(), note
+    folder = new_folder()
+    target = folder / "r.h5"
+    found = simulator.rollout(path)
+    lacking, note = unsaid(
+        lambda: write_rollout(target, simulator, run.scene, found),
+        "not finite from frame 9",
+        "r.stopped.h5",
+    )
+    kept = folder / "r.stopped.h5"
+    problems = [line for line in check_run(kept) if "stopped after 9 good frames" not in line]
+    with Run(kept) as stopped:
+        return lacking + len(problems) + abs(stopped.frame_count - 9) + target.exists(), note
 
 
 def body_points(count: int) -> tuple[float, str]:
@@ -247,7 +237,6 @@ def body_points(count: int) -> tuple[float, str]:
 
 
 def fewer_modes(kind: str) -> tuple[float, str]:
-    """Movement with 1 to all modes but one, in share of the largest of a training run."""
     run, shares = a_run(kind), []
     path = quick_network() if kind == "quick" else synthetic_network(kind)
     whole = Simulator.load(path)
@@ -259,7 +248,6 @@ def fewer_modes(kind: str) -> tuple[float, str]:
 
 
 def quaternion_signs() -> float:
-    """Difference when every other quaternion has the other sign, which is the same rotation."""
     simulator, run = simulator_of("pose"), a_run("pose")
     other = run.pose.copy()
     other[::2, 3:] *= -1
@@ -268,13 +256,11 @@ def quaternion_signs() -> float:
 
 
 def shortest_paths() -> float:
-    """Frames too many or too few along paths of one and two frames."""
     simulator, run = simulator_of("pose"), a_run("pose")
     return sum(abs(len(simulator.rollout(run.pose[:count]).latent) - count) for count in (1, 2))
 
 
 def side_by_side() -> float:
-    """Difference [mm] of rollouts one by one and side by side, among them paths that leave everything."""
     simulator, run = simulator_of("pose"), a_run("pose")
     strange = teleported(run.pose, 3.0), shifted(run.pose, y=50.0), backwards(run.pose)
     paths = np.stack([run.pose, *strange])
@@ -286,7 +272,6 @@ def side_by_side() -> float:
 
 
 def bad_pose(row: list[float], *words: str) -> tuple[float, str]:
-    """A pose that is none."""
     simulator, run = simulator_of("pose"), a_run("pose")
     path = run.pose.copy()
     path[4] = row

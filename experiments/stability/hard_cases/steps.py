@@ -24,7 +24,6 @@ def mean_force(share: float, **changes) -> np.ndarray:
 
 
 def step_error(share: float) -> float:
-    """Change of the force against a tenth of the longest step [%]."""
     exact = mean_force(0.1)
     return 100.0 * float(np.linalg.norm(mean_force(share) - exact) / np.linalg.norm(exact))
 
@@ -59,13 +58,11 @@ def settling_error(youngs_modulus: float) -> tuple[float, str]:
 
 
 def soft_or_stiff_cut(youngs_modulus: float) -> tuple[float, str]:
-    """A cut, 6 cm deep, in soil of any stiffness."""
     scene = cut(material=Material(youngs_modulus=youngs_modulus))
     return blade_shares(scene, frames_of(scene))
 
 
 def precision_gap(quantity: str) -> float:
-    """Between float32 and float64 after a cut of 0.2 s."""
     one, two = (frames_of(cut(), precision=p) for p in ("float32", "float64"))
     if quantity == "force":
         a, b = (np.mean([f.force for f in frames[6:]], axis=0) for frames in (one, two))
@@ -82,7 +79,6 @@ def creep_in_float32() -> float:
 
 
 def a_million_steps() -> tuple[float, str]:
-    """Displacement of a tiny bed at rest after 10^6 substeps [mm]."""
     bed = Bed(size=(0.08, 0.08, 0.06), spacing=0.02, headroom=0.02)
     scene = Scene(bed=bed, duration=1.0, frame_rate=1.0)
     substeps = Solver(scene).substeps_per_frame
@@ -93,7 +89,6 @@ def a_million_steps() -> tuple[float, str]:
 
 
 def twice(effects: Effects) -> float:
-    """Numbers that differ between two computations of the same random bed."""
     bed = replace(cut().bed, arrangement="jittered", seed=3)
     one, two = (frames_of(cut(bed=bed, duration=0.1), effects=effects) for _ in range(2))
     return float(
