@@ -14,9 +14,9 @@ import os
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import patch
 
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
@@ -79,16 +79,6 @@ def in_turn(jobs: dict[str, Job], rounds: int, calls: int, wall: bool = False) -
     return {name: min(values) if wall else statistics.median(values) for name, values in times.items()}
 
 
-@contextmanager
-def onednn(allowed: bool) -> Iterator[None]:
-    """oneDNN's products allowed or not."""
-    before, formulas._AVAILABLE = formulas._AVAILABLE, allowed and formulas._AVAILABLE
-    try:
-        yield
-    finally:
-        formulas._AVAILABLE = before
-
-
 def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[Row]:
     """Whole steps with features, force and torque: advance, a path, paths side by side."""
     frames, d = 123, dynamics.history
@@ -102,11 +92,8 @@ def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[Row]
             states = torch.cat([states[:, 1:], step.latent[:, None]], 1)
 
     def plainly() -> None:
-        forward, dynamics.network.forward = dynamics.network.forward, dynamics.network.plain
-        try:
+        with patch.object(dynamics.network, "forward", dynamics.network.plain):
             advanced()
-        finally:
-            dynamics.network.forward = forward
 
     jobs: dict[str, Job] = {
         "advance, plain network": plainly,
@@ -147,7 +134,7 @@ def time_training(
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4, fused=True)
 
     def trained(form: Callable[..., Tensor], fast_products: bool) -> None:
-        with onednn(fast_products):
+        with patch.object(formulas, "_AVAILABLE", fast_products and formulas._AVAILABLE):
             optimizer.zero_grad()
             form(nodes, edges, edge_index).square().mean().backward()
             optimizer.step()
