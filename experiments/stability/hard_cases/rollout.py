@@ -112,12 +112,15 @@ def vibrating(kind: str) -> tuple[float, str]:
     return float(moved(simulator, found.latent).max()), found.excess.words()
 
 
-def shifted(path: np.ndarray, **by: float) -> np.ndarray:
-    """The tool moved [m] along axes."""
+def shifted(path: np.ndarray, since: float = 0.0, **by: float) -> np.ndarray:
+    """The tool moved [m] along axes, from a share of its way on."""
     path = path.copy()
     for axis, distance in by.items():
-        path[:, "xyz".index(axis)] += distance
+        path[int(since * len(path)) :, "xyz".index(axis)] += distance
     return path
+
+
+teleported = partial(shifted, since=0.5)
 
 
 def stretched(path: np.ndarray, axis: str, factor: float) -> np.ndarray:
@@ -132,13 +135,6 @@ def turned(path: np.ndarray, axis: str, degrees: float) -> np.ndarray:
     path, half = path.copy(), math.radians(degrees) / 2
     path[:, 3:] = 0.0
     path[:, 3 + "xyz".index(axis)], path[:, 6] = math.sin(half), math.cos(half)
-    return path
-
-
-def teleported(path: np.ndarray, distance: float) -> np.ndarray:
-    """The tool somewhere else from the middle of its way on."""
-    path = path.copy()
-    path[len(path) // 2 :, 0] += distance
     return path
 
 
@@ -166,9 +162,8 @@ def unlike(kind: str, change: Change) -> tuple[float, str]:
 
 def sound(found: Rollout) -> bool:
     """Whether all numbers of a rollout are finite."""
-    return all(
-        bool(np.isfinite(part).all()) for part in (found.latent, found.force, found.torque, found.poses)
-    )
+    parts = found.latent, found.force, found.torque, found.poses
+    return all(bool(np.isfinite(part).all()) for part in parts)
 
 
 def held_out() -> tuple[float, str]:
@@ -262,9 +257,8 @@ def shortest_paths() -> float:
 
 def side_by_side() -> float:
     simulator, run = simulator_of("pose"), a_run("pose")
-    strange = teleported(run.pose, 3.0), shifted(run.pose, y=50.0), backwards(run.pose)
-    paths = np.stack([run.pose, *strange])
-    many = simulator.rollouts(paths)
+    paths = run.pose, teleported(run.pose, x=3.0), shifted(run.pose, y=50.0), backwards(run.pose)
+    many = simulator.rollouts(np.stack(paths))
     difference = [
         np.abs(many.latent[i] - simulator.rollout(path).latent).max() for i, path in enumerate(paths)
     ]
@@ -297,10 +291,10 @@ MEASURES = {
     "turned by 30 degrees about the vertical": partial(
         unlike, "quick", partial(turned, axis="z", degrees=30.0)
     ),
-    "teleported by 10 cm": partial(unlike, "quick", partial(teleported, distance=0.1)),
-    "teleported by 10 m": partial(unlike, "quick", partial(teleported, distance=10.0)),
-    "teleported, small network": partial(unlike, "pose", partial(teleported, distance=3.0)),
-    "teleported, polynomials": partial(unlike, "polynomial", partial(teleported, distance=3.0)),
+    "teleported by 10 cm": partial(unlike, "quick", partial(teleported, x=0.1)),
+    "teleported by 10 m": partial(unlike, "quick", partial(teleported, x=10.0)),
+    "teleported, small network": partial(unlike, "pose", partial(teleported, x=3.0)),
+    "teleported, polynomials": partial(unlike, "polynomial", partial(teleported, x=3.0)),
     "1000 km to and fro": partial(far_away, "quick"),
     "1000 km to and fro, small network": partial(far_away, "pose"),
     "1000 km to and fro, polynomials": partial(far_away, "polynomial"),

@@ -81,14 +81,10 @@ def spoilt_gradient() -> tuple[float, str]:
 
     output = new_folder()
     with patch.object(SurrogateTraining, "configure_gradient_clipping", spoil):
-        lacking, note = unsaid(
-            lambda: train_synthetic(synthetic_data(), output, max_steps=30),
-            "the weights",
-            "after step 20",
-        )
-    return lacking + sum(
-        content(output / f"{name}.ckpt")["global_step"] != 10 for name in ("best", "last")
-    ), note
+        act = partial(train_synthetic, synthetic_data(), output, max_steps=30)
+        lacking, note = unsaid(act, "the weights", "after step 20")
+    steps = [content(output / f"{name}.ckpt")["global_step"] for name in ("best", "last")]
+    return lacking + sum(step != 10 for step in steps), note
 
 
 class Interrupted(Exception):
