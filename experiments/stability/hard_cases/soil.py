@@ -141,15 +141,11 @@ def flight() -> float:
     return 1000.0 * float(np.abs(last.position - exact).max())
 
 
+LOOSE = {"spacing": 0.02, "initial_stress": "none", "walls": Walls("slip", "slip")}
+
+
 def thrown_and_settled(per_cell: float) -> tuple[float, str]:
-    bed = Bed(
-        size=(0.32, 0.32, 0.16),
-        spacing=0.02,
-        particles_per_cell=per_cell,
-        headroom=0.6,
-        initial_stress="none",
-        walls=Walls("slip", "slip"),
-    )
+    bed = Bed(size=(0.32, 0.32, 0.16), particles_per_cell=per_cell, headroom=0.6, **LOOSE)
     scene = Thrown(bed=bed, upwards=1.0, spread=0.5, duration=2.0)
     last = frames_of(scene, every=10**6)[-1]
     gain = 100.0 * volume_gain(scene, last.position)
@@ -157,14 +153,7 @@ def thrown_and_settled(per_cell: float) -> tuple[float, str]:
 
 
 def grains_and_settled(per_cell: float) -> tuple[float, str]:
-    bed = Rain(
-        size=(0.16, 0.16, 0.08),
-        spacing=0.02,
-        particles_per_cell=per_cell,
-        headroom=3.0,
-        initial_stress="none",
-        walls=Walls("slip", "slip"),
-    )
+    bed = Rain(size=(0.16, 0.16, 0.08), particles_per_cell=per_cell, headroom=3.0, **LOOSE)
     scene = Thrown(bed=bed, spread=0.3, duration=2.0)
     last = frames_of(scene, every=10**6)[-1]
     layer = np.sort(last.position[:, 2] + bed.size[2])
@@ -185,14 +174,8 @@ class Rain(Bed):
 
 
 def dropped_block(speed: float) -> tuple[float, str]:
-    bed = BlockBed(
-        size=(0.3, 0.3, 0.3),
-        spacing=0.01,
-        initial_stress="none",
-        headroom=0.2,
-        low=(0.1, 0.1, -0.28),
-        high=(0.2, 0.2, -0.18),
-    )
+    size, ends = (0.3, 0.3, 0.3), {"low": (0.1, 0.1, -0.28), "high": (0.2, 0.2, -0.18)}
+    bed = BlockBed(size=size, spacing=0.01, initial_stress="none", headroom=0.2, **ends)
     scene = Thrown(bed=bed, upwards=-speed, duration=0.2, frame_rate=400.0)
     return energy_gain(scene)
 

@@ -34,13 +34,8 @@ def settling_error(youngs_modulus: float) -> tuple[float, str]:
     With the log law the column at rest has M ln J / J = -rho g s at a weight of s above, M the confined modulus.
     """
     height, material = 0.16, Material(youngs_modulus=youngs_modulus)
-    bed = Bed(
-        size=(0.04, 0.04, height),
-        spacing=0.01,
-        initial_stress="none",
-        headroom=0.02,
-        walls=Walls("slip", "slip", "slip"),
-    )
+    size, walls = (0.04, 0.04, height), Walls("slip", "slip", "slip")
+    bed = Bed(size=size, spacing=0.01, initial_stress="none", headroom=0.02, walls=walls)
     period = 4.0 * height / material.wave_speed
     scene = Scene(bed=bed, material=material, duration=6.0 * period, frame_rate=40.0 / period, courant=0.4)
     start = scene.initial_positions()[:, 2]
@@ -91,12 +86,8 @@ def a_million_steps() -> tuple[float, str]:
 def twice(effects: Effects) -> float:
     bed = replace(cut().bed, arrangement="jittered", seed=3)
     one, two = (frames_of(cut(bed=bed, duration=0.1), effects=effects) for _ in range(2))
-    return float(
-        sum(
-            np.sum(a.position != b.position) + np.sum(a.force != b.force)
-            for a, b in zip(one, two, strict=True)
-        )
-    )
+    pairs = zip(one, two, strict=True)
+    return float(sum(np.sum(a.position != b.position) + np.sum(a.force != b.force) for a, b in pairs))
 
 
 def compressed_beyond_the_step() -> tuple[float, str]:
