@@ -23,7 +23,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from common import read_rows, scene_of, write_rows
 
-from mpm_warp import Decision, Effects, Scene, Solver, Tolerances, asymmetry, effects_for
+from mpm_warp import Effects, Scene, Solver, Tolerances, asymmetry, effects_for
 
 HERE = Path(__file__).parent
 REPEATS = 3
@@ -38,10 +38,6 @@ SCENES = {
 EFFECTS = ("yielding", "rate_dependence", "fluidity", "nonlocality", "separation", "symmetry", "torque")
 GRAINS = (1e-4, 3e-4, 5e-4, 7e-4, 1e-3, 2e-3, 5e-3)  # diameters for edge.csv [m]
 AIM = 0.03  # what auto leaves out should change force and displacement by less
-
-
-def make_scene(name: str, *more: str) -> Scene:
-    return scene_of(*SCENES[name], *more)[0]
 
 
 def pair(chosen: Effects, effect: str) -> tuple[Effects, Effects]:
@@ -77,18 +73,12 @@ def changes(scene: Scene, one: tuple, two: tuple) -> dict[str, float]:
     return {"force_change": force, "displacement_change": moved}
 
 
-def impossible(scene: Scene, effect: str) -> bool:
-    return (effect == "symmetry" and asymmetry(scene) is not None) or (
-        effect == "torque" and scene.body is None
-    )
-
-
 def each_effect(name: str, effect: str) -> dict:
-    scene = make_scene(name)
+    scene, _ = scene_of(*SCENES[name])
     chosen, decisions = effects_for(scene)
-    decision: Decision = decisions[effect]
+    decision = decisions[effect]
     row = {"scene": name, "effect": effect, "auto": "on" if decision.on else "off", "number": decision.number}
-    if impossible(scene, effect):
+    if (effect == "symmetry" and asymmetry(scene)) or (effect == "torque" and scene.body is None):
         return row
     off, on = pair(chosen, effect)
     runs = {side: [] for side in (off, on)}
@@ -106,7 +96,7 @@ def each_effect(name: str, effect: str) -> dict:
 
 
 def at_the_edge(name: str, effect: str, grain: float) -> dict:
-    scene = make_scene(name, f"material.grain_diameter={grain}")
+    scene, _ = scene_of(*SCENES[name], f"material.grain_diameter={grain}")
     chosen, decisions = effects_for(scene)
     off, on = (play(scene, side) for side in pair(chosen, effect))
     decision, tolerances = decisions[effect], Tolerances()
@@ -139,10 +129,7 @@ def resume(
 
 def largest(row: dict[str, str]) -> float:
     """The larger of both changes; nan where there is none."""
-    found = [
-        float(row[key]) for key in ("force_change", "displacement_change") if row[key] not in ("", "nan")
-    ]
-    return max(found, default=math.nan)
+    return float(np.fmax(*(float(row[key] or "nan") for key in ("force_change", "displacement_change"))))
 
 
 def draw(table: list[dict[str, str]], edge: list[dict[str, str]]) -> None:

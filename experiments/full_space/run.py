@@ -3,7 +3,7 @@
     python experiments/full_space/run.py --minutes 10
 
 Needs the runs of `sgns simulate dataset=quick`. Every case runs in a fresh process bound to one core, torch on one
-thread. First the cost: processor time of a training step and of a rollout, and the largest memory. Then the errors on
+thread. First the cost: time of a training step and of a rollout, and the memory that training adds. Then the errors on
 the test runs, for two networks trained for at most a given processor time. Every case adds its line to table.csv
 beside this script, and a line that is there is not made again; bars.png is drawn last.
 """
@@ -33,7 +33,7 @@ from torch import Tensor
 
 from sgns.data.dataset import Dataset
 from sgns.data.run import Run
-from sgns.evaluate.costs import forget_peak, peak_memory
+from sgns.evaluate.costs import forget_peak, full_space_cost, peak_memory
 from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
 from sgns.evaluate.metrics import VectorErrors, mean_prediction, skill
 from sgns.model.dynamics import Standardiser
@@ -44,7 +44,7 @@ from sgns.simulator import Simulator
 from sgns.train.command import train as train_subspace
 from sgns.train.lightning_module import SurrogateTraining, prepared
 
-HERE = Path(__file__).parent
+TABLE = Path(__file__).with_name("table.csv")
 SPACING = 0.015  # of the particles of dataset=quick, and the largest of the body nodes [m]
 RADIUS = 0.020  # of the neighbourhood [m]: 6 neighbours in the bed at rest, about 10 where it is disordered
 STEPPED = {"body_nodes": "points", "layer_norm": True, "residual": True}
@@ -164,45 +164,22 @@ def timed(action: Callable[[], object], repeats: int) -> list[float]:
     return found
 
 
-def rates(
-    step: Callable[[], object], frame: Callable[[], object], frame_rate: float, repeats: int, parameters: int
-) -> dict[str, Any]:
-    """Cost of rolling out frames and of training steps; memory is the most that each adds to the process."""
+def cost_full_space(path: Path, name: str, repeats: int) -> dict[str, Any]:
+    """Of a network on all particles; memory is the most that training adds to the process."""
     forget_peak()
     before = peak_memory()
-    # Not inference_mode: the subspace network keeps its edges, and those made there cannot be trained with.
-    with torch.no_grad():
-        frames = timed(frame, repeats)
-    rolled = peak_memory()
-    steps = timed(step, repeats)
+    model = ModelSettings(**settings(path, FULL_SPACE[name])["model"])
+    cost = full_space_cost(Dataset.open(path).runs("train")[0], model, repeats)
     return {
-        "parameters": parameters,
-        "training_s_per_step": statistics.median(steps),
-        "training_memory_MB": (peak_memory() - before) / 2**20,
-        "rollout_s_per_simulated_s": statistics.median(frames) * frame_rate,
-        "rollout_memory_MB": (rolled - before) / 2**20,
+        "parameters": cost.parameters,
+        "training_s_per_step": cost.training_step,
+        "training_memory_MB": (cost.peak_bytes - before) / 2**20,
+        "rollout_s_per_simulated_s": cost.rollout,
         "repeats": repeats,
     }
 
 
-def cost_full_space(path: Path, name: str, repeats: int) -> dict[str, Any]:
-    """Of a network on all particles, with the tool in the soil."""
-    plain = settings(path, FULL_SPACE[name], max_steps=1, warmup_steps=0, batch_size=BATCH)
-    dynamics, runs = full_space(path, plain["model"], "train")
-    windows = FullSpaceWindows(runs[:1], dynamics.history)
-    window = windows.window(len(windows) // 2)
-    still = torch.zeros(3, dtype=torch.float64)
-    training = TrainingSettings.from_dict(plain["training"])
-    return rates(
-        lambda: train(dynamics, windows, training, still),
-        lambda: dynamics.advance(window.history, window.body),
-        runs[0].frame_rate,
-        repeats,
-        sum(p.numel() for p in dynamics.network.parameters()),
-    )
-
-
-def cost_subspace(path: Path, name: str, repeats: int) -> dict[str, Any]:
+def cost_subspace(path: Path, repeats: int) -> dict[str, Any]:
     """Of the default network on modes."""
     plain = settings(path, batch_size=BATCH)
     reduced = reduce_dataset(Dataset.open(path), plain["reduction"], progress=False)
@@ -222,23 +199,27 @@ def cost_subspace(path: Path, name: str, repeats: int) -> dict[str, Any]:
         torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
         optimiser.step()
 
-    return rates(
-        step,
-        lambda: surrogate.dynamics.advance(window.history, window.shown_body),
-        float(reduced.frame_rate),
-        20 * repeats,
-        sum(p.numel() for p in surrogate.dynamics.network.parameters()),
-    )
+    forget_peak()
+    before = peak_memory()
+    # Not inference_mode: the network keeps its edges, and those made there cannot be trained with.
+    with torch.no_grad():
+        frames = timed(lambda: surrogate.dynamics.advance(window.history, window.shown_body), 20 * repeats)
+    steps = timed(step, 20 * repeats)
+    return {
+        "parameters": sum(p.numel() for p in surrogate.dynamics.network.parameters()),
+        "training_s_per_step": statistics.median(steps),
+        "training_memory_MB": (peak_memory() - before) / 2**20,
+        "rollout_s_per_simulated_s": statistics.median(frames) * float(reduced.frame_rate),
+        "repeats": 20 * repeats,
+    }
 
 
-def errors(
-    path: Path, count: int | None, predict: Callable[[Path], tuple[np.ndarray, np.ndarray]], d: int
-) -> dict[str, float]:
-    """Skill and force NRMSE over the first `count` test runs of a dataset, d frames given, beside the baselines.
+def errors(path: Path, predict: Callable[[Path], tuple[np.ndarray, np.ndarray]], d: int) -> dict[str, float]:
+    """Skill and force NRMSE over the test runs of a dataset, d frames given, beside the baselines.
 
     `predict` gives positions [m] (T, n, 3) and force [N] (T, 3) of a run.
     """
-    forces, paths = [], Dataset.open(path).runs("test")[:count]
+    forces, paths = [], Dataset.open(path).runs("test")
     for file in Dataset.open(path).runs("train"):
         with Run(file) as run:
             forces.append(run.force)
@@ -271,9 +252,9 @@ def errors(
     }
 
 
-def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
+def learn_full_space(path: Path, minutes: float) -> dict[str, Any]:
     """Train for a processor time and predict test runs."""
-    plain = settings(path, FULL_SPACE[name], **FULL_SPACE_TRAINING)
+    plain = settings(path, FULL_SPACE[TRAINED], **FULL_SPACE_TRAINING)
     dynamics, training_runs = full_space(path, plain["model"], "train")
     windows = FullSpaceWindows(training_runs, dynamics.history)
     given = plain["training"]
@@ -288,7 +269,7 @@ def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) ->
     last = max(1, steps // 10)
     logging.warning(
         "%s: %d steps; mean loss of the last tenth: acceleration %.3f, force %.3f",
-        name, steps, *map(statistics.fmean, zip(*record[-last:], strict=True)),
+        TRAINED, steps, *map(statistics.fmean, zip(*record[-last:], strict=True)),
     )  # fmt: skip
     _, predicted = full_space(path, plain["model"], "test")
     by_path = {run.path: run for run in predicted}
@@ -300,11 +281,11 @@ def learn_full_space(path: Path, name: str, minutes: float, runs: int | None) ->
             positions, force = unroll(dynamics, run.soil(slice(0, dynamics.history))[None], body)
         return positions[0].numpy(), force[0].numpy()
 
-    found = errors(path, runs, predict, dynamics.history)
+    found = errors(path, predict, dynamics.history)
     return {"trained_processor_s": taken, "trained_steps": steps} | found
 
 
-def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> dict[str, Any]:
+def learn_subspace(path: Path, minutes: float) -> dict[str, Any]:
     """The same for the network on modes, with `sgns.train`."""
     plain = settings(path)
     reduced = reduce_dataset(Dataset.open(path), plain["reduction"], progress=False)
@@ -330,17 +311,16 @@ def learn_subspace(path: Path, name: str, minutes: float, runs: int | None) -> d
         rollout = simulator.rollout(run.pose, latent_history=run.latent[: simulator.history, :modes])
         return simulator.basis.inverse(torch.as_tensor(rollout.latent)).numpy(), rollout.force
 
-    found = errors(path, runs, predict, simulator.history)
+    found = errors(path, predict, simulator.history)
     return {"trained_processor_s": taken, "trained_steps": steps} | found
 
 
 def solver(path: Path) -> dict[str, Any]:
     """Wall time of the solver, as its runs recorded it."""
     found = []
-    for split in ("train", "validation", "test"):
-        for file in Dataset.open(path).runs(split):
-            with Run(file) as run:
-                found.append(run.wall_time_s / float(run.time[-1]))
+    for file in (path / "runs").glob("*.h5"):
+        with Run(file) as run:
+            found.append(run.wall_time_s / float(run.time[-1]))
     return {"rollout_s_per_simulated_s": statistics.median(found), "repeats": len(found)}
 
 
@@ -382,30 +362,24 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data/quick"))
     parser.add_argument("--minutes", type=float, default=10.0, help="processor time of each training")
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--runs", type=int, help="how many of the test runs to predict; all by default")
-    parser.add_argument("--table", type=Path, default=HERE / "table.csv")
     options = parser.parse_args()
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     os.environ["OMP_NUM_THREADS"] = "1"
     # Freed blocks are kept for the next step: otherwise a third of the time goes into getting zeroed pages anew.
     os.environ |= {"MALLOC_MMAP_THRESHOLD_": "4294967296", "MALLOC_TRIM_THRESHOLD_": "17179869184"}
-    rows: dict[str, dict[str, Any]] = {row["case"]: row for row in read_rows(options.table)}
-    for name in ("solver", SUBSPACE, *FULL_SPACE):
+    rows: dict[str, dict[str, Any]] = {row["case"]: row for row in read_rows(TABLE)}
+    path, minutes, repeats = options.data, options.minutes, options.repeats
+    costs = {"solver": (solver, path), SUBSPACE: (cost_subspace, path, repeats)}
+    costs |= {name: (cost_full_space, path, name, repeats) for name in FULL_SPACE}
+    for name, cost in costs.items():
         if name not in rows:
-            if name == "solver":
-                found = solver(options.data)
-            else:
-                cost = cost_subspace if name == SUBSPACE else cost_full_space
-                found = in_fresh_process(cost, options.data, name, options.repeats)
-            rows[name] = {"case": name, **found}
-            write_rows(options.table, rows.values())
-            print(rows[name], flush=True)
+            rows[name] = {"case": name, **in_fresh_process(*cost)}
+            write_rows(TABLE, rows.values())
     for name, learn in ((SUBSPACE, learn_subspace), (TRAINED, learn_full_space)):
         if not rows[name].get("trained_steps"):
-            rows[name] |= in_fresh_process(learn, options.data, name, options.minutes, options.runs)
-            write_rows(options.table, rows.values())
-            print(rows[name], flush=True)
-    draw(read_rows(options.table), HERE / "bars.png")
+            rows[name] |= in_fresh_process(learn, path, minutes)
+            write_rows(TABLE, rows.values())
+    draw(read_rows(TABLE), TABLE.with_name("bars.png"))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -37,15 +36,7 @@ from sgns.evaluate.costs import cpu_model
 HERE = Path(__file__).resolve().parent
 SCENES = ("quick_excavation", "paper_excavation", "paper_wheel")
 AT_ONCE = (1, 32)
-
-
-@dataclass(frozen=True)
-class Effort:
-    """Frames of each timing."""
-
-    warm: int = 5
-    frames: int = 4
-    stretches: int = 5
+Effort = tuple[int, int, int]  # frames before a timing, frames in it, and how many timings
 
 
 def compared(case: Case, device: str) -> dict[str, Any]:
@@ -62,14 +53,15 @@ def compared(case: Case, device: str) -> dict[str, Any]:
 
 def stretches(frames: Iterator[Any], at_once: int, effort: Effort) -> list[float]:
     """Seconds that a frame takes, for `at_once` scenes together, once warm."""
-    list(islice(frames, effort.warm * at_once))
+    warm, count, timings = effort
+    list(islice(frames, warm * at_once))
     found = []
-    for _ in range(effort.stretches):
+    for _ in range(timings):
         begin = time.perf_counter()
-        for _, frame in islice(frames, effort.frames * at_once):
+        for _, frame in islice(frames, count * at_once):
             if not isinstance(frame, Frame):
                 raise frame
-        found.append((time.perf_counter() - begin) / effort.frames)
+        found.append((time.perf_counter() - begin) / count)
     return found
 
 
@@ -123,11 +115,7 @@ def main() -> int:
             rows.append(row)
             if not row["agrees"]:
                 apart.append(case.name)
-            print(
-                f"{time.perf_counter() - begin:4.0f} s  {case.name}: CPU {row['farthest']:.1e} m, {row['force']:.1e}; "
-                f"again {row['farthest_again']:.1e} m, {row['force_again']:.1e}",
-                flush=True,
-            )
+            print(f"{time.perf_counter() - begin:4.0f} s  {row}", flush=True)
             if not for_show:
                 write_rows(HERE / "agreement.csv", rows)
 
@@ -136,14 +124,9 @@ def main() -> int:
         for device, at_once in (("cpu", 1), *((options.device, number) for number in AT_ONCE)):
             if options.only not in name:
                 continue
-            effort = Effort(1, 1, 2) if for_show else Effort(2, 2, 3) if device == "cpu" else Effort()
-            row = timed(name, device, 2 if for_show and at_once > 1 else at_once, effort)
-            rows.append(row)
-            print(
-                f"{time.perf_counter() - begin:4.0f} s  {name}, {row['at_once']} on {row['device']}: "
-                f"{row['s_per_simulated_s']:.3g} s per simulated s, {row['particle_steps_per_s']:.3g} particle-steps/s",
-                flush=True,
-            )
+            effort = (1, 1, 2) if for_show else (2, 2, 3) if device == "cpu" else (5, 4, 5)
+            rows.append(timed(name, device, 2 if for_show and at_once > 1 else at_once, effort))
+            print(f"{time.perf_counter() - begin:4.0f} s  {rows[-1]}", flush=True)
             if not for_show:
                 write_rows(HERE / "speed.csv", rows)
     print(f"{len(apart)} cases disagree {apart or ''}")

@@ -4,7 +4,6 @@ one scene alone and several in one launch."""
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -87,7 +86,11 @@ class Outcome:
 def outcome(case: Case, device: str = "cpu", precision: str = "float32") -> Outcome:
     """Compute a case: a scene alone by its solver, several in one launch."""
     frames: dict[int, list[Frame]] = {number: [] for number in range(len(case.scenes))}
-    for number, frame in _frames(case, device, precision):
+    if len(case.scenes) == 1:
+        computed = ((0, frame) for frame in Solver(case.scenes[0], case.effects, device, precision).frames())
+    else:
+        computed = frames_together(case.scenes, case.effects, device, precision)
+    for number, frame in computed:
         if not isinstance(frame, Frame):
             raise frame
         frames[number].append(frame)
@@ -96,22 +99,9 @@ def outcome(case: Case, device: str = "cpu", precision: str = "float32") -> Outc
     return Outcome(position, force, float(np.sqrt(np.mean(np.sum(force**2, axis=1)))))
 
 
-def _frames(case: Case, device: str, precision: str) -> Iterator[tuple[int, Frame | Exception]]:
-    if len(case.scenes) == 1:
-        for frame in Solver(case.scenes[0], case.effects, device, precision).frames():
-            yield 0, frame
-    else:
-        yield from frames_together(case.scenes, case.effects, device, precision)
-
-
 def cases(folder: Path) -> list[Case]:
     """All of them; `folder` takes the file of a mesh."""
-    return [
-        *_cuts(),
-        *_other_bodies(folder),
-        *_flows(),
-        *_together(),
-    ]
+    return [*_cuts(), *_other_bodies(folder), *_flows(), *_together()]
 
 
 def _early(**kw) -> Scene:

@@ -123,7 +123,7 @@ def table_row(kind: str, preset: str, scores: Any, rows: list[dict[str, Any]]) -
     return row | {"rollout_s": float(np.median([one["rollout_s"] for one in rows]))}
 
 
-def draw(rows: list[dict[str, Any]], path: Path) -> None:
+def draw(rows: list[dict[str, Any]]) -> None:
     """Skill and force error of every run."""
     panels = (("skill_frozen", "skill against frozen (cut at -1)"), ("force_nrmse", "force NRMSE (cut at 2)"))
     figure, axes = plt.subplots(2, 2, figsize=(10, 6.4), layout="constrained")
@@ -142,9 +142,8 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             axis.set_title(f"{kind}: {label}", fontsize=10)
             axis.axhline(0.0, color="0.3", lw=0.8)
             axis.grid(alpha=0.3, axis="y")
-    axes[0, 0].legend(fontsize=8)
     axes[0, 1].legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    figure.savefig(HERE / "figure.png", dpi=110)
 
 
 def main() -> None:
@@ -153,30 +152,27 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=120.0, help="training time of each network")
     parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1))
     parser.add_argument("--output", type=Path, default=Path("outputs/published_data"))
-    parser.add_argument("--presets", nargs="*", default=list(PRESETS))
-    parser.add_argument("--kinds", nargs="*", default=list(KINDS))
     parser.add_argument("overrides", nargs="*", help="changes of the settings, for example model.history=2")
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     tasks = [
         (preset, kind, fold, options.published, options.seconds, options.output, options.overrides)
-        for kind in options.kinds
-        for preset in options.presets
+        for kind in KINDS
+        for preset in PRESETS
         for fold in range(FOLDS)
     ]
     with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
         found = [row for rows in pool.map(fold_rows, tasks, chunksize=1) for row in rows]
     rows = []
-    for kind in options.kinds:
-        for preset in options.presets:
+    for kind in KINDS:
+        for preset in PRESETS:
             own = [row for row in found if (row["kind"], row["preset"]) == (kind, preset)]
             own.sort(key=lambda row: row["scores"].name)
             rows += [table_row(kind, preset, row["scores"], [row]) for row in own]
             rows.append(table_row(kind, preset, aggregate([row["scores"] for row in own]), own))
             logging.info("%s", rows[-1])
     write_rows(HERE / "table.csv", rows, digits=6)
-    if set(options.presets) == set(PRESETS) and set(options.kinds) == set(KINDS):
-        draw(rows, HERE / "figure.png")
+    draw(rows)
 
 
 if __name__ == "__main__":

@@ -104,9 +104,7 @@ def nrmse(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 def campaign_of(options: argparse.Namespace) -> tuple[list[PublishedRun], Campaign]:
     """The published runs in the order of their cases, and the campaign that makes them."""
-    published = read_published(options.published)
-    wanted = [run for run in published if not options.cases or run.case in options.cases]
-    published = sorted(wanted, key=lambda run: run.case)
+    published = sorted(read_published(options.published), key=lambda run: run.case)
     name = options.kind if options.reference else f"published_{options.kind}"
     theirs = THEIR_WHEEL if name == "wheel" else ()
     config = composed("simulate", f"scene={name}", *theirs, *options.overrides)
@@ -177,11 +175,7 @@ def main() -> None:
     parser.add_argument("published", help="folder with valid.tfrecord and metadata.json")
     parser.add_argument("--reference", action="store_true", help="at the reference setting")
     parser.add_argument("--runs", type=Path, help="folder for the run files (default: data/<scene>)")
-    parser.add_argument(
-        "--other-draw", type=Path, help="such a folder, made with another seed, to compare with"
-    )
-    parser.add_argument("--results", default=HERE, type=Path, help="folder for the table and the figure")
-    parser.add_argument("--cases", type=int, nargs="*", help="only these case numbers")
+    parser.add_argument("--other-draw", type=Path, help="such a folder, of another seed, to compare with")
     parser.add_argument("--workers", type=int, help="runs at once (default: one per core)")
     parser.add_argument("overrides", nargs="*", help="changes of the scene, for example scene.friction=0.5")
     options = parser.parse_intermixed_args()
@@ -215,9 +209,8 @@ def main() -> None:
     axes[0, 1].legend(fontsize=8)
     figure.supxlabel("time [s]")
     table, picture = RESULT[options.kind, options.reference]
-    options.results.mkdir(parents=True, exist_ok=True)
-    figure.savefig(options.results / f"{picture}.png", dpi=80)
-    write_rows(options.results / f"{table}.csv", rows, digits=6)
+    figure.savefig(HERE / f"{picture}.png", dpi=80)
+    write_rows(HERE / f"{table}.csv", rows, digits=6)
     for key in [key for key in rows[0] if "nrmse" in key]:
         errors = [row[key] for row in rows if key in row]
         logging.info("%s: median %.3f, %.3f to %.3f", key, np.median(errors), min(errors), max(errors))

@@ -1,14 +1,13 @@
 """The README's moving picture: a test run of the demo, simulated above and predicted below, with the draft beside.
 
     make demo
-    python experiments/quick/moving_picture.py [--run NAME]
+    python experiments/quick/moving_picture.py
 
 It plays in real time: every third frame of 1/60 s. Writes cut.gif beside this file.
 """
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import matplotlib
@@ -22,7 +21,7 @@ from sgns.evaluate.figures import NETWORK, STYLE, TRUTH
 from sgns.evaluate.views import Scales, common_scales, draw_view
 
 HERE = Path(__file__).resolve().parent
-RUN = "0024_motion-curved_rake-3.8_depth-0.08_speed-0.04"
+RUN = "0024_motion-curved_rake-3.8_depth-0.08_speed-0.04.h5"
 EVERY = 3
 WIDTH, DPI = 6.8, 100  # [inches], [pixels per inch]
 VIEW = 3.75  # width of a side view [inches]
@@ -30,20 +29,13 @@ COLOURS = 48
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--run", default=RUN)
-    parser.add_argument("--truth", type=Path, default=Path("data/quick/runs"))
-    parser.add_argument("--rollouts", type=Path, default=Path("outputs/demo/evaluation/rollouts"))
-    parser.add_argument("--output", type=Path, default=HERE / "cut.gif")
-    asked = parser.parse_args()
-    name = f"{asked.run}.h5"
-    with Run(asked.truth / name) as truth, Run(asked.rollouts / name) as network:
+    rollouts = Path("outputs/demo/evaluation/rollouts")
+    with Run(Path("data/quick/runs") / RUN) as truth, Run(rollouts / RUN) as network:
         frames = range(0, min(truth.frame_count, network.frame_count), EVERY)
         scales = common_scales([truth, network], frames[:: len(frames) // 8], truth.positions(slice(0, 1))[0])
         with matplotlib.rc_context(STYLE | {"font.size": 9.0, "axes.titlesize": 9.5}):
             pictures = [picture(truth, network, frame, scales) for frame in frames]
-    save(pictures, asked.output, 1000 * EVERY / 60)
-    print(f"{asked.output}: {len(pictures)} frames, {asked.output.stat().st_size / 1e6:.2f} MB")
+    save(pictures, HERE / "cut.gif", 1000 * EVERY / 60)
 
 
 def picture(truth: Run, network: Run, frame: int, scales: Scales) -> Image.Image:
@@ -55,19 +47,15 @@ def picture(truth: Run, network: Run, frame: int, scales: Scales) -> Image.Image
     for bottom, title, run in ((view + 0.52, "solver", truth), (0.25, "network", network)):
         axis = figure.add_axes((0.015, bottom / height, VIEW / WIDTH, view / height))
         draw_view(axis, title, run, frame, scales, VIEW)
-        axis.set_xticks([])
-        axis.set_yticks([])
-        for side in axis.spines.values():
-            side.set_visible(False)
+        axis.set(xticks=[], yticks=[])
+        axis.spines[:].set_visible(False)
     figure.text(0.02, 0.09 / height, f"colour: speed of the soil, dark is {scales.speed.vmax:g} m/s")
     axis = figure.add_axes((0.675, 0.13, 0.31, 0.76))
     for run, colour, label in ((truth, TRUTH, "solver"), (network, NETWORK, "network")):
         axis.plot(run.time[: frame + 1], -run.force[: frame + 1, 0], color=colour, label=label)
     highest = max(float((-run.force[:, 0]).max()) for run in (truth, network))
-    axis.set_xlim(0.0, truth.time[-1])
-    axis.set_ylim(min(0.0, -0.05 * highest), 1.25 * highest)
-    axis.set_title("draft on the blade [N]")
-    axis.set_xlabel("time [s]")
+    axis.set(xlim=(0.0, truth.time[-1]), ylim=(-0.05 * highest, 1.25 * highest))
+    axis.set(title="draft on the blade [N]", xlabel="time [s]")
     axis.legend(loc="upper left", ncols=2, columnspacing=1.0, handlelength=1.2)
     canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())

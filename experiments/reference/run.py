@@ -1,6 +1,6 @@
 """What is true: one cut and one wheel at many settings of the solver, as convergence tables and figures.
 
-    python experiments/reference/run.py [--only cut|wheel] [--workers 2]
+    python experiments/reference/run.py [--workers 2]
 
 Every finished run is kept as a line of cut.csv or wheel.csv and is not made again. The figures are drawn from the
 tables (`--draw` does nothing else).
@@ -126,15 +126,9 @@ def measure(kind: str, name: str, overrides: list[str]) -> dict[str, float | str
     return {k: round(float(v), 3) if isinstance(v, np.floating) else v for k, v in row.items()}
 
 
-def save(kind: str, rows: dict[str, dict]) -> None:
-    """The table in the order of the settings."""
-    write_rows(HERE / f"{kind}.csv", [rows[name] for name in settings(kind) if name in rows], digits=6)
-
-
 def draw(kind: str, rows: dict[str, dict]) -> None:
     """Left: each quantity over the grid spacing. Right: what one change does at one setting."""
-    figure = plt.figure(figsize=(13, 7.8), layout="constrained")
-    axes = figure.subplots(3, 2, width_ratios=(1, 1.4))
+    figure, axes = plt.subplots(3, 2, figsize=(13, 7.8), layout="constrained", width_ratios=(1, 1.4))
     grid = {
         name: m for name in rows if (m := re.fullmatch(r"dx ([\d.]+), (\d) per cell, (margin \S+)", name))
     }
@@ -171,13 +165,11 @@ def draw(kind: str, rows: dict[str, dict]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", choices=("cut", "wheel"))
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--draw", action="store_true", help="only draw the figures from the tables")
     options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    kinds = (options.only,) if options.only else ("cut", "wheel")
-    tables = {kind: {row["setting"]: row for row in read_rows(HERE / f"{kind}.csv")} for kind in kinds}
+    tables = {kind: {row["setting"]: row for row in read_rows(HERE / f"{kind}.csv")} for kind in QUANTITIES}
     if not options.draw:
         compute(tables, options.workers)
     for kind, rows in tables.items():
@@ -200,7 +192,8 @@ def compute(tables: dict[str, dict[str, dict]], workers: int) -> None:
             except Exception as error:  # one setting that fails must not end the study
                 logging.warning("%s, %s: %s", kind, name, error)
                 continue
-            save(kind, tables[kind])
+            rows = [tables[kind][name] for name in settings(kind) if name in tables[kind]]
+            write_rows(HERE / f"{kind}.csv", rows, digits=6)
             logging.info("%s %s", kind, tables[kind][name])
 
 

@@ -14,9 +14,9 @@ import os
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import patch
 
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
@@ -53,31 +53,25 @@ def dynamics_of(overrides: list[str]) -> LatentDynamics:
     return dynamics
 
 
-def track_of(dynamics: LatentDynamics, paths: int, frames: int, turning: bool = False) -> BodyTrack:
+def track_of(dynamics: LatentDynamics, paths: int, frames: int) -> BodyTrack:
     """Bodies on random ways, (B, T, N, ...)."""
     pose = dynamics.settings.body_nodes == "pose"
     nodes = 1 if pose else BODY_POINTS
-    motion = 0.01 * torch.randn(paths, frames, nodes if turning else 1, 3).double().expand(-1, -1, nodes, -1)
+    motion = 0.01 * torch.randn(paths, frames, 1, 3).double().expand(-1, -1, nodes, -1)
     position = torch.randn(1, 1, nodes, 3).double() + motion.cumsum(1)
     if not pose:
         return BodyTrack(position, position[..., :0], motion)
-    return BodyTrack(
-        position,
-        torch.randn(paths, frames, 1, 6).double(),
-        torch.cat([motion, torch.zeros_like(motion)], -1),
-    )
+    orientation = torch.randn(paths, frames, 1, 6).double()
+    return BodyTrack(position, orientation, torch.cat([motion, torch.zeros_like(motion)], -1))
 
 
-def in_turn(
-    jobs: dict[str, Job], rounds: int, calls: int, warm: int = 2, wall: bool = False
-) -> dict[str, float]:
+def in_turn(jobs: dict[str, Job], rounds: int, calls: int, wall: bool = False) -> dict[str, float]:
     """Time of a call [s], the jobs in turn: the median of processor times, or the shortest by the clock."""
     now = time.perf_counter if wall else time.thread_time
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(rounds):
         for name, job in jobs.items():
-            for _ in range(warm):
-                job()
+            job()
             for _ in range(calls):
                 began = now()
                 job()
@@ -85,22 +79,11 @@ def in_turn(
     return {name: min(values) if wall else statistics.median(values) for name, values in times.items()}
 
 
-@contextmanager
-def onednn(allowed: bool) -> Iterator[None]:
-    """oneDNN's products allowed or not."""
-    before, formulas._AVAILABLE = formulas._AVAILABLE, allowed and formulas._AVAILABLE
-    try:
-        yield
-    finally:
-        formulas._AVAILABLE = before
-
-
 def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[Row]:
-    """Whole steps with features, force and torque: advance, a path, a path whose body turns, paths side by side."""
+    """Whole steps with features, force and torque: advance, a path, paths side by side."""
     frames, d = 123, dynamics.history
     latent = torch.randn(1, d, MODES, 3).double()
     track = track_of(dynamics, 1, frames)
-    turning = track_of(dynamics, 1, frames, turning=True)
 
     def advanced() -> None:
         states = latent.expand(1, d, MODES, 3)
@@ -109,28 +92,21 @@ def time_rollouts(name: str, dynamics: LatentDynamics, rounds: int) -> list[Row]
             states = torch.cat([states[:, 1:], step.latent[:, None]], 1)
 
     def plainly() -> None:
-        forward, dynamics.network.forward = dynamics.network.forward, dynamics.network.plain
-        try:
+        with patch.object(dynamics.network, "forward", dynamics.network.plain):
             advanced()
-        finally:
-            dynamics.network.forward = forward
 
     jobs: dict[str, Job] = {
         "advance, plain network": plainly,
         "advance": advanced,
         "a path": lambda: dynamics.unroll(latent, track),
     }
-    if dynamics.settings.body_nodes == "points":
-        jobs["a path, body turning"] = lambda: dynamics.unroll(latent, turning)
     with torch.inference_mode():
-        whole = in_turn(jobs, rounds, 1, warm=1)
+        whole = in_turn(jobs, rounds, 1)
         found = {job: seconds / (frames - d) for job, seconds in whole.items()}
-        for paths, steps in ((16, 5), (256, 2), (4096, 1)):
-            many = track_of(dynamics, paths, d + steps)
-            start = latent.expand(paths, -1, -1, -1)
-            job = {"": lambda start=start, many=many: dynamics.unroll(start, many)}
-            seconds = in_turn(job, 1 if paths == 4096 else rounds, 1, warm=int(paths < 4096))[""]
-            found[f"{paths} paths side by side"] = seconds / (steps * paths)
+        paths, steps = 256, 2
+        many, start = track_of(dynamics, paths, d + steps), latent.expand(paths, -1, -1, -1)
+        seconds = in_turn({"": lambda: dynamics.unroll(start, many)}, rounds, 1)[""]
+        found[f"{paths} paths side by side"] = seconds / (steps * paths)
     plain = found["advance, plain network"]
     return [
         {
@@ -158,7 +134,7 @@ def time_training(
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4, fused=True)
 
     def trained(form: Callable[..., Tensor], fast_products: bool) -> None:
-        with onednn(fast_products):
+        with patch.object(formulas, "_AVAILABLE", fast_products and formulas._AVAILABLE):
             optimizer.zero_grad()
             form(nodes, edges, edge_index).square().mean().backward()
             optimizer.step()
@@ -172,9 +148,9 @@ def time_training(
         torch.set_num_threads(count)
         os.sched_setaffinity(0, cores if count > 1 else {min(cores)})
         if count == 1:
-            found, clock = in_turn(jobs, rounds, 2, warm=1), "processor time, median"
+            found, clock = in_turn(jobs, rounds, 2), "processor time, median"
         else:
-            found, clock = in_turn(jobs, rounds, 3, warm=1, wall=True), "wall clock, best round"
+            found, clock = in_turn(jobs, rounds, 3, wall=True), "wall clock, best round"
         rows += [
             {
                 "part": "training",
@@ -212,13 +188,6 @@ def draw(rows: list[Row]) -> None:
     figure.savefig(HERE / "bars.png", dpi=130)
 
 
-def told(rows: list[Row]) -> list[Row]:
-    """The rows, printed."""
-    for row in rows:
-        print(*(f"{key}={value}" for key, value in row.items() if key != "note"), flush=True)
-    return rows
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2, 4])
@@ -230,8 +199,9 @@ def main() -> None:
     rows: list[Row] = []
     for name, overrides in NETWORKS.items():
         dynamics = dynamics_of(overrides)
-        rows += told(time_rollouts(name, dynamics, max(2, options.rounds // 3)))
-        rows += told(time_training(name, dynamics, options.threads, cores, options.rounds))
+        rows += time_rollouts(name, dynamics, max(2, options.rounds // 3))
+        rows += time_training(name, dynamics, options.threads, cores, options.rounds)
+        print(name, *rows, sep="\n", flush=True)
     machine = f"{cpu_model()}, {len(cores)} of {os.cpu_count()} cores"
     write_rows(HERE / "table.csv", [{"threads": 1} | row | {"machine": machine} for row in rows])
     draw(rows)

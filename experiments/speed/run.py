@@ -9,7 +9,6 @@ only: its speed does not depend on how good it is. Writes table.csv and bars.png
 
 from __future__ import annotations
 
-import argparse
 import logging
 import os
 import statistics
@@ -35,6 +34,7 @@ from sgns.simulator import Simulator
 from sgns.train.command import train
 
 HERE = Path(__file__).parent
+REPEATS = 3  # of the solver's run
 
 
 def make_simulator(config, folder: Path) -> Simulator:
@@ -52,9 +52,6 @@ def make_simulator(config, folder: Path) -> Simulator:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repeats", type=int, default=3)
-    options = parser.parse_args()
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     torch.set_num_threads(1)
@@ -67,7 +64,7 @@ def main() -> None:
         simulator = make_simulator(config, folder)
         rollout_scene(simulator, scene, folder / "warm.h5")
         solver, inference, complete, rates = [], [], [], []
-        for _ in range(options.repeats):
+        for _ in range(REPEATS):
             timing = simulate_scene(scene, folder / "truth.h5", effects=effects)
             solver.append(timing.per_simulated_second)
             rates.append(timing.rate)

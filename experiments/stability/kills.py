@@ -12,7 +12,6 @@ of a campaign, half of them hit a worker process.
 The other half come at a random one of the calls that make a file whole, `os.fsync` and `os.replace`, just before or
 just after it: a network's checkpoint is written in milliseconds, which no random time would meet. (A campaign's files
 are written by its workers, for minutes: there all kills come by the clock.)
-A command with a row in the table is not repeated.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ import time
 import traceback
 import types
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +48,7 @@ from sgns.reduction.reduce import read_reduced
 
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
-from common import read_rows, write_rows
+from common import write_rows
 
 log = logging.getLogger(__name__)
 
@@ -77,20 +76,20 @@ class Row:
     """What happened to one command; numbers of kills and of files."""
 
     command: str
-    kills: float = 0
+    kills: int = 0
     """SIGKILLs that hit a running process."""
-    while_writing: float = 0  # of them, with a hidden half of a file left
-    at_a_write: float = 0  # of them, at a call of `os.fsync` or `os.replace` and not by the clock
-    of_workers: float = 0  # of them, a campaign's worker process was hit
-    corrupt: float = 0
+    while_writing: int = 0  # of them, with a hidden half of a file left
+    at_a_write: int = 0  # of them, at a call of `os.fsync` or `os.replace` and not by the clock
+    of_workers: int = 0  # of them, a campaign's worker process was hit
+    corrupt: int = 0
     """Files under their final name that were not whole."""
-    completed: float = 0
+    completed: int = 0
     """Times that the command was complete at last, each after some kills."""
-    equal: float = 0
+    equal: int = 0
     """Those of them whose result was that of the undisturbed command, bit for bit."""
-    orphans: float = 0
+    orphans: int = 0
     """Processes that outlived the command by more than half a minute."""
-    leftovers: float = 0
+    leftovers: int = 0
     """Hidden files beside a complete result."""
     undisturbed_s: float = 0.0
     """Processor time of the undisturbed command, the imports of its first process left out [s]."""
@@ -114,22 +113,15 @@ def main() -> int:
     torch.set_num_threads(1)
     for line in COMMANDS.values():  # here, so that no time of the commands goes into imports
         importlib.import_module(cli.COMMANDS[line.split()[0]].module)
-    numbers = [field.name for field in fields(Row)[1:]]
-    done = {
-        row["command"]: Row(row["command"], **{key: float(row[key]) for key in numbers})
-        for row in read_rows(asked.table)
-    }
+    rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="sgns_kills_") as name:
         bench = Bench(Path(name), asked.data)
         for command in asked.commands or COMMANDS:
-            if command in done and done[command].kills >= asked.kills:
-                log.info("%s: already in %s", command, asked.table)
-                continue
             chance = np.random.default_rng([asked.seed, list(COMMANDS).index(command)])
-            done[command] = bench.killed_often(command, asked.kills, chance)
-            write_rows(asked.table, [asdict(done[name]) for name in COMMANDS if name in done])
-            log.info("%s", done[command])
-    return int(any(not done[name].nothing_lost for name in asked.commands or COMMANDS))
+            rows.append(bench.killed_often(command, asked.kills, chance))
+            write_rows(asked.table, map(asdict, rows))
+            log.info("%s", rows[-1])
+    return int(not all(row.nothing_lost for row in rows))
 
 
 class Bench:
@@ -153,7 +145,7 @@ class Bench:
                     break
             else:
                 begun = self.begin(command, folder)
-                begun.wait()
+                begun.ended(0)
                 row.orphans += outlived(begun.family)
             row.completed += 1
             row.equal += same(reference, folder)
@@ -167,7 +159,7 @@ class Bench:
         moments = self.writes[row.command] if row.command != "simulate" else 0
         if moments and chance.integers(2):
             begun = self.begin(row.command, folder, fatal=int(chance.integers(moments)))
-            hit = begun.killed_itself()
+            hit = begun.ended(-signal.SIGKILL, 0) != 0
             row.at_a_write += hit
         else:
             begun = self.begin(row.command, folder)
@@ -190,7 +182,7 @@ class Bench:
         if command not in self.seconds:
             self.give(command, folder)
             begun = self.begin(command, folder)
-            begun.wait()
+            begun.ended(0)
             self.seconds[command], self.writes[command] = begun.spent, begun.writes
         return folder
 
@@ -284,14 +276,6 @@ class Begun:
                 self.status = os.waitstatus_to_exitcode(status)
         return self.status is None
 
-    def wait(self) -> None:
-        """Until the command is complete."""
-        self._ended(0)
-
-    def killed_itself(self) -> bool:
-        """Wait for the fatal moment; says whether it came."""
-        return self._ended(-signal.SIGKILL, 0) != 0
-
     def kill_after(self, seconds: float, worker: bool) -> str | None:
         """Kill the command or one of its worker processes; says which was hit, None if it ended by itself before.
 
@@ -306,12 +290,13 @@ class Begun:
             hit = "worker" if worker and workers else "command"
             os.kill(workers[0] if hit == "worker" else self.pid, signal.SIGKILL)
             # A command whose worker was killed ends by itself.
-            if self._ended(-signal.SIGKILL, 2, 0) != 0:
+            if self.ended(-signal.SIGKILL, 2, 0) != 0:
                 return hit
-        self._ended(0)  # there was nothing left to do
+        self.ended(0)  # there was nothing left to do
         return None
 
-    def _ended(self, *allowed: int) -> int:
+    def ended(self, *allowed: int) -> int:
+        """Wait until the command ends, with one of these statuses; returns which."""
         while self.running():
             time.sleep(0.005)
         if self.status not in allowed:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import time
 from pathlib import Path
 
@@ -65,11 +64,8 @@ def main() -> None:
     parser.add_argument(
         "--blade", action="store_true", help="full law and contact; else a bed at constant friction"
     )
-    parser.add_argument("--core", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--warm", type=int, default=5, help="frames before timing starts, with --blade")
     options = parser.parse_args()
-    os.sched_setaffinity(0, {options.core})
     if options.blade:
         scene, effects = cut(options.particles), Effects()
     else:
@@ -81,7 +77,7 @@ def main() -> None:
     solver = Solver(scene, effects)
     frames, seconds = solver.frames(), options.seconds
     begin, warm = time.process_time(), 0
-    while warm < (options.warm if options.blade else 3) or time.process_time() - begin < 0.3 * seconds:
+    while warm < (5 if options.blade else 3) or time.process_time() - begin < 0.3 * seconds:
         next(frames)
         warm += 1
     times, stop = [], time.process_time() + seconds

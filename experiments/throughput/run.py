@@ -16,6 +16,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
@@ -89,43 +90,37 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--taichi-python", default=sys.executable, help="Python with taichi and numpy")
     parser.add_argument("--newton-python", default=sys.executable, help="Python with newton and numpy")
-    parser.add_argument("--core", type=int, default=min(os.sched_getaffinity(0)))
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=5.0, help="of timing per repeat, except for Newton")
-    parser.add_argument("--newton-frames", type=int, default=5, help="frames timed per repeat")
-    parser.add_argument("--skip-growth", action="store_true")
     options = parser.parse_args()
-    budget = ["--core", options.core, "--seconds", options.seconds]
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    budget = "--seconds", options.seconds
     with tempfile.TemporaryDirectory() as temporary:
-
-        def case(particles: int) -> Path:
-            path = Path(temporary) / f"{particles}.npz"
-            if not path.exists():
-                ours.write_case(path, particles)
-            return path
+        files = {size: Path(temporary) / f"{size}.npz" for size in (PAPER, *SIZES)}
+        for size, file in files.items():
+            ours.write_case(file, size)
 
         def mpm_warp(particles: int, *more: str) -> dict | None:
             return child(sys.executable, "ours.py", "--particles", particles, *budget, *more)
 
         def taichi(particles: int, *more: str) -> dict | None:
-            return child(options.taichi_python, "taichi_mpm.py", case(particles), *budget, *more)
+            return child(options.taichi_python, "taichi_mpm.py", files[particles], *budget, *more)
 
         def newton(particles: int, *more: object) -> dict | None:
-            frames = ["--core", options.core, "--frames", options.newton_frames]
-            return child(options.newton_python, "newton_mpm.py", case(particles), *frames, *more)
+            return child(options.newton_python, "newton_mpm.py", files[particles], *more)
 
         bed, limited = "bed at rest, constant friction", "blade, at most {} iterations a step (its {})"
         compared = [
-            ("mpm_warp", "blade, mu(I), contact, frames copied", lambda: mpm_warp(PAPER, "--blade")),
-            ("mpm_warp", f"{bed}, frames copied", lambda: mpm_warp(PAPER)),
-            ("Taichi MLS-MPM", f"{bed}, plain sums", lambda: taichi(PAPER)),
-            ("Taichi MLS-MPM", f"{bed}, atomic sums", lambda: taichi(PAPER, "--atomic")),
-            ("Taichi MLS-MPM", f"{bed}, SVD, plain sums", lambda: taichi(PAPER, "--law", "svd")),
-            ("Newton implicit MPM", limited.format(250, "default"), lambda: newton(PAPER)),
+            ("mpm_warp", "blade, mu(I), contact, frames copied", partial(mpm_warp, PAPER, "--blade")),
+            ("mpm_warp", f"{bed}, frames copied", partial(mpm_warp, PAPER)),
+            ("Taichi MLS-MPM", f"{bed}, plain sums", partial(taichi, PAPER)),
+            ("Taichi MLS-MPM", f"{bed}, atomic sums", partial(taichi, PAPER, "--atomic")),
+            ("Taichi MLS-MPM", f"{bed}, SVD, plain sums", partial(taichi, PAPER, "--law", "svd")),
+            ("Newton implicit MPM", limited.format(250, "default"), partial(newton, PAPER)),
             (
                 "Newton implicit MPM",
                 limited.format(50, "examples"),
-                lambda: newton(PAPER, "--iterations", 50),
+                partial(newton, PAPER, "--iterations", 50),
             ),
         ]
         found: list[list[dict | None]] = [[] for _ in compared]
@@ -134,17 +129,15 @@ def main() -> None:
                 results.append(measure())
         rows = [summary(*entry[:2], PAPER, results) for entry, results in zip(compared, found, strict=True)]
         grown = []
-        for size in () if options.skip_growth else SIZES:
+        for size in SIZES:
             grown.append(summary("mpm_warp", f"growth: {bed}, frames copied", size, [mpm_warp(size)]))
             grown.append(summary("Taichi MLS-MPM", f"growth: {bed}, plain sums", size, [taichi(size)]))
             if size in NEWTON_SIZES:
                 what = "growth: blade, at most 50 iterations a step"
                 grown.append(summary("Newton implicit MPM", what, size, [newton(size, "--iterations", 50)]))
-    if grown:
-        draw(grown)
-    rows += grown
-    write_rows(HERE / "table.csv", rows)
-    for row in rows:
+    draw(grown)
+    write_rows(HERE / "table.csv", rows + grown)
+    for row in rows + grown:
         print(*(row[key] for key in (*COLUMNS[:4], "s_per_simulated_s")), sep="  ")
 
 

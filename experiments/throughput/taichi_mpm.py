@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import time
 
 import numpy as np
@@ -155,10 +154,8 @@ def main() -> None:
     parser.add_argument("case")
     parser.add_argument("--law", choices=["hencky", "svd"], default="hencky")
     parser.add_argument("--atomic", action="store_true", help="atomic sums, Taichi's default for +=")
-    parser.add_argument("--core", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=5.0)
     options = parser.parse_args()
-    os.sched_setaffinity(0, {options.core})
     ti.init(arch=ti.cpu, cpu_max_num_threads=1, default_fp=ti.f32, log_level=ti.ERROR)
     case = dict(np.load(options.case))
     step = make_step(case, options.law, options.atomic)

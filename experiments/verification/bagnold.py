@@ -17,15 +17,15 @@ BEADS = Material(
 THICKNESS = 0.03  # [m]
 
 
+def endless(height: float, spacing: float, **values) -> Bed:
+    """A layer of soil without end in x and y."""
+    size, walls = (4 * spacing, 4 * spacing, height), Walls("periodic", "periodic")
+    return Bed(size=size, spacing=spacing, walls=walls, **values)
+
+
 def layer(spacing: float, particles_per_cell: float, courant: float = 0.6, **changes) -> Incline:
     """A layer 3 cm thick at 26 degrees, endless in x and y, in Bagnold's profile."""
-    bed = Bed(
-        size=(4 * spacing, 4 * spacing, THICKNESS),
-        spacing=spacing,
-        particles_per_cell=particles_per_cell,
-        headroom=0.006,
-        walls=Walls("periodic", "periodic"),
-    )
+    bed = endless(THICKNESS, spacing, particles_per_cell=particles_per_cell, headroom=0.006)
     values = {"tilt": 26.0, "duration": 2.0, "frame_rate": 20.0, "courant": courant, "material": BEADS}
     return Incline(**({"bed": bed} | values | changes))
 
@@ -57,14 +57,3 @@ def measure() -> list[dict]:
         case = {"spacing": spacing, "particles_per_cell": ppc, "courant": courant}
         rows += [case | {"height": z, "speed": speed, "theory": steady} for z, speed, steady in layers]
     return rows
-
-
-PLOT = {
-    "x": "height",
-    "y": "speed",
-    "theory": "theory",
-    "curves": ["spacing", "courant"],
-    "panels": ["particles_per_cell"],
-    "xlabel": "height [m]",
-    "ylabel": "speed after 2 s [m/s]",
-}

@@ -192,15 +192,3 @@ def measure() -> list[dict]:
             row[f"draft_{name}"], row[f"down_{name}"] = wedge(angle, scene.rake, scene.depth, width)
         rows.append(row)
     return rows
-
-
-PLOT = {
-    "x": "rake",
-    "y": "draft",
-    "theory": "draft_own",
-    "curves": ["spacing"],
-    "panels": ["friction_map"],
-    "where": {"bin_width": math.inf},
-    "xlabel": "rake from vertical [°]",
-    "ylabel": "draft per width, 8 cm deep [N/m]",
-}

@@ -77,14 +77,3 @@ def measure() -> list[dict]:
                 travel = scene.speed * i / scene.frame_rate
                 rows.append(case | {"travel": travel, "coefficient": value, "theory": expected(friction)})
     return rows
-
-
-PLOT = {
-    "x": "travel",
-    "y": "coefficient",
-    "theory": "theory",
-    "curves": ["cells", "particles_per_cell"],
-    "panels": ["friction"],
-    "xlabel": "travel of the wall [m]",
-    "ylabel": "passive coefficient",
-}

@@ -77,14 +77,3 @@ def measure() -> list[dict]:
     for shape, known in EXPONENTS.items():
         logging.info("%s: exponents %s, known %s", shape, exponents(rows, shape), known)
     return rows
-
-
-PLOT = {
-    "x": "aspect",
-    "y": "runout",
-    "curves": ["shape"],
-    "xscale": "log",
-    "yscale": "log",
-    "xlabel": "height over radius",
-    "ylabel": "run-out over radius",
-}

@@ -82,13 +82,3 @@ def measure() -> list[dict]:
                 }
             )
     return rows
-
-
-PLOT = {
-    "x": "height_over_width",
-    "y": "pressure",
-    "theory": "janssen",
-    "curves": ["friction"],
-    "xlabel": "height over width",
-    "ylabel": "pressure on the bottom [Pa]",
-}

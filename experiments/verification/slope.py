@@ -5,22 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from bagnold import endless
 
-from mpm_warp import Bed, Effects, Material, Scene, Solver, Walls
+from mpm_warp import Effects, Material, Scene, Solver
 
 SOIL = Material()
 
 
 def acceleration(tilt: float, particles_per_cell: float, duration: float = 0.3) -> float:
     """Acceleration down the slope [m/s^2] of the upper half over the second half of `duration`, friction mu_s."""
-    h = 0.01
-    bed = Bed(
-        size=(4 * h, 4 * h, 0.1),
-        spacing=h,
-        particles_per_cell=particles_per_cell,
-        headroom=0.03,
-        walls=Walls("periodic", "periodic"),
-    )
+    bed = endless(0.1, 0.01, particles_per_cell=particles_per_cell, headroom=0.03)
     scene = Scene(bed=bed, material=SOIL, tilt=tilt, duration=duration, frame_rate=50.0)
     upper = scene.initial_positions()[:, 2] > -0.5 * bed.size[2]
     frames = Solver(scene, Effects(rate_dependence=False)).frames()
@@ -46,13 +40,3 @@ def measure() -> list[dict]:
         for ppc in (1, 8)
         for tilt in (25.0, 30.0, 34.0, 35.0, 36.0, 36.5, 37.0, 37.5, 38.0, 39.0, 41.0, 44.0)
     ]
-
-
-PLOT = {
-    "x": "tilt",
-    "y": "acceleration",
-    "theory": "theory",
-    "curves": ["particles_per_cell"],
-    "xlabel": "tilt [degrees]",
-    "ylabel": "acceleration down the slope [m/s²]",
-}

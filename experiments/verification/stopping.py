@@ -6,9 +6,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from bagnold import BEADS
+from bagnold import BEADS, endless
 
-from mpm_warp import Bed, Effects, Incline, Material, Solver, Walls
+from mpm_warp import Effects, Incline, Material, Solver
 
 EFFECTS = Effects(fluidity=True, nonlocality=True)
 CASES = (  # rate law, cells in a grain, tilts [degrees]
@@ -34,12 +34,7 @@ def final_speed(law: str, tilt: float, grains: float, cells_per_grain: float) ->
     soil = beads(law)
     height = grains * soil.grain_diameter
     spacing = height / round(grains * cells_per_grain)
-    bed = Bed(
-        size=(4 * spacing, 4 * spacing, height),
-        spacing=spacing,
-        headroom=0.6 * height,
-        walls=Walls("periodic", "periodic"),
-    )
+    bed = endless(height, spacing, headroom=0.6 * height)
     # Eight times the time in which a layer 6 % too high grows out of nothing.
     slowing = soil.nonlocal_amplitude * soil.grain_diameter
     slowing /= soil.cooperativity_length(math.tan(math.radians(tilt)))
@@ -66,13 +61,3 @@ def measure() -> list[dict]:
             found = {"stopping_height": grains[1] - speed[1] / slope, "theory": theory}
             rows += [case | {"grains": g, "speed": v} | found for g, v in zip(grains, speed, strict=True)]
     return rows
-
-
-PLOT = {
-    "x": "tilt",
-    "y": "stopping_height",
-    "theory": "theory",
-    "curves": ["law", "cells_per_grain"],
-    "xlabel": "tilt [degrees]",
-    "ylabel": "height at which flow stops [grains]",
-}

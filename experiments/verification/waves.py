@@ -63,14 +63,3 @@ def measure() -> list[dict]:
         for ppc in (1, 8)
         for cells in (8, 16, 32, 64)
     ]
-
-
-PLOT = {
-    "x": "cells",
-    "y": "error",
-    "curves": ["wave", "particles_per_cell"],
-    "xscale": "log",
-    "yscale": "log",
-    "xlabel": "grid spacings in a wavelength",
-    "ylabel": "relative error of velocity after one period",
-}

@@ -57,16 +57,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Case:
-    """One hard case."""
+    """A line of cases.csv: what is hard, what must hold, and the quantity that is measured for it."""
 
     name: str
-    """In words, unique within its area."""
     hard: str
-    """What is hard about it."""
     must: str
-    """The property that must hold."""
     quantity: str
-    """What is measured for it."""
     limit: float
     """Of the quantity, from physics or from what a user can bear, chosen before measuring; 0 allows nothing at all."""
     unit: str

@@ -18,7 +18,6 @@ K0_ANGLE = float(np.degrees(np.arctan(np.sqrt(3.0) * (1.0 - 0.6) / 1.3)))
 
 
 def excavation(depth: float, speed: float, rake: float, motion: str) -> tuple[float, str]:
-    """A run of the paper's campaign on a 2 cm grid."""
     scene = Excavation(
         bed=CUT_BED, blade=Plate(thickness=0.04), depth=depth, speed=speed, rake=rake, motion=motion
     )
@@ -46,7 +45,6 @@ def wheel(duration: float = 3.0, bed: Bed = WHEEL_BED, **values) -> tuple[float,
 
 
 def too_heavy() -> tuple[float, str]:
-    """The 5 cm wheel with the load of the big one: carried, or stopped by a line that says what to do."""
     try:
         return wheel(diameter=0.05, load=225.0, gravity=1.62, slip=0.7, width=0.0833)
     except SolverStopped as stopped:
@@ -62,7 +60,6 @@ def raised_limit() -> tuple[float, str]:
 
 
 def light_wheel() -> tuple[float, str]:
-    """A wheel of 10 g, lighter than the soil it touches: the step must shrink, and it must come to rest."""
     bed = replace(WHEEL_BED, particles_per_cell=1.0)
     scene = Wheel(
         bed=bed,

@@ -72,17 +72,12 @@ def top_speed(frames: Iterable[Frame]) -> float:
 def energies(scene: Scene, frames: Iterable[Frame]) -> np.ndarray:
     """Kinetic energy and potential energy above the floor of the soil [J], shape (T,)."""
     mass = scene.filled[1] * scene.material.bulk_density
-    floor = scene.bed.size[2]
-    return np.array(
-        [
-            mass
-            * (
-                0.5 * np.sum(f.velocity.astype(float) ** 2)
-                + scene.gravity * np.sum(f.position[:, 2].astype(float) + floor)
-            )
-            for f in frames
-        ]
-    )
+    found = []
+    for frame in frames:
+        height = frame.position[:, 2].astype(float) + scene.bed.size[2]
+        kinetic = 0.5 * np.sum(frame.velocity.astype(float) ** 2)
+        found.append(mass * (kinetic + scene.gravity * np.sum(height)))
+    return np.array(found)
 
 
 def work_on_soil(frames: list[Frame]) -> np.ndarray:

@@ -24,9 +24,14 @@ ROOT = Path(__file__).resolve().parents[3]
 _FOLDER = tempfile.TemporaryDirectory(prefix="sgns-stability-")
 
 
+def new_folder() -> Path:
+    """An empty folder, for as long as this process."""
+    return Path(tempfile.mkdtemp(dir=_FOLDER.name))
+
+
 def fresh_data(**kw: Any) -> ReducedDataset:
     """Four training runs, two validation runs and a test run; keyword arguments as of `tiny.make_dataset`."""
-    return tiny.reduced(Path(tempfile.mkdtemp(dir=_FOLDER.name)), **kw)
+    return tiny.reduced(new_folder(), **kw)
 
 
 @cache
@@ -57,7 +62,7 @@ def train_synthetic(
 @cache
 def synthetic_network(kind: str = "pose") -> Path:
     """Checkpoint of a network of pose or points, or of polynomials, that follows the synthetic runs."""
-    output = Path(tempfile.mkdtemp(dir=_FOLDER.name))
+    output = new_folder()
     if kind == "polynomial":
         train_synthetic(synthetic_data(), output, {"kind": "polynomial"})
     else:

@@ -5,9 +5,7 @@ Letters: t frames, n particles, r modes.
 
 from __future__ import annotations
 
-import tempfile
 from functools import partial
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -21,6 +19,7 @@ from sgns.reduction.reduce import reduce_dataset
 from sgns_testing.tiny import REDUCTION, make_dataset
 
 from .measures import unsaid
+from .networks import new_folder
 
 
 def soil(t: int = 40, n: int = 60, rank: int | None = None, offset: float = 0.0, seed: int = 0) -> np.ndarray:
@@ -70,13 +69,13 @@ def constant() -> float:
 
 
 def constant_dataset() -> tuple[float, str]:
-    with tempfile.TemporaryDirectory() as folder:
-        dataset = make_dataset(Path(folder))
-        for path in (Path(folder) / "runs").iterdir():
-            with h5py.File(path, "r+") as file:
-                values = file["particles/soil/position/value"]
-                values[...] = values[:1].repeat(len(values), axis=0)
-        return unsaid(lambda: reduce_dataset(dataset, REDUCTION), "nothing moves", "rank 0", "simulate")
+    folder = new_folder()
+    dataset = make_dataset(folder)
+    for path in (folder / "runs").iterdir():
+        with h5py.File(path, "r+") as file:
+            values = file["particles/soil/position/value"]
+            values[...] = values[:1].repeat(len(values), axis=0)
+    return unsaid(lambda: reduce_dataset(dataset, REDUCTION), "nothing moves", "rank 0", "simulate")
 
 
 def duplicates() -> float:
@@ -126,14 +125,13 @@ def one_frame() -> tuple[float, str]:
 
 
 def one_run() -> tuple[float, str]:
-    """A dataset whose training split is one run, whose modes are asked for to the last."""
-    with tempfile.TemporaryDirectory() as folder:
-        make_dataset(Path(folder))
-        split = {"train": ["a"], "validation": ["e", "f"], "test": ["g"]}
-        (Path(folder) / "dataset.yaml").write_text(yaml.safe_dump({"name": "tiny", "split": split}))
-        dataset = Dataset.open(Path(folder))
-        reduced = reduce_dataset(dataset, REDUCTION | {"max_modes": 40, "num_modes": 1})
-        return askew(reduced.basis), f"{len(dataset.runs('train'))} run, {reduced.basis.num_modes} modes"
+    folder = new_folder()
+    make_dataset(folder)
+    split = {"train": ["a"], "validation": ["e", "f"], "test": ["g"]}
+    (folder / "dataset.yaml").write_text(yaml.safe_dump({"name": "tiny", "split": split}))
+    dataset = Dataset.open(folder)
+    reduced = reduce_dataset(dataset, REDUCTION | {"max_modes": 40, "num_modes": 1})
+    return askew(reduced.basis), f"{len(dataset.runs('train'))} run, {reduced.basis.num_modes} modes"
 
 
 def batches_of_one() -> float:
@@ -143,7 +141,6 @@ def batches_of_one() -> float:
 
 
 def modes_of_all_sizes() -> float:
-    """Ways of moving from 1 m down to 1e-12 m."""
     chance = np.random.default_rng(1)
     ways = np.linalg.qr(chance.normal(size=(80, 24)))[0].T * 10.0 ** -np.linspace(0, 12, 24)[:, None]
     return askew(fitted(np.einsum("tak,kn->tna", chance.normal(size=(60, 3, 24)), ways), 24))
@@ -157,7 +154,6 @@ def equal_modes() -> float:
 
 
 def tiny_motion() -> float:
-    """A bed of 1 m whose soil moves by 1e-9 m."""
     still, moving = soil(t=1, rank=4), soil(rank=4)
     small = still + 1e-8 * (moving - moving.mean(0))
     return turned(fitted(moving, 4), fitted(small, 4))
@@ -178,36 +174,30 @@ def truncated_stream() -> tuple[float, str]:
 def poisoned(split: str, value: float) -> tuple[float, str]:
     """One particle of one frame of one run is no number."""
     name = {"train": "b", "validation": "f"}[split]
-    with tempfile.TemporaryDirectory() as folder:
-        dataset = make_dataset(Path(folder))
-        with h5py.File(Path(folder) / "runs" / f"{name}.h5", "r+") as file:
-            file["particles/soil/position/value"][9, 31, 1] = value
-        words = f"{name}.h5", "particle 31", "along y", "frame 9", str(value)
-        return unsaid(lambda: reduce_dataset(dataset, REDUCTION), *words)
+    folder = new_folder()
+    dataset = make_dataset(folder)
+    with h5py.File(folder / "runs" / f"{name}.h5", "r+") as file:
+        file["particles/soil/position/value"][9, 31, 1] = value
+    words = f"{name}.h5", "particle 31", "along y", "frame 9", str(value)
+    return unsaid(lambda: reduce_dataset(dataset, REDUCTION), *words)
 
 
 def beyond_the_rank() -> tuple[float, str]:
-    with tempfile.TemporaryDirectory() as folder:
-        dataset = make_dataset(Path(folder), n=5)
-        return unsaid(
-            lambda: reduce_dataset(dataset, REDUCTION | {"num_modes": 6}),
-            "num_modes is 6",
-            "give 3 modes",
-            "at most 3",
-        )
+    dataset = make_dataset(new_folder(), n=5)
+    return unsaid(
+        lambda: reduce_dataset(dataset, REDUCTION | {"num_modes": 6}),
+        "num_modes is 6",
+        "give 3 modes",
+        "at most 3",
+    )
 
 
 def mixture_of_beds() -> tuple[float, str]:
-    with tempfile.TemporaryDirectory() as folder:
-        dataset = make_dataset(Path(folder))
-        make_dataset(Path(folder) / "other", n=51)
-        (Path(folder) / "other" / "runs" / "c.h5").replace(Path(folder) / "runs" / "c.h5")
-        return unsaid(lambda: reduce_dataset(dataset, REDUCTION), "c.h5", "one basis serves one bed")
-
-
-ORTHONORMAL = "modes stay orthonormal"
-NO_MODES = "no mode is made of nothing"
-NAMED = "refused in one line that says what and where"
+    folder = new_folder()
+    dataset = make_dataset(folder)
+    make_dataset(folder / "other", n=51)
+    (folder / "other" / "runs" / "c.h5").replace(folder / "runs" / "c.h5")
+    return unsaid(lambda: reduce_dataset(dataset, REDUCTION), "c.h5", "one basis serves one bed")
 
 
 MEASURES = {

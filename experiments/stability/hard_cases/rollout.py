@@ -7,10 +7,8 @@ Letters: T frames, r modes.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +20,7 @@ from sgns.rollout import write_rollout
 from sgns.simulator import Rollout, Simulator
 
 from .measures import unsaid
-from .networks import quick_data, quick_network, simulator_of, synthetic_data, synthetic_network
+from .networks import new_folder, quick_data, quick_network, simulator_of, synthetic_data, synthetic_network
 
 Change = Callable[[np.ndarray], np.ndarray]
 
@@ -56,7 +54,6 @@ def to_and_fro(path: np.ndarray, times: int) -> np.ndarray:
 
 
 def long_path(kind: str, times: int) -> tuple[float, str]:
-    """Movement of the soil at its largest, in share of the largest of a training run."""
     simulator, run = simulator_of(kind), a_run(kind)
     rollout = simulator.rollout(to_and_fro(run.pose, times), values=run.scene)
     share = float(moved(simulator, rollout.latent).max()) / largest_movement(kind, simulator)
@@ -84,7 +81,6 @@ def slowly(kind: str, times: int) -> tuple[float, str]:
 
 
 def rest(start: str, seconds: float = 60.0) -> tuple[float, str]:
-    """Drift under a tool at rest [mm]: in a bed that was never touched, or after a cut."""
     run = a_run("quick")
     drifts = []
     for hold in (True, False):
@@ -101,7 +97,6 @@ def rest(start: str, seconds: float = 60.0) -> tuple[float, str]:
 
 
 def creeping(kind: str) -> tuple[float, str]:
-    """Movement of the soil under a tool that advances by a micrometre in every frame, for a minute [mm]."""
     simulator, run = simulator_of(kind), a_run(kind)
     path = run.pose[:1].repeat(3601, axis=0)
     path[:, 0] += 1e-6 * np.arange(len(path))
@@ -110,7 +105,6 @@ def creeping(kind: str) -> tuple[float, str]:
 
 
 def vibrating(kind: str) -> tuple[float, str]:
-    """Movement of the soil under a tool that shakes by 0.1 mm to and fro at 15 Hz for a minute, before it cuts [mm]."""
     simulator, run = simulator_of(kind), a_run(kind)
     path = run.pose[:1].repeat(3601, axis=0)
     path[:, 0] += 1e-4 * np.sin(2 * np.pi * 15.0 * np.arange(len(path)) / simulator.frame_rate)
@@ -118,12 +112,15 @@ def vibrating(kind: str) -> tuple[float, str]:
     return float(moved(simulator, found.latent).max()), found.excess.words()
 
 
-def shifted(path: np.ndarray, **by: float) -> np.ndarray:
-    """The tool moved [m] along axes."""
+def shifted(path: np.ndarray, since: float = 0.0, **by: float) -> np.ndarray:
+    """The tool moved [m] along axes, from a share of its way on."""
     path = path.copy()
     for axis, distance in by.items():
-        path[:, "xyz".index(axis)] += distance
+        path[int(since * len(path)) :, "xyz".index(axis)] += distance
     return path
+
+
+teleported = partial(shifted, since=0.5)
 
 
 def stretched(path: np.ndarray, axis: str, factor: float) -> np.ndarray:
@@ -141,20 +138,12 @@ def turned(path: np.ndarray, axis: str, degrees: float) -> np.ndarray:
     return path
 
 
-def teleported(path: np.ndarray, distance: float) -> np.ndarray:
-    """The tool somewhere else from the middle of its way on."""
-    path = path.copy()
-    path[len(path) // 2 :, 0] += distance
-    return path
-
-
 def backwards(path: np.ndarray) -> np.ndarray:
     """The way back, driven as a way there."""
     return path[::-1].copy()
 
 
 def unlike(kind: str, change: Change) -> tuple[float, str]:
-    """How often a path that is unlike the training runs is not flagged, or its rollout not finite or beyond bounds."""
     simulator = simulator_of(kind)
     runs = data_of(kind).runs("test")
     failures, least, most, words = 0, math.inf, 0.0, ""
@@ -173,13 +162,11 @@ def unlike(kind: str, change: Change) -> tuple[float, str]:
 
 def sound(found: Rollout) -> bool:
     """Whether all numbers of a rollout are finite."""
-    return all(
-        bool(np.isfinite(part).all()) for part in (found.latent, found.force, found.torque, found.poses)
-    )
+    parts = found.latent, found.force, found.torque, found.poses
+    return all(bool(np.isfinite(part).all()) for part in parts)
 
 
 def held_out() -> tuple[float, str]:
-    """Excess of runs of the same kind as the training's, at its largest."""
     simulator = simulator_of("quick")
     runs = [run for split in ("validation", "test") for run in quick_data().runs(split)]
     found = [simulator.rollout(run.pose, values=run.scene).excess.largest for run in runs]
@@ -187,7 +174,6 @@ def held_out() -> tuple[float, str]:
 
 
 def far_away(kind: str) -> tuple[float, str]:
-    """How far modes go beyond their bound when the tool jumps about by 1000 km for 1000 frames [m]."""
     simulator, run = simulator_of(kind), a_run(kind)
     path = run.pose[:1].repeat(1000, axis=0)
     path[10:, :3] += 1e6 * np.sin(np.arange(990))[:, None]
@@ -215,22 +201,21 @@ def breakdown() -> tuple[float, str]:
 
 
 def broken_path() -> tuple[float, str]:
-    """Frames lost of a rollout that is not finite from frame 9 on."""
     simulator, run = simulator_of("pose"), a_run("pose")
     path = run.pose.copy()
     path[9, 0] = 1e300
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "r.h5"
-        found = simulator.rollout(path)
-        lacking, note = unsaid(
-            lambda: write_rollout(target, simulator, run.scene, found),
-            "not finite from frame 9",
-            "r.stopped.h5",
-        )
-        kept = Path(folder) / "r.stopped.h5"
-        problems = [line for line in check_run(kept) if "stopped after 9 good frames" not in line]
-        with Run(kept) as stopped:
-            return lacking + len(problems) + abs(stopped.frame_count - 9) + target.exists(), note
+    folder = new_folder()
+    target = folder / "r.h5"
+    found = simulator.rollout(path)
+    lacking, note = unsaid(
+        lambda: write_rollout(target, simulator, run.scene, found),
+        "not finite from frame 9",
+        "r.stopped.h5",
+    )
+    kept = folder / "r.stopped.h5"
+    problems = [line for line in check_run(kept) if "stopped after 9 good frames" not in line]
+    with Run(kept) as stopped:
+        return lacking + len(problems) + abs(stopped.frame_count - 9) + target.exists(), note
 
 
 def body_points(count: int) -> tuple[float, str]:
@@ -247,7 +232,6 @@ def body_points(count: int) -> tuple[float, str]:
 
 
 def fewer_modes(kind: str) -> tuple[float, str]:
-    """Movement with 1 to all modes but one, in share of the largest of a training run."""
     run, shares = a_run(kind), []
     path = quick_network() if kind == "quick" else synthetic_network(kind)
     whole = Simulator.load(path)
@@ -259,7 +243,6 @@ def fewer_modes(kind: str) -> tuple[float, str]:
 
 
 def quaternion_signs() -> float:
-    """Difference when every other quaternion has the other sign, which is the same rotation."""
     simulator, run = simulator_of("pose"), a_run("pose")
     other = run.pose.copy()
     other[::2, 3:] *= -1
@@ -268,17 +251,14 @@ def quaternion_signs() -> float:
 
 
 def shortest_paths() -> float:
-    """Frames too many or too few along paths of one and two frames."""
     simulator, run = simulator_of("pose"), a_run("pose")
     return sum(abs(len(simulator.rollout(run.pose[:count]).latent) - count) for count in (1, 2))
 
 
 def side_by_side() -> float:
-    """Difference [mm] of rollouts one by one and side by side, among them paths that leave everything."""
     simulator, run = simulator_of("pose"), a_run("pose")
-    strange = teleported(run.pose, 3.0), shifted(run.pose, y=50.0), backwards(run.pose)
-    paths = np.stack([run.pose, *strange])
-    many = simulator.rollouts(paths)
+    paths = run.pose, teleported(run.pose, x=3.0), shifted(run.pose, y=50.0), backwards(run.pose)
+    many = simulator.rollouts(np.stack(paths))
     difference = [
         np.abs(many.latent[i] - simulator.rollout(path).latent).max() for i, path in enumerate(paths)
     ]
@@ -286,7 +266,6 @@ def side_by_side() -> float:
 
 
 def bad_pose(row: list[float], *words: str) -> tuple[float, str]:
-    """A pose that is none."""
     simulator, run = simulator_of("pose"), a_run("pose")
     path = run.pose.copy()
     path[4] = row
@@ -312,10 +291,10 @@ MEASURES = {
     "turned by 30 degrees about the vertical": partial(
         unlike, "quick", partial(turned, axis="z", degrees=30.0)
     ),
-    "teleported by 10 cm": partial(unlike, "quick", partial(teleported, distance=0.1)),
-    "teleported by 10 m": partial(unlike, "quick", partial(teleported, distance=10.0)),
-    "teleported, small network": partial(unlike, "pose", partial(teleported, distance=3.0)),
-    "teleported, polynomials": partial(unlike, "polynomial", partial(teleported, distance=3.0)),
+    "teleported by 10 cm": partial(unlike, "quick", partial(teleported, x=0.1)),
+    "teleported by 10 m": partial(unlike, "quick", partial(teleported, x=10.0)),
+    "teleported, small network": partial(unlike, "pose", partial(teleported, x=3.0)),
+    "teleported, polynomials": partial(unlike, "polynomial", partial(teleported, x=3.0)),
     "1000 km to and fro": partial(far_away, "quick"),
     "1000 km to and fro, small network": partial(far_away, "pose"),
     "1000 km to and fro, polynomials": partial(far_away, "polynomial"),

@@ -77,7 +77,6 @@ class Shifted(Bed):
 
 
 def one_layer_at_rest() -> float:
-    """Largest displacement of a layer left alone [mm]."""
     bed = OneLayer(size=(0.2, 0.2, 0.08), spacing=0.02, initial_stress="none")
     scene = Scene(bed=bed, duration=1.0)
     last = frames_of(scene, every=10**6)[-1]
@@ -113,7 +112,6 @@ class Strip(OneLayer):
 
 
 def one_layer_scraped() -> tuple[float, str]:
-    """A blade that starts on bare floor scrapes the only layer off it."""
     bed = Strip(size=(0.48, 0.4, 0.08), spacing=0.02, headroom=0.2, initial_stress="none", bare=0.14)
     scene = cut(bed=bed, motion="path", path=along(0.104, 0.304, 0.1, 0.021, 1.0), duration=1.0)
     frames = frames_of(scene)
@@ -133,7 +131,6 @@ def along(x0: float, x1: float, start: float, z: float, end: float, y: float = 0
 
 
 def flight() -> float:
-    """Error of single grains' paths against the parabola (of the scheme's own steps) [mm]."""
     bed = Grains(size=(0.4, 0.4, 0.1), spacing=0.01, headroom=0.4, initial_stress="none")
     scene = Thrown(bed=bed, upwards=0.5, spread=0.02, duration=0.1, frame_rate=20.0)
     solver = Solver(scene)
@@ -144,16 +141,11 @@ def flight() -> float:
     return 1000.0 * float(np.abs(last.position - exact).max())
 
 
+LOOSE = {"spacing": 0.02, "initial_stress": "none", "walls": Walls("slip", "slip")}
+
+
 def thrown_and_settled(per_cell: float) -> tuple[float, str]:
-    """A whole bed is thrown 5 cm up, comes apart in the air and falls back: change of its volume [%]."""
-    bed = Bed(
-        size=(0.32, 0.32, 0.16),
-        spacing=0.02,
-        particles_per_cell=per_cell,
-        headroom=0.6,
-        initial_stress="none",
-        walls=Walls("slip", "slip"),
-    )
+    bed = Bed(size=(0.32, 0.32, 0.16), particles_per_cell=per_cell, headroom=0.6, **LOOSE)
     scene = Thrown(bed=bed, upwards=1.0, spread=0.5, duration=2.0)
     last = frames_of(scene, every=10**6)[-1]
     gain = 100.0 * volume_gain(scene, last.position)
@@ -161,15 +153,7 @@ def thrown_and_settled(per_cell: float) -> tuple[float, str]:
 
 
 def grains_and_settled(per_cell: float) -> tuple[float, str]:
-    """A rain of single grains becomes a layer: how much higher or lower it is than dense soil [%]."""
-    bed = Rain(
-        size=(0.16, 0.16, 0.08),
-        spacing=0.02,
-        particles_per_cell=per_cell,
-        headroom=3.0,
-        initial_stress="none",
-        walls=Walls("slip", "slip"),
-    )
+    bed = Rain(size=(0.16, 0.16, 0.08), particles_per_cell=per_cell, headroom=3.0, **LOOSE)
     scene = Thrown(bed=bed, spread=0.3, duration=2.0)
     last = frames_of(scene, every=10**6)[-1]
     layer = np.sort(last.position[:, 2] + bed.size[2])
@@ -190,15 +174,8 @@ class Rain(Bed):
 
 
 def dropped_block(speed: float) -> tuple[float, str]:
-    """A block hits the floor at `speed`: energy that appears, over what there was [%]."""
-    bed = BlockBed(
-        size=(0.3, 0.3, 0.3),
-        spacing=0.01,
-        initial_stress="none",
-        headroom=0.2,
-        low=(0.1, 0.1, -0.28),
-        high=(0.2, 0.2, -0.18),
-    )
+    size, ends = (0.3, 0.3, 0.3), {"low": (0.1, 0.1, -0.28), "high": (0.2, 0.2, -0.18)}
+    bed = BlockBed(size=size, spacing=0.01, initial_stress="none", headroom=0.2, **ends)
     scene = Thrown(bed=bed, upwards=-speed, duration=0.2, frame_rate=400.0)
     return energy_gain(scene)
 
@@ -220,7 +197,6 @@ def impact(speed: float) -> tuple[float, str]:
 
 
 def push_without_gravity() -> tuple[float, str]:
-    """A plate hits a free block: momentum that appears or is lost, over what was given [-]."""
     free = block()
     path = ((0.0, 0.08, 0.15, -0.15, 0, 0, 0, 1), (1.0, 1.08, 0.15, -0.15, 0, 0, 0, 1))
     scene = cut(bed=free.bed, gravity=0.0, motion="path", path=path, duration=0.05, frame_rate=200.0)
@@ -231,14 +207,12 @@ def push_without_gravity() -> tuple[float, str]:
 
 
 def free_block_in_nothing() -> float:
-    """Drift of a block of soil that nothing acts on, after 0.5 s [mm]."""
     scene = block(gravity=0.0, duration=0.5, frame_rate=20.0)
     *_, last = Solver(scene).frames()
     return 1000.0 * float(np.abs(last.position - scene.initial_positions()).max())
 
 
 def on_nodes() -> tuple[float, str]:
-    """Particles on every node of the bin, its walls, edges and corners, let go."""
     bed = Shifted(size=(0.2, 0.2, 0.1), spacing=0.02, initial_stress="none")
     scene = Scene(bed=bed, duration=1.0)
     frames = frames_of(scene, every=10)
@@ -275,7 +249,6 @@ def against_the_wall() -> tuple[float, str]:
 
 
 def walls_hold(kind: str | float) -> float:
-    """How far soil that falls and spreads at 2 m/s gets beyond walls and floor [mm]."""
     walls = Walls(kind, kind, kind)
     bed = Bed(size=(0.2, 0.2, 0.1), spacing=0.02, headroom=0.5, initial_stress="none", walls=walls)
     scene = Thrown(bed=bed, spread=2.0, duration=0.5)
@@ -283,7 +256,6 @@ def walls_hold(kind: str | float) -> float:
 
 
 def column_falls() -> tuple[float, str]:
-    """A column eight times as high as wide: energy that appears [%]."""
     bed = Bed(size=(0.8, 0.12, 0.32), spacing=0.02, headroom=0.05, walls=Walls(y="slip"))
     scene = Column(bed=bed, radius=0.04, shape="slab", duration=0.8)
     return energy_gain(scene)
@@ -307,7 +279,6 @@ def steep_slope() -> tuple[float, str]:
 
 
 def volume_after_a_deep_cut(per_cell: float) -> tuple[float, str]:
-    """Volume change of the settled soil after the deepest, fastest cut of the campaign, in either direction [%]."""
     bed = Bed(spacing=0.02, particles_per_cell=per_cell)
     scene = Excavation(bed=bed, depth=0.10, speed=0.15, rake=0.0, motion="curved", duration=4.0)
     last = frames_of(scene, every=10**6, effects=Effects(symmetry=True))[-1]
@@ -316,7 +287,6 @@ def volume_after_a_deep_cut(per_cell: float) -> tuple[float, str]:
 
 
 def out_of_the_grid() -> tuple[float, str]:
-    """Soil is thrown higher than the grid reaches."""
     scene = Thrown(bed=replace(block().bed, headroom=0.05), upwards=3.0, duration=0.3)
     return stopped_with(scene, "raise scene.bed.headroom")
 

@@ -24,7 +24,6 @@ def mean_force(share: float, **changes) -> np.ndarray:
 
 
 def step_error(share: float) -> float:
-    """Change of the force against a tenth of the longest step [%]."""
     exact = mean_force(0.1)
     return 100.0 * float(np.linalg.norm(mean_force(share) - exact) / np.linalg.norm(exact))
 
@@ -35,13 +34,8 @@ def settling_error(youngs_modulus: float) -> tuple[float, str]:
     With the log law the column at rest has M ln J / J = -rho g s at a weight of s above, M the confined modulus.
     """
     height, material = 0.16, Material(youngs_modulus=youngs_modulus)
-    bed = Bed(
-        size=(0.04, 0.04, height),
-        spacing=0.01,
-        initial_stress="none",
-        headroom=0.02,
-        walls=Walls("slip", "slip", "slip"),
-    )
+    size, walls = (0.04, 0.04, height), Walls("slip", "slip", "slip")
+    bed = Bed(size=size, spacing=0.01, initial_stress="none", headroom=0.02, walls=walls)
     period = 4.0 * height / material.wave_speed
     scene = Scene(bed=bed, material=material, duration=6.0 * period, frame_rate=40.0 / period, courant=0.4)
     start = scene.initial_positions()[:, 2]
@@ -59,13 +53,11 @@ def settling_error(youngs_modulus: float) -> tuple[float, str]:
 
 
 def soft_or_stiff_cut(youngs_modulus: float) -> tuple[float, str]:
-    """A cut, 6 cm deep, in soil of any stiffness."""
     scene = cut(material=Material(youngs_modulus=youngs_modulus))
     return blade_shares(scene, frames_of(scene))
 
 
 def precision_gap(quantity: str) -> float:
-    """Between float32 and float64 after a cut of 0.2 s."""
     one, two = (frames_of(cut(), precision=p) for p in ("float32", "float64"))
     if quantity == "force":
         a, b = (np.mean([f.force for f in frames[6:]], axis=0) for frames in (one, two))
@@ -82,7 +74,6 @@ def creep_in_float32() -> float:
 
 
 def a_million_steps() -> tuple[float, str]:
-    """Displacement of a tiny bed at rest after 10^6 substeps [mm]."""
     bed = Bed(size=(0.08, 0.08, 0.06), spacing=0.02, headroom=0.02)
     scene = Scene(bed=bed, duration=1.0, frame_rate=1.0)
     substeps = Solver(scene).substeps_per_frame
@@ -93,15 +84,10 @@ def a_million_steps() -> tuple[float, str]:
 
 
 def twice(effects: Effects) -> float:
-    """Numbers that differ between two computations of the same random bed."""
     bed = replace(cut().bed, arrangement="jittered", seed=3)
     one, two = (frames_of(cut(bed=bed, duration=0.1), effects=effects) for _ in range(2))
-    return float(
-        sum(
-            np.sum(a.position != b.position) + np.sum(a.force != b.force)
-            for a, b in zip(one, two, strict=True)
-        )
-    )
+    pairs = zip(one, two, strict=True)
+    return float(sum(np.sum(a.position != b.position) + np.sum(a.force != b.force) for a, b in pairs))
 
 
 def compressed_beyond_the_step() -> tuple[float, str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +15,7 @@ from sgns_testing.meshes import box_corners, box_triangles, write_obj
 from sgns_testing.scenes import cut
 
 from .measures import blade_shares, frames_of, refused, shares, stopped_with, top_speed, volume_gain
+from .networks import new_folder
 
 IN_SOIL = 0.06
 """Height of the centre of the plate of `cut` when its tip is 4 cm deep [m]."""
@@ -69,7 +69,6 @@ def appears_in_soil() -> tuple[float, str]:
 
 
 def turns_back() -> tuple[float, str]:
-    """Forward at 0.2 m/s, back at once, and forward again."""
     rows = [*down(), (0.7, 0.204, IN_SOIL), (1.2, 0.104, IN_SOIL), (1.7, 0.204, IN_SOIL)]
     scene = driven(rows, 1.7)
     return blade_shares(scene, frames_of(scene))
@@ -90,7 +89,6 @@ def creep() -> tuple[float, str]:
 
 
 def shakes(amplitude: float = 1e-3, frequency: float = 50.0) -> tuple[float, str]:
-    """In the soil, along x, for a second."""
     times = np.arange(0.0, 1.0, 1.0 / (frequency * 24.0))
     swing = 0.104 + amplitude * np.sin(2.0 * np.pi * frequency * times)
     rows = [*down(), *((0.2 + t, x, IN_SOIL) for t, x in zip(times[1:], swing[1:], strict=True))]
@@ -110,7 +108,6 @@ def leaves_and_comes_back() -> tuple[float, str]:
 
 
 def spins() -> tuple[float, str]:
-    """Three turns per second about its vertical axis, 4 cm deep: its edges move at 1.8 m/s."""
     times = np.arange(0.0, 0.8, 0.01)
     angle = np.maximum(times - 0.25, 0.0) * 6.0 * np.pi
     height = np.interp(times, [0.0, 0.2], [ABOVE, IN_SOIL])
@@ -131,7 +128,6 @@ def spins() -> tuple[float, str]:
 
 
 def thin(cells: float, speed: float) -> tuple[float, str]:
-    """Soil that comes through a plate `cells` grid spacings thick [%]."""
     rows = [*down(), (0.2 + 0.1 / speed, 0.204, IN_SOIL)]
     blade = Plate(length=0.2, width=0.193, thickness=0.02 * cells)
     scene = driven(rows, 0.2 + 0.1 / speed, frame_rate=max(100.0, 500.0 * speed), blade=blade)
@@ -149,31 +145,28 @@ def mesh_scene(folder: Path, triangles: np.ndarray) -> Push:
 
 
 def flipped_mesh() -> float:
-    """Change of the force when all triangles of a mesh face inwards [%]."""
     force = []
-    with tempfile.TemporaryDirectory() as folder:
-        for triangles in (box_triangles(), box_triangles()[:, ::-1]):
-            frames = frames_of(mesh_scene(Path(folder), triangles))
-            force.append(np.array([f.force for f in frames]))
+    for triangles in (box_triangles(), box_triangles()[:, ::-1]):
+        frames = frames_of(mesh_scene(new_folder(), triangles))
+        force.append(np.array([f.force for f in frames]))
     return 100.0 * float(np.abs(force[1] - force[0]).max() / np.abs(force[0]).max())
 
 
 def one_flipped_triangle() -> tuple[float, str]:
     triangles = box_triangles()
     triangles[3] = triangles[3][::-1]
-    with tempfile.TemporaryDirectory() as folder:
-        accepted, words = refused(lambda: mesh_scene(Path(folder), triangles), "do not all face the same way")
+    folder = new_folder()
+    accepted, words = refused(lambda: mesh_scene(folder, triangles), "do not all face the same way")
     return accepted, words.replace(f"{folder}/", "")
 
 
 def open_mesh() -> tuple[float, str]:
-    with tempfile.TemporaryDirectory() as folder:
-        accepted, words = refused(lambda: mesh_scene(Path(folder), box_triangles()[:-1]), "is not closed")
+    folder = new_folder()
+    accepted, words = refused(lambda: mesh_scene(folder, box_triangles()[:-1]), "is not closed")
     return accepted, words.replace(f"{folder}/", "")
 
 
 def too_thin() -> tuple[float, str]:
-    """A plate of 2 mm on a grid of 2 cm."""
     blade = Plate(length=0.2, width=0.193, thickness=0.002)
     bed = replace(cut().bed, particles_per_cell=8.0)
     return refused(lambda: Solver(cut(blade=blade, bed=bed)), "too thin")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,14 +23,7 @@ from sgns.train.lightning_module import SurrogateTraining
 from sgns.train.windows import TrainingWindows
 
 from .measures import unsaid
-from .networks import fresh_data, poisoned, synthetic_data, synthetic_network, train_synthetic
-
-
-@contextmanager
-def folder() -> Iterator[Path]:
-    """A folder for what is trained."""
-    with tempfile.TemporaryDirectory() as path:
-        yield Path(path)
+from .networks import fresh_data, new_folder, poisoned, synthetic_data, synthetic_network, train_synthetic
 
 
 def content(path: Path) -> dict[str, Any]:
@@ -43,9 +34,8 @@ def content(path: Path) -> dict[str, Any]:
 def poison(split: str, what: str) -> tuple[float, str]:
     """One number of one frame of one run is none."""
     name = {"train": "b", "validation": "f"}[split]
-    with folder() as output:
-        words = f"reduced run {name}", "frame 7", f"sgns check {name}.h5"
-        return unsaid(lambda: train_synthetic(poisoned(synthetic_data(), split, what), output), *words)
+    words = f"reduced run {name}", "frame 7", f"sgns check {name}.h5"
+    return unsaid(lambda: train_synthetic(poisoned(synthetic_data(), split, what), new_folder()), *words)
 
 
 def exploding_rate(factor: float) -> tuple[float, str]:
@@ -55,15 +45,15 @@ def exploding_rate(factor: float) -> tuple[float, str]:
     def ill(settings: TrainingSettings, step: int) -> float:
         return rate(settings, step) * (factor if step > 11 else 1.0)
 
-    with folder() as output:
-        with patch.object(TrainingSettings, "rate", ill):
-            lacking, note = unsaid(
-                lambda: train_synthetic(synthetic_data(), output, max_steps=60),
-                "learning_rate", "at step 1", "best.ckpt",
-            )  # fmt: skip
-        steps = content(output / "best.ckpt")["global_step"]
-        finite = np.isfinite(Simulator.load(output / "best.ckpt").rollout(a_path()).latent).all()
-        return lacking + abs(steps - 10) + (not finite), note
+    output = new_folder()
+    with patch.object(TrainingSettings, "rate", ill):
+        lacking, note = unsaid(
+            lambda: train_synthetic(synthetic_data(), output, max_steps=60),
+            "learning_rate", "at step 1", "best.ckpt",
+        )  # fmt: skip
+    steps = content(output / "best.ckpt")["global_step"]
+    finite = np.isfinite(Simulator.load(output / "best.ckpt").rollout(a_path()).latent).all()
+    return lacking + abs(steps - 10) + (not finite), note
 
 
 def a_path() -> np.ndarray:
@@ -72,13 +62,12 @@ def a_path() -> np.ndarray:
 
 
 def far_too_high_rate() -> tuple[float, str]:
-    """No step is sound, so no checkpoint may be kept."""
     training = {"learning_rate": 1e30, "final_learning_rate": 1e30, "gradient_clip": None, "warmup_steps": 0}
-    with folder() as output:
-        lacking, note = unsaid(
-            lambda: train_synthetic(synthetic_data(), output, **training), "learning_rate", "at step"
-        )
-        return lacking + len(list(output.glob("*.ckpt"))), note
+    output = new_folder()
+    lacking, note = unsaid(
+        lambda: train_synthetic(synthetic_data(), output, **training), "learning_rate", "at step"
+    )
+    return lacking + len(list(output.glob("*.ckpt"))), note
 
 
 def spoilt_gradient() -> tuple[float, str]:
@@ -90,16 +79,12 @@ def spoilt_gradient() -> tuple[float, str]:
         if module.global_step == 19:
             next(module.surrogate.dynamics.network.parameters()).grad[0] = math.nan
 
-    with folder() as output:
-        with patch.object(SurrogateTraining, "configure_gradient_clipping", spoil):
-            lacking, note = unsaid(
-                lambda: train_synthetic(synthetic_data(), output, max_steps=30),
-                "the weights",
-                "after step 20",
-            )
-        return lacking + sum(
-            content(output / f"{name}.ckpt")["global_step"] != 10 for name in ("best", "last")
-        ), note
+    output = new_folder()
+    with patch.object(SurrogateTraining, "configure_gradient_clipping", spoil):
+        act = partial(train_synthetic, synthetic_data(), output, max_steps=30)
+        lacking, note = unsaid(act, "the weights", "after step 20")
+    steps = [content(output / f"{name}.ckpt")["global_step"] for name in ("best", "last")]
+    return lacking + sum(step != 10 for step in steps), note
 
 
 class Interrupted(Exception):
@@ -107,31 +92,28 @@ class Interrupted(Exception):
 
 
 def resumed(stops: tuple[int, ...], **training: Any) -> tuple[float, str]:
-    """Largest difference of weights, optimiser and schedule between a training that was interrupted and one that was
-    not."""
-
     def run(output: Path) -> float:
         return train_synthetic(synthetic_data(), output, max_steps=24, validate_every=6, **training)
 
-    with folder() as output:
-        whole = run(output / "whole")
-        for stop in stops:
+    output = new_folder()
+    whole = run(output / "whole")
+    for stop in stops:
 
-            def interrupt(callback: Any, trainer: Any, *args: Any, at: int = stop) -> None:
-                if trainer.global_step == at:
-                    raise Interrupted
+        def interrupt(callback: Any, trainer: Any, *args: Any, at: int = stop) -> None:
+            if trainer.global_step == at:
+                raise Interrupted
 
-            try:
-                with patch.object(StepProgress, "on_train_batch_end", interrupt):
-                    run(output / "parts")
-            except Interrupted:
-                continue
-            return math.nan, f"it was not interrupted at step {stop}"
-        difference = abs(run(output / "parts") - whole)
-        a, b = (content(output / name / "last.ckpt") for name in ("whole", "parts"))
-        for key in ("state_dict", "optimizer_states", "lr_schedulers", "global_step", "first_loss"):
-            difference = max(difference, unlike(a[key], b[key]))
-        return difference, f"interrupted after steps {', '.join(map(str, stops))}"
+        try:
+            with patch.object(StepProgress, "on_train_batch_end", interrupt):
+                run(output / "parts")
+        except Interrupted:
+            continue
+        return math.nan, f"it was not interrupted at step {stop}"
+    difference = abs(run(output / "parts") - whole)
+    a, b = (content(output / name / "last.ckpt") for name in ("whole", "parts"))
+    for key in ("state_dict", "optimizer_states", "lr_schedulers", "global_step", "first_loss"):
+        difference = max(difference, unlike(a[key], b[key]))
+    return difference, f"interrupted after steps {', '.join(map(str, stops))}"
 
 
 def unlike(a: Any, b: Any) -> float:
@@ -149,9 +131,9 @@ def unlike(a: Any, b: Any) -> float:
 def no_variance() -> tuple[float, str]:
     """Largest normalised feature or target of any window of runs that are all the same and whose tool never turns."""
     data = fresh_data(scene={"depth": 0.05, "speed": 0.1, "rake": 0.0, "motion": "ramp"})
-    with folder() as output:
-        skill = train_synthetic(data, output, max_steps=60, validate_every=60, learning_rate=5e-3)
-        dynamics = Simulator.load(output / "best.ckpt")._dynamics
+    output = new_folder()
+    skill = train_synthetic(data, output, max_steps=60, validate_every=60, learning_rate=5e-3)
+    dynamics = Simulator.load(output / "best.ckpt")._dynamics
     windows = TrainingWindows(data.runs("train"), 4, 3, "pose", 0)
     batch = windows.windows(windows.targets)
     values = [
@@ -166,17 +148,14 @@ def no_variance() -> tuple[float, str]:
 
 
 def no_force() -> tuple[float, str]:
-    """Runs in which the tool never feels anything: what force is predicted."""
     data = synthetic_data()
     runs = {
         name: [replace(run, force=0 * run.force, torque=0 * run.torque) for run in data.runs(name)]
         for name in ("train", "validation", "test")
     }
-    with folder() as output:
-        train_synthetic(
-            replace(data, _runs=runs), output, max_steps=150, validate_every=150, learning_rate=5e-3
-        )
-        found = Simulator.load(output / "best.ckpt").rollout(a_path())
+    output = new_folder()
+    train_synthetic(replace(data, _runs=runs), output, max_steps=150, validate_every=150, learning_rate=5e-3)
+    found = Simulator.load(output / "best.ckpt").rollout(a_path())
     return float(np.abs(found.force).max()), ""
 
 
@@ -184,10 +163,9 @@ def coinciding_nodes() -> float:
     """Gradients that are not finite where two modes are at one place, over a horizon of three steps: the length of an
     edge of no length has no direction."""
     data = synthetic_data()
-    with folder() as output:
-        with patch.object(SurrogateTraining, "losses", spy := Losses(SurrogateTraining.losses)):
-            train_synthetic(data, output, max_steps=3, horizon=3, validate_every=3, noise=0.0)
-        return spy.bad
+    with patch.object(SurrogateTraining, "losses", spy := Losses(SurrogateTraining.losses)):
+        train_synthetic(data, new_folder(), max_steps=3, horizon=3, validate_every=3, noise=0.0)
+    return spy.bad
 
 
 class Losses:
@@ -212,16 +190,14 @@ class Losses:
 
 def few_frames(**training: Any) -> tuple[float, str]:
     """Every run has four frames, one of them two: a few windows each."""
-    with folder() as output:
-        skill = train_synthetic(fresh_data(frames=4), output, max_steps=4, validate_every=4, **training)
-        return 0.0 if np.isfinite(skill) else math.nan, f"skill {skill:.3f}"
+    skill = train_synthetic(fresh_data(frames=4), new_folder(), max_steps=4, validate_every=4, **training)
+    return 0.0 if np.isfinite(skill) else math.nan, f"skill {skill:.3f}"
 
 
 def horizon_too_long() -> tuple[float, str]:
-    with folder() as output:
-        return unsaid(
-            lambda: train_synthetic(synthetic_data(), output, horizon=200), "200 steps", "201 frames"
-        )
+    return unsaid(
+        lambda: train_synthetic(synthetic_data(), new_folder(), horizon=200), "200 steps", "201 frames"
+    )
 
 
 class Cast(nn.Module):
@@ -237,7 +213,6 @@ class Cast(nn.Module):
 
 
 def precision(dtype: torch.dtype) -> tuple[float, str]:
-    """RMS difference of a rollout's modes from that of the network in float64, in share of the soil's movement."""
     run = synthetic_data().runs("test")[0]
     paths = {}
     for kind in (torch.float64, dtype):
@@ -257,13 +232,12 @@ def stepped(simulator: Simulator, path: np.ndarray) -> np.ndarray:
 
 
 def unfit_checkpoint() -> tuple[float, str]:
-    """A checkpoint with one weight that is not finite."""
-    with folder() as output:
-        held = content(synthetic_network())
-        name = next(name for name in held["state_dict"] if name.endswith("weight"))
-        held["state_dict"][name].view(-1)[0] = math.inf
-        torch.save(held, output / "bad.ckpt")
-        return unsaid(lambda: Simulator.load(output / "bad.ckpt"), "bad.ckpt", "not finite")
+    output = new_folder()
+    held = content(synthetic_network())
+    name = next(name for name in held["state_dict"] if name.endswith("weight"))
+    held["state_dict"][name].view(-1)[0] = math.inf
+    torch.save(held, output / "bad.ckpt")
+    return unsaid(lambda: Simulator.load(output / "bad.ckpt"), "bad.ckpt", "not finite")
 
 
 def wrong_modes() -> tuple[float, str]:
