@@ -10,8 +10,6 @@ from matplotlib.figure import Figure
 
 from sgns.evaluate import figures
 
-__all__ = ["pixels"]
-
 
 def pixels(figure: Figure) -> np.ndarray:
     """The drawn picture, shape (height, width, channels); fails if it is empty."""

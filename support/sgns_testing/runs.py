@@ -14,8 +14,6 @@ import numpy as np
 
 from sgns.data.writer import RunWriter
 
-__all__ = ["BED", "PLATE", "make_run", "make_writer", "random_frame", "random_poses", "start_positions"]
-
 BED = np.array([0.80, 0.60, 0.15])
 """Lx, Ly, Lz [m]."""
 PLATE = np.array([0.028, 0.457, 0.305])

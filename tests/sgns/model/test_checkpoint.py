@@ -37,6 +37,15 @@ def saying(key, value):
     return lambda content: content["hyper_parameters"].update({key: value})
 
 
+BAD_RANGES = (
+    *(None, {}, {"low": {}, "high": {}}, {"low": {"a": [0.0]}, "high": {"b": [1.0]}}, [1, 2]),
+    *(
+        {"low": {"a": low}, "high": {"a": high}}
+        for low, high in (([0.0], [1.0, 2.0]), ([1.0], [0.0]), ([float("nan")], [0.0]), ([], []), (1.0, 2.0))
+    ),
+)
+
+
 @pytest.mark.parametrize(
     ("line", "spoil"),
     [
@@ -49,8 +58,7 @@ def saying(key, value):
         *[("frame rate is", saying("frame_rate", rate)) for rate in (float("inf"), float("nan"), 0.0, -60.0)],
         ("the slowest travel is nan", saying("slowest_travel", float("nan"))),
         ("fit together", saying("slowest_travel", None)),
-        ("fit together", saying("training_range", None)),
-        ("fit together", saying("training_range", {"low": {}, "high": {}})),
+        *[("fit together", saying("training_range", bad)) for bad in BAD_RANGES],
     ],
 )
 def test_what_is_wrong_with_it_is_said(trained_briefly, tmp_path, line, spoil) -> None:
