@@ -21,10 +21,8 @@ from pathlib import Path
 import pytest
 from kills import broken, same
 
-from sgns.config import UserError
 from sgns.data.files import whole_file, write_whole
 from sgns.evaluate.command import read_log
-from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import reduce_dataset
 from sgns.train.command import train
 from sgns_testing.commands import REDUCED, SMALL, TRAIN, call, files, python, refused, small_dataset
@@ -190,14 +188,6 @@ def test_hidden_files_of_a_killed_process_do_not_stay(collected, tmp_path) -> No
     write_whole(tmp_path / "a", "whole")
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
     process.wait()
-
-
-def test_a_disk_that_is_full_for_the_basis_leaves_the_earlier_one(tmp_path) -> None:
-    folder = reduced(tmp_path).folder
-    before, basis = files(folder), Basis.load(folder / "basis.h5")
-    with largest_file(2000), pytest.raises(UserError, match="cannot write"):
-        basis.save(folder / "basis.h5")
-    assert files(folder) == before
 
 
 # --- a disk that is really full, or only to be read ------------------------------------------------------

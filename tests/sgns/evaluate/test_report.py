@@ -20,14 +20,7 @@ from sgns.evaluate.report import (
     render_report,
     short_names,
 )
-from sgns.evaluate.results import (
-    Costs,
-    EvaluatedRun,
-    Evaluation,
-    FullSpaceCost,
-    NetworkTiming,
-    aggregate,
-)
+from sgns.evaluate.results import Costs, EvaluatedRun, Evaluation, FullSpaceCost, NetworkTiming, aggregate
 from sgns.reduction.basis import Basis, ReductionCurves
 from sgns_testing.surrogates import made_scores
 

@@ -10,7 +10,6 @@ from mpm_warp.scenes import Wheel, sinkage
 from sgns.data.run import Run
 from sgns.evaluate import figures
 from sgns.evaluate.depth_buffer import CAMERA, DepthBuffer, project
-from sgns.evaluate.metrics import forward_force
 from sgns.evaluate.views import (
     body_corners,
     body_outline,
@@ -26,7 +25,6 @@ from sgns.evaluate.views import (
     upper_scale,
     view_times,
 )
-from sgns.model.features import is_wheel
 from sgns_testing.pictures import pixels
 from sgns_testing.runs import PLATE, make_run, start_positions
 from sgns_testing.surrogates import fitted
@@ -211,12 +209,6 @@ def test_hull_of_a_cube_of_flat_points_and_of_points_on_a_line():
 # --- The body of a recorded scene ------------------------------------------------------------------------
 
 REST = np.array([[0.3, 0.2, 0.1, 0.0, 0.0, 0.0, 1.0]])
-
-
-def test_forward_force_follows_the_kind_of_body():
-    assert forward_force({"kind": "wheel"}) == ("drawbar pull Fx", 1.0)
-    assert forward_force({"blade": {}}) == ("draft −Fx", -1.0)
-    assert is_wheel({"kind": "wheel"}) and not is_wheel({"kind": "bed"})
 
 
 @pytest.mark.parametrize("grousers", [{}, {"grousers": 6, "grouser_height": 0.01, "grouser_thickness": 0.02}])

@@ -10,13 +10,7 @@ import pytest
 
 from mpm_warp import Bed, Excavation
 from sgns.config import UserError
-from sgns.frontier.observation import (
-    Observation,
-    compare,
-    errors,
-    observe,
-    read_observation,
-)
+from sgns.frontier.observation import Observation, compare, errors, observe, read_observation
 
 FRAMES = 25
 

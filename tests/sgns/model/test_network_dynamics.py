@@ -177,16 +177,3 @@ def test_with_gradients_the_weights_are_differentiated() -> None:
     body, latent = track_of("pose", False), torch.randn(1, 3, 4, 3).double()
     dynamics.unroll(latent, body).force.sum().backward()
     assert all(p.grad is not None for p in dynamics.network.parameters())
-
-
-def test_memory_put_back_undoes_a_step() -> None:
-    dynamics = dynamics_of(body_nodes="points")
-    body, latent = track_of("points", False), torch.randn(1, 3, 4, 3).double()
-    stepper, plain = dynamics.stepper(len(POINTS)), dynamics.stepper(len(POINTS))
-    for each in (stepper, plain):
-        each.advance(latent, body.frames(slice(0, 3)))
-    memory = stepper.memory
-    stepper.advance(latent, track_of("points", True).frames(slice(6, 9)))
-    stepper.memory = memory
-    found, expected = (each.advance(latent, body.frames(slice(1, 4))) for each in (stepper, plain))
-    assert torch.equal(found.latent, expected.latent) and torch.equal(found.force, expected.force)
