@@ -1,7 +1,5 @@
 """Settings with which every command takes a second, and how tests call them."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging

@@ -1,7 +1,5 @@
 """Looking at figures in tests."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

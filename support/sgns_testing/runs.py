@@ -4,8 +4,6 @@ The initial positions depend on `n` only, so runs with the same `n` belong toget
 varies depth, speed and rake of the cut.
 """
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from typing import Any

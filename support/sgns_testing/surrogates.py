@@ -1,7 +1,5 @@
 """Stand-ins for a trained network and a dataset, for tests of rollout, evaluation and report."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar

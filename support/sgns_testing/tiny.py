@@ -1,7 +1,5 @@
 """A tiny dataset and small settings, so that learning can be tested in seconds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

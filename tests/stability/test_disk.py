@@ -6,8 +6,6 @@ permits it. With space again, the same command goes on to the result of one that
 `SGNS_FREE=0,50000,...` tries other amounts of space for all commands.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil
@@ -244,13 +242,6 @@ COMMANDS = {
 }
 
 
-def placed(name: str, here: Path, undisturbed: Undisturbed) -> list[str]:
-    """A command's arguments with their folders."""
-    needed = [one for one in ("network", "polynomial") if f"{{{one}}}" in " ".join(COMMANDS[name])]
-    places = {"here": here} | {one: undisturbed(one) for one in needed}
-    return [argument.format(**places) if "/" in argument else argument for argument in COMMANDS[name]]
-
-
 class Undisturbed:
     """What commands make of the small dataset undisturbed, each made when first asked for."""
 
@@ -266,6 +257,13 @@ class Undisturbed:
             done = call(*placed(name, made, self))
             assert done.returncode == 0, done.stderr
         return made
+
+
+def placed(name: str, here: Path, undisturbed: Undisturbed) -> list[str]:
+    """A command's arguments with their folders."""
+    needed = [one for one in ("network", "polynomial") if f"{{{one}}}" in " ".join(COMMANDS[name])]
+    places = {"here": here} | {one: undisturbed(one) for one in needed}
+    return [argument.format(**places) if "/" in argument else argument for argument in COMMANDS[name]]
 
 
 @pytest.fixture(scope="module")

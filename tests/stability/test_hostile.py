@@ -3,8 +3,6 @@
 Every hostile file tries to leave a canary; none may appear.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import io

@@ -1,7 +1,5 @@
 """Commands that are killed lose nothing, and two processes or users that share a campaign make every run once."""
 
-from __future__ import annotations
-
 import csv
 import os
 import subprocess

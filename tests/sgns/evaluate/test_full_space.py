@@ -1,7 +1,5 @@
 """The network on every particle: body nodes, neighbours, symmetries, windows, and the training of the experiment."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 

@@ -62,15 +62,6 @@ def test_runs_above_each_other_have_one_scale(pair):
     assert scales.arrow * strongest < 0.3 * np.ptp(scales.x_limits)
 
 
-def test_runs_may_stand_side_by_side_in_a_wide_picture(pair):
-    truth, prediction, _ = pair
-    scales = common_scales([truth, prediction], [4], start_positions(300))
-    figure = side_views([[("a", truth, 4), ("b", prediction, 4)]], scales, 10.8, 4.95)
-    assert pixels(figure).shape[1] == round(10.8 * figures.DPI)
-    left, right = figure.axes[:2]
-    assert left.get_position().x1 < right.get_position().x0
-
-
 @pytest.mark.parametrize("scene", [WHEEL, {"blade": None, "kind": "body"}, {"blade": None, "speed": 1e-12}])
 def test_other_bodies_and_soil_that_rests(tmp_path, scene):
     with Run(make_run(tmp_path / "run.h5", frames=8, n=200, scene={"depth": 0.0} | scene)) as run:

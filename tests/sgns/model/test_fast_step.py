@@ -1,7 +1,5 @@
 """The stepper of one graph against the network's definition."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """One latent step and whole paths: forces add up, modes have identities, one path is stepped as many are."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every option of model and training is trainable, and does what it says."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hydra import compose, initialize_config_module

@@ -1,7 +1,5 @@
 """Polynomial latent dynamics: known systems are found, rollouts are steps, nothing runs away."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

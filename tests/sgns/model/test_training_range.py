@@ -1,7 +1,5 @@
 """How far a path leaves what the training runs covered."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

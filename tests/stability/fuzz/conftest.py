@@ -1,7 +1,5 @@
 """Good files, and what all random tests share."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

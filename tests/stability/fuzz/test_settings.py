@@ -1,7 +1,5 @@
 """Overrides and files of settings."""
 
-from __future__ import annotations
-
 import json
 import string
 import subprocess
