@@ -21,13 +21,14 @@ def saying(key, value):
     return lambda content: content["hyper_parameters"].update({key: value})
 
 
-BAD_RANGES = (
-    *(None, {}, {"low": {}, "high": {}}, {"low": {"a": [0.0]}, "high": {"b": [1.0]}}, [1, 2]),
-    *(
-        {"low": {"a": low}, "high": {"a": high}}
-        for low, high in (([0.0], [1.0, 2.0]), ([1.0], [0.0]), ([float("nan")], [0.0]), ([], []), (1.0, 2.0))
-    ),
-)
+def ranging(low, high):
+    """Gives a quantity another range."""
+
+    def spoil(content) -> None:
+        known = content["hyper_parameters"]["training_range"]
+        known["low"]["the tool's position"], known["high"]["the tool's position"] = low, high
+
+    return spoil
 
 
 @pytest.mark.parametrize(
@@ -42,7 +43,12 @@ BAD_RANGES = (
         *[("frame rate is", saying("frame_rate", rate)) for rate in (float("inf"), float("nan"), 0.0, -60.0)],
         ("the slowest travel is nan", saying("slowest_travel", float("nan"))),
         ("fit together", saying("slowest_travel", None)),
-        *[("fit together", saying("training_range", bad)) for bad in BAD_RANGES],
+        *[("fit together", saying("training_range", bad)) for bad in (None, {"low": {}, "high": {}}, [1])],
+        ("ends differ", ranging([0.0], [1.0, 2.0])),
+        *[
+            ("not one of numbers in order", ranging(*ends))
+            for ends in (([1.0], [0.0]), ([float("nan")], [0.0]), ([], []), (1.0, 2.0))
+        ],
     ],
 )
 def test_what_is_wrong_with_it_is_said(trained_briefly, tmp_path, line, spoil) -> None:

@@ -65,18 +65,6 @@ def test_context_is_what_varies(data) -> None:
     assert not torch.allclose(plain.force, other.force)
 
 
-def test_the_loss_of_the_first_step_is_that_of_the_predicted_acceleration(data) -> None:
-    module, windows = module_of(data)
-    batch = windows.training_windows.batch(0, 8, windows.noise)
-    dynamics = module.surrogate.dynamics
-    shown = batch.history
-    target = batch.following[:, 0] - 2 * shown[:, -1] + shown[:, -2]
-    error = dynamics(shown, batch.shown_body).change[:, :4] - dynamics.change.normalise(target)
-    torch.testing.assert_close(
-        module.losses(batch)["change"], error.square().sum(-1).mean(), rtol=1e-5, atol=0
-    )
-
-
 def test_later_steps_of_the_horizon_start_from_predictions(data) -> None:
     module, windows = module_of(data, training={"horizon": 2})
     batch = windows.training_windows.batch(0, 8, windows.noise)
