@@ -3,6 +3,8 @@
 The cases follow from a fixed seed; `SGNS_FUZZ=20` makes twenty times as many from random seeds.
 """
 
+from __future__ import annotations
+
 import contextlib
 import json
 import os

@@ -1,5 +1,7 @@
 """Good files, and what all random tests share."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Files that are read: bytes lost or changed, and values, parts and lines that are missing, wrong or huge."""
 
+from __future__ import annotations
+
 import contextlib
 import csv
 import io

@@ -1,5 +1,7 @@
 """Overrides and files of settings."""
 
+from __future__ import annotations
+
 import json
 import string
 import subprocess
