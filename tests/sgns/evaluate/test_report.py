@@ -31,7 +31,8 @@ def scores(name, skill=0.9, force=0.3, mean=0.6, reduction=0.1):
     """Scores with a given skill, force NRMSE, NRMSE of the mean force and share of the reduction."""
     total = 1e-4 * (1.0 - skill)
     own, baseline = (made_scores(name, total, 1e-4, 1.0 + factor, 20.0) for factor in (force, mean))
-    mse = own.mse | {"reduction": reduction * total, "network": (1 - reduction) * total}
+    parts = {"reduction": reduction * total, "network": (1 - reduction) * total}
+    mse = own.mse | parts | {"constant_velocity": 1e-4}
     return replace(own, mse=mse, mean_force=baseline.force, mean_torque=baseline.torque)
 
 
