@@ -1,7 +1,5 @@
 """A campaign of small cuts, planned without torch: processes that make it begin quickly."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Settings with which every command takes a second, and how tests call them."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging
@@ -18,22 +16,6 @@ from omegaconf import DictConfig
 from sgns.cli.commands import main
 from sgns.simulate.scene import scene_from_config
 from sgns_testing.tiny import make_dataset
-
-__all__ = [
-    "REDUCED",
-    "SHORT",
-    "SMALL",
-    "TRAIN",
-    "call",
-    "composed",
-    "environment",
-    "files",
-    "python",
-    "refusal",
-    "refused",
-    "sgns",
-    "small_dataset",
-]  # fmt: skip
 
 SMALL = [
     *("scene.bed.size=[0.4,0.2,0.16]", "scene.bed.spacing=0.04", "scene.duration=0.2", "scene.speed=0.05"),

@@ -21,18 +21,6 @@ from hypothesis import HealthCheck, Phase, settings
 from mpm_warp import SceneError
 from sgns.config import UserError
 
-__all__ = [
-    "NUMBERS",
-    "OUTCOMES",
-    "VALUES",
-    "YAML",
-    "bounded",
-    "cases",
-    "changed",
-    "damaged",
-    "refused_or_read",
-]
-
 MORE = int(os.environ.get("SGNS_FUZZ", "1"))
 SECONDS = 10
 """Of computing time, that a case may take."""

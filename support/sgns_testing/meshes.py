@@ -1,7 +1,5 @@
 """Mesh files for the tests, written here."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The permissions of files count for root, too, once a process has given up the right to pass over them."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 

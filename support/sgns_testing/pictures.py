@@ -1,7 +1,5 @@
 """Looking at figures in tests."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np
@@ -9,8 +7,6 @@ from matplotlib import image
 from matplotlib.figure import Figure
 
 from sgns.evaluate import figures
-
-__all__ = ["pixels"]
 
 
 def pixels(figure: Figure) -> np.ndarray:

@@ -1,7 +1,5 @@
 """TFRecords as the paper's authors published them, written without TensorFlow."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

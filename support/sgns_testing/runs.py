@@ -4,8 +4,6 @@ The initial positions depend on `n` only, so runs with the same `n` belong toget
 varies depth, speed and rake of the cut.
 """
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from typing import Any
@@ -13,8 +11,6 @@ from typing import Any
 import numpy as np
 
 from sgns.data.writer import RunWriter
-
-__all__ = ["BED", "PLATE", "make_run", "make_writer", "random_frame", "random_poses", "start_positions"]
 
 BED = np.array([0.80, 0.60, 0.15])
 """Lx, Ly, Lz [m]."""

@@ -1,7 +1,5 @@
 """Beds and scenes for the solver's tests."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What tests look at inside a solver."""
 
-from __future__ import annotations
-
 from dataclasses import astuple
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Stand-ins for a trained network and a dataset, for tests of rollout, evaluation and report."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,23 +10,10 @@ from mpm_warp.poses import in_world_frame
 from sgns.data.run import Run
 from sgns.evaluate.metrics import VectorErrors
 from sgns.evaluate.results import Scores
-from sgns.model.training_range import Excess
 from sgns.reduction.basis import Basis
 from sgns.reduction.pca import IncrementalPCA
+from sgns.simulator import Rollout
 from sgns_testing.runs import make_run
-
-
-@dataclass
-class FakeRollout:
-    """The fields of `sgns.simulator.Rollout`."""
-
-    latent: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
-    poses: np.ndarray
-    body_points: np.ndarray
-    wall_time_s: float
-    excess: Excess | None = None
 
 
 @dataclass
@@ -71,16 +56,14 @@ class FakeSimulator:
 
     def rollout(
         self, poses: np.ndarray, body_points: Any = None, latent_history: Any = None, values: Any = None
-    ) -> FakeRollout:
+    ) -> Rollout:
         distance = [np.abs(known[0] - poses).sum() for known in self.known]
         _, latent, force, torque = self.known[int(np.argmin(distance))]
         latent = self.mistake(latent.copy(), self.history)
         if latent_history is not None:
             latent[: self.history] = np.asarray(latent_history)
-        factor = self.force_factor
-        return FakeRollout(
-            latent, factor * force, factor * torque, poses, in_world_frame(poses, body_points), 0.01
-        )
+        loads = self.force_factor * force, self.force_factor * torque
+        return Rollout(latent, *loads, poses, in_world_frame(poses, body_points), 0.01, lambda: None)
 
 
 def fitted(paths: list[Path], modes: int) -> Basis:

@@ -6,8 +6,6 @@ permits it. With space again, the same command goes on to the result of one that
 `SGNS_FREE=0,50000,...` tries other amounts of space for all commands.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil
@@ -21,10 +19,8 @@ from pathlib import Path
 import pytest
 from kills import broken, same
 
-from sgns.config import UserError
 from sgns.data.files import whole_file, write_whole
 from sgns.evaluate.command import read_log
-from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import reduce_dataset
 from sgns.train.command import train
 from sgns_testing.commands import REDUCED, SMALL, TRAIN, call, files, python, refused, small_dataset
@@ -192,14 +188,6 @@ def test_hidden_files_of_a_killed_process_do_not_stay(collected, tmp_path) -> No
     process.wait()
 
 
-def test_a_disk_that_is_full_for_the_basis_leaves_the_earlier_one(tmp_path) -> None:
-    folder = reduced(tmp_path).folder
-    before, basis = files(folder), Basis.load(folder / "basis.h5")
-    with largest_file(2000), pytest.raises(UserError, match="cannot write"):
-        basis.save(folder / "basis.h5")
-    assert files(folder) == before
-
-
 # --- a disk that is really full, or only to be read ------------------------------------------------------
 
 MOUNTED = 16 << 20
@@ -254,13 +242,6 @@ COMMANDS = {
 }
 
 
-def placed(name: str, here: Path, undisturbed: Undisturbed) -> list[str]:
-    """A command's arguments with their folders."""
-    needed = [one for one in ("network", "polynomial") if f"{{{one}}}" in " ".join(COMMANDS[name])]
-    places = {"here": here} | {one: undisturbed(one) for one in needed}
-    return [argument.format(**places) if "/" in argument else argument for argument in COMMANDS[name]]
-
-
 class Undisturbed:
     """What commands make of the small dataset undisturbed, each made when first asked for."""
 
@@ -276,6 +257,13 @@ class Undisturbed:
             done = call(*placed(name, made, self))
             assert done.returncode == 0, done.stderr
         return made
+
+
+def placed(name: str, here: Path, undisturbed: Undisturbed) -> list[str]:
+    """A command's arguments with their folders."""
+    needed = [one for one in ("network", "polynomial") if f"{{{one}}}" in " ".join(COMMANDS[name])]
+    places = {"here": here} | {one: undisturbed(one) for one in needed}
+    return [argument.format(**places) if "/" in argument else argument for argument in COMMANDS[name]]
 
 
 @pytest.fixture(scope="module")

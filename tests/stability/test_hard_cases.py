@@ -1,7 +1,5 @@
 """The hard cases of `make stability`: the quick ones, what they measure, and what is made of the measurements."""
 
-from __future__ import annotations
-
 import json
 import math
 import subprocess

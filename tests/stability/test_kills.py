@@ -1,7 +1,5 @@
 """Commands that are killed lose nothing, and two processes or users that share a campaign make every run once."""
 
-from __future__ import annotations
-
 import csv
 import os
 import subprocess
@@ -13,7 +11,6 @@ import pytest
 import yaml
 from kills import COMMANDS, broken, same
 
-from sgns.config import UserError
 from sgns.data.files import file_lock
 from sgns.simulate.workers import simulate_campaign
 from sgns_testing.campaigns import campaign
@@ -156,14 +153,3 @@ def test_a_lock_left_by_another_user_in_a_shared_folder_is_taken_over(tmp_path) 
     os.chown(tmp_path, NOBODY, NOBODY)
     tmp_path.chmod(0o1777)  # sticky: nobody may remove another user's file
     assert begin(LOCK, str(tmp_path / "a.h5")).communicate(timeout=100)[:2] == ("True\n", "")
-
-
-def test_a_folder_of_another_user_is_named(tmp_path, monkeypatch) -> None:
-    made = campaign(tmp_path, runs=3)
-
-    def refuse(*_: object, **__: object) -> None:
-        raise PermissionError(13, "Permission denied", str(made.path))
-
-    monkeypatch.setattr("sgns.data.files.os.open", refuse)
-    with pytest.raises(UserError, match=r"cannot write .*dataset\.yaml: Permission denied"):
-        simulate_campaign(made, device="cpu", workers=1)

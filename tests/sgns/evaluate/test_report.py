@@ -21,36 +21,20 @@ from sgns.evaluate.report import (
     render_report,
     short_names,
 )
-from sgns.evaluate.results import (
-    Costs,
-    EvaluatedRun,
-    Evaluation,
-    FullSpaceCost,
-    NetworkTiming,
-    Scores,
-    aggregate,
-)
+from sgns.evaluate.results import Costs, EvaluatedRun, Evaluation, FullSpaceCost, NetworkTiming, aggregate
 from sgns.reduction.basis import Basis, ReductionCurves
+from sgns_testing.surrogates import made_scores
 
 EVIL = '<script>alert("run&1")</script>'
 
 
 def scores(name, skill=0.9, force=0.3, mean=0.6, reduction=0.1):
     """Scores with a given skill, force NRMSE, NRMSE of the mean force and share of the reduction."""
-    truth = np.full((4, 3), [-100.0, 0.0, 50.0])
     total = 1e-4 * (1.0 - skill)
-    mse = {
-        "reduction": reduction * total,
-        "network": (1 - reduction) * total,
-        "total": total,
-        "frozen": 1e-4,
-        "constant_velocity": 1e-4,
-        "surface": 1e-6,
-        "surface_frozen": 1e-5,
-    }
-    own = VectorErrors.compare(truth, (1 + force) * truth)
-    baseline = VectorErrors.compare(truth, (1 + mean) * truth)
-    return Scores(name, 4, mse, own, own, baseline, baseline, 20.0)
+    own, baseline = (made_scores(name, total, 1e-4, 1.0 + factor, 20.0) for factor in (force, mean))
+    parts = {"reduction": reduction * total, "network": (1 - reduction) * total}
+    mse = own.mse | parts | {"constant_velocity": 1e-4}
+    return replace(own, mse=mse, mean_force=baseline.force, mean_torque=baseline.torque)
 
 
 def evaluation(names=("run1", "run2"), split="test", rollout=0.1, words="", wheel=False, **kw):

@@ -10,7 +10,6 @@ from mpm_warp.scenes import Wheel, sinkage
 from sgns.data.run import Run
 from sgns.evaluate import figures
 from sgns.evaluate.depth_buffer import CAMERA, DepthBuffer, project
-from sgns.evaluate.metrics import forward_force
 from sgns.evaluate.views import (
     body_corners,
     body_outline,
@@ -26,7 +25,6 @@ from sgns.evaluate.views import (
     upper_scale,
     view_times,
 )
-from sgns.model.features import is_wheel
 from sgns_testing.pictures import pixels
 from sgns_testing.runs import PLATE, make_run, start_positions
 from sgns_testing.surrogates import fitted
@@ -62,15 +60,6 @@ def test_runs_above_each_other_have_one_scale(pair):
     assert upper.get_position().y0 > lower.get_position().y1
     strongest = max(np.linalg.norm(run.force[f, [0, 2]]) for run in (truth, prediction) for f in frames)
     assert scales.arrow * strongest < 0.3 * np.ptp(scales.x_limits)
-
-
-def test_runs_may_stand_side_by_side_in_a_wide_picture(pair):
-    truth, prediction, _ = pair
-    scales = common_scales([truth, prediction], [4], start_positions(300))
-    figure = side_views([[("a", truth, 4), ("b", prediction, 4)]], scales, 10.8, 4.95)
-    assert pixels(figure).shape[1] == round(10.8 * figures.DPI)
-    left, right = figure.axes[:2]
-    assert left.get_position().x1 < right.get_position().x0
 
 
 @pytest.mark.parametrize("scene", [WHEEL, {"blade": None, "kind": "body"}, {"blade": None, "speed": 1e-12}])
@@ -211,12 +200,6 @@ def test_hull_of_a_cube_of_flat_points_and_of_points_on_a_line():
 # --- The body of a recorded scene ------------------------------------------------------------------------
 
 REST = np.array([[0.3, 0.2, 0.1, 0.0, 0.0, 0.0, 1.0]])
-
-
-def test_forward_force_follows_the_kind_of_body():
-    assert forward_force({"kind": "wheel"}) == ("drawbar pull Fx", 1.0)
-    assert forward_force({"blade": {}}) == ("draft −Fx", -1.0)
-    assert is_wheel({"kind": "wheel"}) and not is_wheel({"kind": "bed"})
 
 
 @pytest.mark.parametrize("grousers", [{}, {"grousers": 6, "grouser_height": 0.01, "grouser_thickness": 0.02}])

@@ -1,7 +1,5 @@
 """Figures of a study, and labels that keep apart."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -18,7 +18,7 @@ from sgns.frontier.study import Study, Workload, composed_scene
 from sgns.model.checkpoint import read_checkpoint
 from sgns.reduction.reduce import reduce_dataset
 from sgns.simulate.run import simulate_scene
-from sgns_testing.surrogates import FakeSimulator, fitted, frozen_latent, small_dataset
+from sgns_testing.surrogates import FakeSimulator, fitted, small_dataset
 from sgns_testing.tiny import FIT, MODEL, POLYNOMIAL, REDUCTION, TRAINING, make_dataset
 
 BED = [
@@ -71,15 +71,6 @@ def test_they_are_those_of_evaluate(dataset, tmp_path):
     # A run file keeps positions in float32.
     for key in ("rmse_total_mm", "skill_frozen", "surface_rmse_mm", "force_nrmse", "draft_mpe_percent"):
         assert found[key] == pytest.approx(told[key], rel=1e-3)
-
-
-def test_the_truth_leaves_only_the_reduction_and_a_frozen_bed_has_no_skill(dataset):
-    scores = own_errors(simulator(dataset), dataset)
-    assert scores.force.overall_nrmse == 0
-    assert scores.rmse_mm("total") == pytest.approx(scores.rmse_mm("reduction"), rel=1e-6)
-    scores = own_errors(simulator(dataset, mistake=frozen_latent), dataset)
-    # But for what the reduction leaves out of the frame it is frozen in.
-    assert abs(scores.skill("frozen")) < 0.2
 
 
 # --- Surrogates -----------------------------------------------------------------------------------------

@@ -1,7 +1,5 @@
 """What is kept of a run: the same motion looks the same on every bed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,13 +8,7 @@ import pytest
 
 from mpm_warp import Bed, Excavation
 from sgns.config import UserError
-from sgns.frontier.observation import (
-    Observation,
-    compare,
-    errors,
-    observe,
-    read_observation,
-)
+from sgns.frontier.observation import Observation, compare, errors, observe, read_observation
 
 FRAMES = 25
 
@@ -43,9 +35,7 @@ def observed(spacing: float, per_cell: float, moving=sheared) -> Observation:
 
 
 @pytest.mark.parametrize(("spacing", "per_cell"), [(0.02, 1.0), (0.02, 2.37), (0.025, 1.0), (0.01, 4.0)])
-def test_the_same_motion_on_another_bed_differs_by_less_than_the_lattice_can_tell(
-    spacing: float, per_cell: float
-) -> None:
+def test_the_same_motion_on_another_bed_differs_by_less_than_the_lattice_can_tell(spacing, per_cell) -> None:
     run, reference = observed(spacing, per_cell), observed(0.0133333333, 4.0)
     found = errors([compare(run, reference)])
     assert np.linalg.norm(reference.moved[-1], axis=1).max() > 0.02  # what there is to see

@@ -1,7 +1,5 @@
 """A whole study, tiny: measured, interrupted, gathered."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -69,9 +67,7 @@ def test_a_study_gives_a_table_figures_and_a_page(folder: Path) -> None:
     assert points["float64"].force_nrmse == pytest.approx(base.force_nrmse, rel=0.2)
 
 
-def test_only_a_missing_point_is_measured(
-    folder: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_missing_point_is_measured(folder, caplog, monkeypatch) -> None:
     monkeypatch.setattr(timing, "FRAMES", 1)
     before = (folder / "points.csv").read_text().splitlines()
     (folder / "points" / "cut_solver_float64.json").unlink()

@@ -1,26 +1,10 @@
-"""Files that are no checkpoint, or not one to step a bed with, are named and refused."""
-
-from __future__ import annotations
+"""Checkpoints that no bed can be stepped with are named and refused."""
 
 import pytest
 import torch
 
 from sgns.config import UserError
 from sgns.model.checkpoint import load_surrogate
-
-
-@pytest.mark.parametrize("content", [None, b"", b"hello"], ids=["truncated", "empty", "text"])
-def test_other_bytes_are_named(trained_briefly, tmp_path, content) -> None:
-    whole = (trained_briefly.output / "best.ckpt").read_bytes()
-    path = tmp_path / "bad.ckpt"
-    path.write_bytes(whole[: len(whole) // 2] if content is None else content)
-    with pytest.raises(UserError, match=r"bad\.ckpt"):
-        load_surrogate(path)
-
-
-def test_an_absent_one_says_how_to_train_one() -> None:
-    with pytest.raises(UserError, match="no checkpoint"):
-        load_surrogate("absent.ckpt")
 
 
 def with_a_mesh(content) -> None:
@@ -37,6 +21,16 @@ def saying(key, value):
     return lambda content: content["hyper_parameters"].update({key: value})
 
 
+def ranging(low, high):
+    """Gives a quantity another range."""
+
+    def spoil(content) -> None:
+        known = content["hyper_parameters"]["training_range"]
+        known["low"]["the tool's position"], known["high"]["the tool's position"] = low, high
+
+    return spoil
+
+
 @pytest.mark.parametrize(
     ("line", "spoil"),
     [
@@ -49,8 +43,12 @@ def saying(key, value):
         *[("frame rate is", saying("frame_rate", rate)) for rate in (float("inf"), float("nan"), 0.0, -60.0)],
         ("the slowest travel is nan", saying("slowest_travel", float("nan"))),
         ("fit together", saying("slowest_travel", None)),
-        ("fit together", saying("training_range", None)),
-        ("fit together", saying("training_range", {"low": {}, "high": {}})),
+        *[("fit together", saying("training_range", bad)) for bad in (None, {"low": {}, "high": {}}, [1])],
+        ("ends differ", ranging([0.0], [1.0, 2.0])),
+        *[
+            ("not one of numbers in order", ranging(*ends))
+            for ends in (([1.0], [0.0]), ([float("nan")], [0.0]), ([], []), (1.0, 2.0))
+        ],
     ],
 )
 def test_what_is_wrong_with_it_is_said(trained_briefly, tmp_path, line, spoil) -> None:

@@ -1,7 +1,5 @@
 """Means and scales: round trip, nothing blown up, float64 before float32."""
 
-from __future__ import annotations
-
 import torch
 
 from sgns.model.dynamics import Standardiser

@@ -1,7 +1,5 @@
 """The graph: which edges, and what is written on nodes and edges."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

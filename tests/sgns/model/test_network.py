@@ -2,8 +2,6 @@
 symmetries.
 """
 
-from __future__ import annotations
-
 import time
 
 import numpy as np
@@ -194,26 +192,6 @@ def test_the_algebra_changes_nothing_in_float32_at_the_papers_size(hidden_layers
     inputs = torch.randn(9, 23, 20), torch.randn(9, 506, 4)
     expected = outcome(network.plain, network, *inputs, index)
     assert_close(outcome(network, network, *inputs, index), expected, 1e-5)
-
-
-def test_renaming_nodes_renames_the_answer() -> None:
-    torch.manual_seed(4)
-    network = EncodeProcessDecode(6, 4, 9, hidden=16, steps=2).double()
-    nodes, index = torch.randn(1, 5, 6).double(), edge_indices(4, 1)
-    pair = torch.randn(5, 5, 4).double()
-    order = torch.randperm(5)
-    first = network(nodes, pair[index[0], index[1]][None], index)
-    renamed_pair = pair[order][:, order]
-    second = network(nodes[:, order], renamed_pair[index[0], index[1]][None], index)
-    torch.testing.assert_close(second, first[:, order])
-
-
-def test_the_order_of_edges_does_not_matter() -> None:
-    torch.manual_seed(5)
-    network = EncodeProcessDecode(6, 4, 9, hidden=16).double()
-    nodes, edges, index = torch.randn(1, 5, 6).double(), torch.randn(1, 20, 4).double(), edge_indices(4, 1)
-    order = torch.randperm(20)
-    torch.testing.assert_close(network(nodes, edges, index), network(nodes, edges[:, order], index[:, order]))
 
 
 def test_leading_dimensions_and_blocks_are_free(monkeypatch) -> None:

@@ -1,9 +1,5 @@
 """One latent step and whole paths: forces add up, modes have identities, one path is stepped as many are."""
 
-from __future__ import annotations
-
-import copy
-import pickle
 from typing import Any
 
 import numpy as np
@@ -11,7 +7,6 @@ import pytest
 import torch
 
 from mpm_warp.poses import in_world_frame
-from sgns.config import UserError
 from sgns.model.features import BodyTrack, body_track
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.settings import ModelSettings
@@ -79,14 +74,6 @@ def test_modes_are_told_apart(data) -> None:
     weight[:2] = weight[[1, 0]].clone()
     swapped = dynamics(batch.history[:, :, order], batch.body).change[:, order]
     torch.testing.assert_close(swapped, plain)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("history", 1), ("hidden_layers", 0), ("body_nodes", "mesh"), ("activation", "step")]
-)
-def test_wrong_settings_name_their_key(key, value) -> None:
-    with pytest.raises(UserError, match=f"model.{key}"):
-        ModelSettings(**(MODEL | {key: value}))
 
 
 # --- The stepper of one path against `advance`, whatever the network sees and predicts ------------------
@@ -157,18 +144,6 @@ def test_following_is_advancing(variant, body_nodes, turning) -> None:
     assert not path.latent.is_inference()
 
 
-@pytest.mark.parametrize("body_nodes", ["pose", "points"])
-def test_stepping_is_following_to_the_bit(body_nodes) -> None:
-    dynamics = dynamics_of(body_nodes=body_nodes)
-    body, latent = track_of(body_nodes, False), torch.randn(1, 3, 4, 3).double()
-    with torch.no_grad():
-        path = dynamics.unroll(latent, body)
-    stepper = dynamics.stepper(len(POINTS))
-    for t in range(3, 12):
-        step = stepper.advance(path.latent[:, t - 3 : t], body.frames(slice(t - 2, t + 1)))
-        assert torch.equal(step.latent, path.latent[:, t]) and torch.equal(step.force, path.force[:, t])
-
-
 def test_the_context_is_told() -> None:
     dynamics = dynamics_of(context=["gravity", "load"])
     body, latent = track_of("pose", True), torch.randn(1, 3, 4, 3).double()
@@ -199,35 +174,3 @@ def test_with_gradients_the_weights_are_differentiated() -> None:
     body, latent = track_of("pose", False), torch.randn(1, 3, 4, 3).double()
     dynamics.unroll(latent, body).force.sum().backward()
     assert all(p.grad is not None for p in dynamics.network.parameters())
-
-
-@pytest.mark.parametrize(
-    "take", [copy.copy, copy.deepcopy, lambda stepper: pickle.loads(pickle.dumps(stepper))]
-)
-@pytest.mark.parametrize("body_nodes", ["pose", "points"])
-@pytest.mark.parametrize("turning", [False, True])
-def test_copies_go_on_to_the_bit(body_nodes, turning, take) -> None:
-    dynamics = dynamics_of(body_nodes=body_nodes, context=["gravity"])
-    body, latent = track_of(body_nodes, turning), torch.randn(1, 3, 4, 3).double()
-    stepper = dynamics.stepper(len(POINTS), torch.tensor([[9.8]]).double())
-    windows = [body.frames(slice(t, t + 3)) for t in range(8)]
-    for window in windows[:4]:
-        stepper.advance(latent, window)
-    one, other = take(stepper), take(stepper)
-    for window, away in zip(windows[4:], windows, strict=False):
-        other.advance(latent + 1.0, away)
-        expected, found = stepper.advance(latent, window), one.advance(latent, window)
-        assert torch.equal(found.latent, expected.latent) and torch.equal(found.force, expected.force)
-
-
-def test_memory_put_back_undoes_a_step() -> None:
-    dynamics = dynamics_of(body_nodes="points")
-    body, latent = track_of("points", False), torch.randn(1, 3, 4, 3).double()
-    stepper, plain = dynamics.stepper(len(POINTS)), dynamics.stepper(len(POINTS))
-    for each in (stepper, plain):
-        each.advance(latent, body.frames(slice(0, 3)))
-    memory = stepper.memory
-    stepper.advance(latent, track_of("points", True).frames(slice(6, 9)))
-    stepper.memory = memory
-    found, expected = (each.advance(latent, body.frames(slice(1, 4))) for each in (stepper, plain))
-    assert torch.equal(found.latent, expected.latent) and torch.equal(found.force, expected.force)

@@ -1,7 +1,5 @@
 """A wheel: its way is prescribed, its height follows from the network."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from dataclasses import replace
