@@ -92,7 +92,7 @@ class RigidBody:
         assert shape is not None
         self._shape = shape
         self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, effects.torque)
-        self.data = data = body_struct(real, self.law)()
+        self.data = data = body_struct(real)()
         """The struct that kernels take."""
         data.margin = scene.contact_distance
         data.layer = HOLDING_LAYER * h if scene.bilateral else 0.0

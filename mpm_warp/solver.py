@@ -14,7 +14,7 @@ import warp as wp
 
 from .discretisation import half, initial_stress, lay_grid, require_symmetry
 from .effects import Effects
-from .kernels.contact import ContactLaw, body_struct
+from .kernels.contact import body_struct
 from .kernels.fluidity import soil_parameters
 from .kernels.ghost_nodes import GhostNodes, ghost_kernels
 from .kernels.grid import grid_step, particle_struct
@@ -228,7 +228,7 @@ class Solver:
         kernels = transfer(real, self.effects, body.law if body else None, atomic=device.is_cuda)
         node_kernels, wrap = grid_step(real, scene.bed.walls.conditions), ghost_kernels(real).wrap
         ghost_nodes = GhostNodes(real, device, self._grid, layers, mirrored=self._half is not None)
-        body_data = body.data if body else body_struct(real, ContactLaw())()
+        body_data = body.data if body else body_struct(real)()
 
         def over_particles(kernel: SceneKernel, *arguments: Any) -> Launch:
             return Launch(kernel, self.computed_count, [particles, self._grid, *arguments], device)

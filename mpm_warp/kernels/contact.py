@@ -42,10 +42,10 @@ class ContactLaw:
 
 
 @cache
-def body_struct(real: type, law: ContactLaw) -> type:
+def body_struct(real: type) -> type:
     """Struct of a body and its motion over the substeps of one frame."""
     vec3, quat = wp.types.vector(3, real), wp.types.quaternion(real)
-    Shape = shape_struct(real, law.shape)
+    Shape = shape_struct(real)
 
     @wp.struct
     class Body:
@@ -69,23 +69,16 @@ def body_struct(real: type, law: ContactLaw) -> type:
 
 
 @cache
-def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
+def contact(real: type, law: ContactLaw) -> wp.Function:
     """Warp function `push(p, x, v, mass, part, dt, s, body)` in precision `real`: impulse on particle p, of which
     `part` is computed, in substep s [N s].
 
-    The opposite impulse is added to the body; `atomic` is needed where many threads do so at once (a GPU).
+    The opposite impulse is added to the body.
     """
     vec3 = wp.types.vector(3, real)
-    Body = body_struct(real, law)
+    Body = body_struct(real)
     outward = signed_distance(real, law.shape)
     bilateral, free, torque = law.bilateral, law.free, law.torque
-
-    @wp.func
-    def take(total: wp.array(dtype=vec3), i: int, amount: vec3):
-        if wp.static(atomic):
-            wp.atomic_sub(total, i, amount)
-        else:
-            total[i] = total[i] - amount
 
     @wp.func
     def push(p: int, x: vec3, v: vec3, mass: real, part: real, dt: real, s: int, body: Body):
@@ -125,9 +118,9 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
                         grip = grip * (most / size)
                         stretch = grip / (dt * stiffness)
                     impulse = pressed * normal - grip
-                    take(body.impulse, 0, impulse)
+                    wp.atomic_sub(body.impulse, 0, impulse)
                     if wp.static(torque):
-                        take(body.impulse, 1, wp.cross(arm, impulse))
+                        wp.atomic_sub(body.impulse, 1, wp.cross(arm, impulse))
             body.stick[p] = stretch
         return impulse
 

@@ -75,8 +75,8 @@ def wall_sink(shape: tuple[int, int, int], low: Sequence[int], high: Sequence[in
 
 
 @cache
-def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamespace:
-    """Kernels in precision `real`; `atomic` is needed where many threads write to the grid at once (a GPU).
+def nonlocal_kernels(real: type, effects: Effects) -> SimpleNamespace:
+    """Kernels in precision `real`:
 
     - `project`: volume, fluidity and s from the particles to `sums`,
     - `prepare`: `sums` to means in `field` (filled volume, G, s, g), clearing the sums,
@@ -107,13 +107,6 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
             mu = wp.sqrt(real(2.0) * size) * ac[0] / dt
             return vec3(real(1.0), local_fluidity(mu, ac[1], soil), slowing(mu, soil))
 
-    @wp.func
-    def deposit(sums: vec4s, at: int, amount: vec4):
-        if wp.static(atomic):
-            wp.atomic_add(sums, at, amount)
-        else:
-            sums[at] = sums[at] + amount
-
     @scene_kernel()
     def project(p: int, particles: Particles, grid: Grid, soil: Soil, sums: vec4s):
         found = source(p, particles, grid.dt, soil)
@@ -131,9 +124,9 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
                 for j in range(3):
                     row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
                     at = (wx[i] * wy[j]) * amount
-                    deposit(sums, row, wz[0] * at)
-                    deposit(sums, row + 1, wz[1] * at)
-                    deposit(sums, row + 2, wz[2] * at)
+                    wp.atomic_add(sums, row, wz[0] * at)
+                    wp.atomic_add(sums, row + 1, wz[1] * at)
+                    wp.atomic_add(sums, row + 2, wz[2] * at)
 
     @scene_kernel()
     def prepare(n: int, sums: vec4s, field: vec4s):
@@ -236,7 +229,7 @@ def nonlocal_launches(
         ghost_nodes: with plain signs: what is carried here has no direction, so a mirror does not turn it.
     """
     device, count = field.device, len(field)
-    kernels = nonlocal_kernels(real, effects, atomic=device.is_cuda)
+    kernels = nonlocal_kernels(real, effects)
     sums, other = (wp.zeros_like(field) for _ in range(2))
     walls = wp.array(sink, dtype=real, device=device)
     ratio = (soil.cooperative_length / grid.spacing) ** 2
