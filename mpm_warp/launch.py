@@ -134,7 +134,7 @@ def load_kernel(kernel: wp.Kernel, device: wp.Device) -> None:
 
 
 class SceneKernel:
-    """The two kernels made of one function.
+    """The two kernels made of one function, as a decorator of it.
 
     Args:
         body: what thread i does; i is its first argument, the others are the kernel's.
@@ -186,11 +186,6 @@ class SceneKernel:
         function: Any = names[name]
         function.__qualname__ = self._body.__qualname__ + ending
         return wp.kernel(function, module="unique", enable_backward=False, module_options=self._options)
-
-
-def scene_kernel(module_options: dict[str, Any] | None = None) -> Callable[[Callable], SceneKernel]:
-    """Decorator that makes a `SceneKernel` of a function."""
-    return lambda body: SceneKernel(body, module_options)
 
 
 @dataclass(frozen=True, eq=False)

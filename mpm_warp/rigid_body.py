@@ -9,21 +9,17 @@ sinks slower than one such step per substep would hang in the air.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
+from .effects import Effects
 from .kernels.contact import HOLDING_LAYER, ContactLaw, axle_step, body_struct
 from .kernels.signed_distance import shape_data
 from .launch import Launch
 from .poses import rotation_vectors
+from .scene import Scene
 from .state import SolverStopped
-
-if TYPE_CHECKING:
-    from .effects import Effects
-    from .scene import Scene
-
 
 LONGEST_WAY = 0.5
 """Of any point of a body in one substep [grid spacings]."""

@@ -78,7 +78,6 @@ class Solver:
         self.scene = scene
         self.effects = effects or Effects()
         self.device = find_device(device)
-        self.precision = precision
         self._real = PRECISIONS[precision]
         require_memory(scene, precision, device, self.effects.symmetry)
         if self.effects.symmetry:
@@ -169,11 +168,10 @@ class Solver:
 
         positions, volume = scene.filled
         velocities, (ln_j, strain) = scene.initial_velocities(), initial_stress(scene)
-        if self._half is not None:
-            kept = self._half.kept
-            positions, velocities, ln_j, strain = positions[kept], velocities[kept], ln_j[kept], strain[kept]
         self._grid, layers = lay_grid(scene, real, self.time_step, volume, self._half is not None)
-        self._grid.on_plane = self._half.on_plane if self._half is not None else 0
+        if self._half is not None:
+            kept, self._grid.on_plane = self._half.kept, self._half.on_plane
+            positions, velocities, ln_j, strain = positions[kept], velocities[kept], ln_j[kept], strain[kept]
         self._soil = soil_parameters(real, scene.material, max(scene.bed.size))
         shear, bulk = 2.0 * scene.material.shear_modulus, scene.material.bulk_modulus
         n, node_count = len(positions), self._grid.nx * self._grid.ny * self._grid.nz

@@ -20,7 +20,7 @@ from functools import cache
 
 import warp as wp
 
-from ..launch import SceneKernel, scene_kernel
+from ..launch import SceneKernel
 from .signed_distance import shape_struct, signed_distance
 
 HOLDING_LAYER = 0.5
@@ -133,7 +133,7 @@ def axle_step(real: type) -> SceneKernel:
     implicitly."""
     vec3 = wp.types.vector(3, real)
 
-    @scene_kernel()
+    @SceneKernel
     def step(
         _: int,
         axle: wp.array(dtype=wp.float64),  # height [m], its rate [m/s], vertical impulse of this frame [N s]

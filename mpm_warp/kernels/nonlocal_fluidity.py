@@ -35,7 +35,7 @@ import numpy as np
 import warp as wp
 
 from ..effects import Effects
-from ..launch import Launch, scene_kernel
+from ..launch import Launch, SceneKernel
 from .fluidity import fluidity, soil_struct
 from .ghost_nodes import GhostNodes
 from .grid import grid_struct, particle_struct
@@ -107,7 +107,7 @@ def nonlocal_kernels(real: type, effects: Effects) -> SimpleNamespace:
             mu = wp.sqrt(real(2.0) * size) * ac[0] / dt
             return vec3(real(1.0), local_fluidity(mu, ac[1], soil), slowing(mu, soil))
 
-    @scene_kernel()
+    @SceneKernel
     def project(p: int, particles: Particles, grid: Grid, soil: Soil, sums: vec4s):
         found = source(p, particles, grid.dt, soil)
         if found[0] > real(0.0):
@@ -128,7 +128,7 @@ def nonlocal_kernels(real: type, effects: Effects) -> SimpleNamespace:
                     wp.atomic_add(sums, row + 1, wz[1] * at)
                     wp.atomic_add(sums, row + 2, wz[2] * at)
 
-    @scene_kernel()
+    @SceneKernel
     def prepare(n: int, sums: vec4s, field: vec4s):
         s = sums[n]
         filled = s[0]
@@ -153,7 +153,7 @@ def nonlocal_kernels(real: type, effects: Effects) -> SimpleNamespace:
             return grid.nz
         return 1
 
-    @scene_kernel()
+    @SceneKernel
     def sweep(
         n: int,
         ratio: real,  # (A d / dx)^2
@@ -190,7 +190,7 @@ def nonlocal_kernels(real: type, effects: Effects) -> SimpleNamespace:
                 sharp -= real(0.25) * (before[1] - real(2.0) * here[1] + after[1])
         return sharp
 
-    @scene_kernel()
+    @SceneKernel
     def place(n: int, grid: Grid, soil: Soil, field: vec4s, cooperation: vec4s):
         found = field[n]
         amount = real(0.0)

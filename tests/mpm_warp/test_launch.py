@@ -14,7 +14,7 @@ from mpm_warp import launch as launch_module
 from mpm_warp.kernels.contact import ContactLaw
 from mpm_warp.kernels.grid import grid_step
 from mpm_warp.kernels.transfer import transfer
-from mpm_warp.launch import Executor, Job, Launch, Program, find_device, load_kernel, scene_kernel
+from mpm_warp.launch import Executor, Job, Launch, Program, SceneKernel, find_device, load_kernel
 
 # --- Kernels that are damaged in Warp's cache -----------------------------------------------------------
 
@@ -120,13 +120,13 @@ class Pair:
 
 
 def kernels():
-    @scene_kernel()
+    @SceneKernel
     def add(i: int, pair: Pair, given: wp.array(dtype=float)):
         if i >= given.shape[0]:
             return
         pair.to[i] = pair.to[i] + pair.factor * given[i]
 
-    @scene_kernel()
+    @SceneKernel
     def double(i: int, to: wp.array(dtype=float)):
         to[i] = 2.0 * to[i]
 
