@@ -60,16 +60,9 @@ def longest_step(scene: Scene) -> float:
 
 
 class RigidBody:
-    """Arrays and launches of one body.
+    """Arrays and launches of one body, for frames of so many substeps of `time_step` [s].
 
-    Args:
-        scene: with a body.
-        effects: with `symmetry` half of the soil's impulse is computed; with `torque` its moment is added up.
-        real: precision.
-        device: where it lives.
-        substeps: per frame.
-        time_step: substep [s].
-        particles: how many are computed.
+    With the effect `symmetry` half of the soil's impulse is computed; with `torque` its moment is added up.
     """
 
     def __init__(

@@ -361,8 +361,7 @@ def frames_together(
     Args:
         scenes: what to compute.
         effects: which physics, for all of them or one for each.
-        device: `cpu` or `cuda`, `cuda:0`, ...
-        precision: `float32` or `float64`.
+        device, precision: as of a `Solver`.
         at_once: scenes that are under way at the same time; the next begins when one ends.
 
     Yields:
@@ -383,12 +382,7 @@ def frames_together(
 def run_concurrently(
     tasks: Iterable[Generator[Any, None, None]], at_once: int, device: str
 ) -> Iterator[tuple[int, Any]]:
-    """Advances `at_once` generators side by side, the next one as soon as one has ended.
-
-    Args:
-        tasks: what to advance; each is taken when its turn comes.
-        at_once: how many are under way.
-        device: where they compute.
+    """Advances `at_once` of the generators side by side, the next one as soon as one has ended.
 
     Yields:
         A task's number and what it yielded, unless that was a job. Jobs are run when all tasks have asked for one.

@@ -79,12 +79,8 @@ def ghost_kernels(real: type) -> SimpleNamespace:
 class GhostNodes:
     """Launches that keep ghost nodes and their images in agreement.
 
-    Args:
-        real: precision.
-        device: Warp device.
-        grid: the solver's struct.
-        layers: axis → ghost layers and their images, shape (m, 2).
-        mirrored: whether the layers along y are mirror images; all others are one period apart.
+    `layers` are those of an axis and their images, shape (m, 2). With `mirrored` the layers along y are mirror images;
+    all others are one period apart.
     """
 
     def __init__(

@@ -220,8 +220,6 @@ def nonlocal_launches(
     """What computes the cooperative term: in order, after the grid step and before the particles read the grid.
 
     Args:
-        real: precision.
-        effects: which physics.
         sink: R of each node, see `wall_sink`.
         particles, grid, soil: the solver's structs.
         field: filled volume [cells], mean g or g_loc [1/s], s [-] and g [1/s] of the nodes, shape (nodes, 4).
