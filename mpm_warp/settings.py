@@ -210,8 +210,7 @@ def _chosen(groups: list[Any], value: Any, where: str) -> Any:
     return shapes[shape]
 
 
-@cache
-def _fields_of(cls: Any) -> dict[str, _Field]:
+def _read_fields(cls: Any) -> dict[str, _Field]:
     hints = get_type_hints(cls, localns={cls.__name__: cls})  # its module does not have it yet
     found = {}
     for one in fields(cls):
@@ -224,6 +223,9 @@ def _fields_of(cls: Any) -> dict[str, _Field]:
         adapter = None if _groups(hint) else TypeAdapter(_limited(hint, known), config=_CONFIG)
         found[one.name] = _Field(known, hint, adapter)
     return found
+
+
+_fields_of: Callable[[Any], dict[str, _Field]] = cache(_read_fields)
 
 
 def _limited(hint: Any, known: Setting) -> Any:
