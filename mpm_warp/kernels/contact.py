@@ -69,16 +69,24 @@ def body_struct(real: type) -> type:
 
 
 @cache
-def contact(real: type, law: ContactLaw) -> wp.Function:
+def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
     """Warp function `push(p, x, v, mass, part, dt, s, body)` in precision `real`: impulse on particle p, of which
     `part` is computed, in substep s [N s].
 
-    The opposite impulse is added to the body.
+    The opposite impulse is added to the body; `atomic` is needed where many threads do so at once (a GPU).
     """
     vec3 = wp.types.vector(3, real)
     Body = body_struct(real)
     outward = signed_distance(real, law.shape)
     bilateral, free, torque = law.bilateral, law.free, law.torque
+
+    # Warp's own sum would be rounded otherwise on a CPU, too: its product and sum are fused differently.
+    @wp.func
+    def take(total: wp.array(dtype=vec3), i: int, amount: vec3):
+        if wp.static(atomic):
+            wp.atomic_sub(total, i, amount)
+        else:
+            total[i] = total[i] - amount
 
     @wp.func
     def push(p: int, x: vec3, v: vec3, mass: real, part: real, dt: real, s: int, body: Body):
@@ -118,9 +126,9 @@ def contact(real: type, law: ContactLaw) -> wp.Function:
                         grip = grip * (most / size)
                         stretch = grip / (dt * stiffness)
                     impulse = pressed * normal - grip
-                    wp.atomic_sub(body.impulse, 0, impulse)
+                    take(body.impulse, 0, impulse)
                     if wp.static(torque):
-                        wp.atomic_sub(body.impulse, 1, wp.cross(arm, impulse))
+                        take(body.impulse, 1, wp.cross(arm, impulse))
             body.stick[p] = stretch
         return impulse
 

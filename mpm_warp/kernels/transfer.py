@@ -43,7 +43,7 @@ def transfer(real: type, effects: Effects, contact_law: ContactLaw | None, atomi
     Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real)
     Particles, vec4s, reals, ints = particle_struct(real), *(wp.array(dtype=t) for t in (vec4, real, int))
     with_body = contact_law is not None
-    push = contact(real, contact_law or ContactLaw())
+    push = contact(real, contact_law or ContactLaw(), atomic)
     update, kirchhoff = law.update, law.kirchhoff
     fading = fluidity(real).fading
     apart, loose_volume = loose_soil(real).apart, loose_soil(real).volume
