@@ -275,12 +275,16 @@ class Bed(Settings):
     @cached_property
     def filled(self) -> tuple[np.ndarray, float]:
         """Particle positions (n, 3) [m] and the volume of one [m^3]."""
+        return self._arranged
+
+    @property
+    def _arranged(self) -> tuple[np.ndarray, float]:
         return arrange(self.arrangement, self.size, self.particle_spacing, self.seed, self.mirrored)
 
     @property
     def filling(self) -> float:
         """Share of the bin below the surface that its particles fill [-]: 1, but for random points that keep apart."""
-        positions, volume = self.filled
+        positions, volume = self._arranged
         return len(positions) * volume / float(np.prod(self.size))
 
     @property
