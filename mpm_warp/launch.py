@@ -134,11 +134,9 @@ def load_kernel(kernel: wp.Kernel, device: wp.Device) -> None:
 
 
 class SceneKernel:
-    """The two kernels made of one function.
+    """The two kernels made of one function, as a decorator of it.
 
-    Args:
-        body: what thread i does; i is its first argument, the others are the kernel's.
-        module_options: Warp's options for the kernels' modules.
+    `body` is what thread i does; i is its first argument, the others are the kernel's.
     """
 
     def __init__(self, body: Callable, module_options: dict[str, Any] | None = None) -> None:
@@ -188,11 +186,6 @@ class SceneKernel:
         return wp.kernel(function, module="unique", enable_backward=False, module_options=self._options)
 
 
-def scene_kernel(module_options: dict[str, Any] | None = None) -> Callable[[Callable], SceneKernel]:
-    """Decorator that makes a `SceneKernel` of a function."""
-    return lambda body: SceneKernel(body, module_options)
-
-
 @dataclass(frozen=True, eq=False)
 class Launch:
     """A kernel over the items of one scene."""
@@ -215,12 +208,7 @@ class Launch:
 
 
 class BatchedLaunch:
-    """The same kernel over the items of several scenes.
-
-    Args:
-        launches: one of each scene.
-        steps: that each scene has to do.
-    """
+    """The same kernel over the items of several scenes, a launch of each; `steps` are what each has to do."""
 
     def __init__(self, launches: Sequence[Launch], steps: wp.array) -> None:
         self._launches = launches  # they hold the arrays that the table points to

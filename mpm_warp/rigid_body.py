@@ -9,21 +9,17 @@ sinks slower than one such step per substep would hang in the air.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
+from .effects import Effects
 from .kernels.contact import HOLDING_LAYER, ContactLaw, axle_step, body_struct
 from .kernels.signed_distance import shape_data
 from .launch import Launch
 from .poses import rotation_vectors
+from .scene import Scene
 from .state import SolverStopped
-
-if TYPE_CHECKING:
-    from .effects import Effects
-    from .scene import Scene
-
 
 LONGEST_WAY = 0.5
 """Of any point of a body in one substep [grid spacings]."""
@@ -64,16 +60,9 @@ def longest_step(scene: Scene) -> float:
 
 
 class RigidBody:
-    """Arrays and launches of one body.
+    """Arrays and launches of one body, for frames of so many substeps of `time_step` [s].
 
-    Args:
-        scene: with a body.
-        effects: with `symmetry` half of the soil's impulse is computed; with `torque` its moment is added up.
-        real: precision.
-        device: where it lives.
-        substeps: per frame.
-        time_step: substep [s].
-        particles: how many are computed.
+    With the effect `symmetry` half of the soil's impulse is computed; with `torque` its moment is added up.
     """
 
     def __init__(
@@ -92,7 +81,7 @@ class RigidBody:
         assert shape is not None
         self._shape = shape
         self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, effects.torque)
-        self.data = data = body_struct(real, self.law)()
+        self.data = data = body_struct(real)()
         """The struct that kernels take."""
         data.margin = scene.contact_distance
         data.layer = HOLDING_LAYER * h if scene.bilateral else 0.0

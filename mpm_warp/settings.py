@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, MISSING, dataclass, field, fields, is_dataclass, replace
+from functools import cache
 from types import UnionType
 from typing import (
     Annotated,
@@ -30,7 +31,6 @@ from typing_extensions import Self, dataclass_transform  # in `typing` from Pyth
 from .state import SceneError
 
 T = TypeVar("T")
-_FIELDS: dict[type, dict[str, _Field]] = {}
 _CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True)
 
 
@@ -210,12 +210,6 @@ def _chosen(groups: list[Any], value: Any, where: str) -> Any:
     return shapes[shape]
 
 
-def _fields_of(cls: type) -> dict[str, _Field]:
-    if cls not in _FIELDS:
-        _FIELDS[cls] = _read_fields(cls)
-    return _FIELDS[cls]
-
-
 def _read_fields(cls: Any) -> dict[str, _Field]:
     hints = get_type_hints(cls, localns={cls.__name__: cls})  # its module does not have it yet
     found = {}
@@ -229,6 +223,9 @@ def _read_fields(cls: Any) -> dict[str, _Field]:
         adapter = None if _groups(hint) else TypeAdapter(_limited(hint, known), config=_CONFIG)
         found[one.name] = _Field(known, hint, adapter)
     return found
+
+
+_fields_of: Callable[[Any], dict[str, _Field]] = cache(_read_fields)
 
 
 def _limited(hint: Any, known: Setting) -> Any:

@@ -14,7 +14,7 @@ import warp as wp
 
 from .discretisation import half, initial_stress, lay_grid, require_symmetry
 from .effects import Effects
-from .kernels.contact import ContactLaw, body_struct
+from .kernels.contact import body_struct
 from .kernels.fluidity import soil_parameters
 from .kernels.ghost_nodes import GhostNodes, ghost_kernels
 from .kernels.grid import grid_step, particle_struct
@@ -78,7 +78,6 @@ class Solver:
         self.scene = scene
         self.effects = effects or Effects()
         self.device = find_device(device)
-        self.precision = precision
         self._real = PRECISIONS[precision]
         require_memory(scene, precision, device, self.effects.symmetry)
         if self.effects.symmetry:
@@ -169,11 +168,10 @@ class Solver:
 
         positions, volume = scene.filled
         velocities, (ln_j, strain) = scene.initial_velocities(), initial_stress(scene)
-        if self._half is not None:
-            kept = self._half.kept
-            positions, velocities, ln_j, strain = positions[kept], velocities[kept], ln_j[kept], strain[kept]
         self._grid, layers = lay_grid(scene, real, self.time_step, volume, self._half is not None)
-        self._grid.on_plane = self._half.on_plane if self._half is not None else 0
+        if self._half is not None:
+            kept, self._grid.on_plane = self._half.kept, self._half.on_plane
+            positions, velocities, ln_j, strain = positions[kept], velocities[kept], ln_j[kept], strain[kept]
         self._soil = soil_parameters(real, scene.material, max(scene.bed.size))
         shear, bulk = 2.0 * scene.material.shear_modulus, scene.material.bulk_modulus
         n, node_count = len(positions), self._grid.nx * self._grid.ny * self._grid.nz
@@ -228,7 +226,7 @@ class Solver:
         kernels = transfer(real, self.effects, body.law if body else None, atomic=device.is_cuda)
         node_kernels, wrap = grid_step(real, scene.bed.walls.conditions), ghost_kernels(real).wrap
         ghost_nodes = GhostNodes(real, device, self._grid, layers, mirrored=self._half is not None)
-        body_data = body.data if body else body_struct(real, ContactLaw())()
+        body_data = body.data if body else body_struct(real)()
 
         def over_particles(kernel: SceneKernel, *arguments: Any) -> Launch:
             return Launch(kernel, self.computed_count, [particles, self._grid, *arguments], device)
@@ -363,8 +361,7 @@ def frames_together(
     Args:
         scenes: what to compute.
         effects: which physics, for all of them or one for each.
-        device: `cpu` or `cuda`, `cuda:0`, ...
-        precision: `float32` or `float64`.
+        device, precision: as of a `Solver`.
         at_once: scenes that are under way at the same time; the next begins when one ends.
 
     Yields:
@@ -385,12 +382,7 @@ def frames_together(
 def run_concurrently(
     tasks: Iterable[Generator[Any, None, None]], at_once: int, device: str
 ) -> Iterator[tuple[int, Any]]:
-    """Advances `at_once` generators side by side, the next one as soon as one has ended.
-
-    Args:
-        tasks: what to advance; each is taken when its turn comes.
-        at_once: how many are under way.
-        device: where they compute.
+    """Advances `at_once` of the generators side by side, the next one as soon as one has ended.
 
     Yields:
         A task's number and what it yielded, unless that was a job. Jobs are run when all tasks have asked for one.

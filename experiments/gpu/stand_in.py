@@ -36,7 +36,6 @@ import numpy as np
 import warp as wp
 
 from mpm_warp import solver
-from mpm_warp.kernels import nonlocal_fluidity
 
 HERE = Path(__file__).resolve().parent
 MANY = 0xFFFFFFFF
@@ -175,9 +174,6 @@ def on_stand_in(stand_in: Way) -> Iterator[Way]:
     with (
         mock.patch.object(wp, "launch", taken_over),
         mock.patch.object(solver, "transfer", as_for_a_gpu(solver.transfer)),
-        mock.patch.object(
-            nonlocal_fluidity, "nonlocal_kernels", as_for_a_gpu(nonlocal_fluidity.nonlocal_kernels)
-        ),
     ):
         yield stand_in
 

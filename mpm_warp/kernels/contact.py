@@ -20,7 +20,7 @@ from functools import cache
 
 import warp as wp
 
-from ..launch import SceneKernel, scene_kernel
+from ..launch import SceneKernel
 from .signed_distance import shape_struct, signed_distance
 
 HOLDING_LAYER = 0.5
@@ -42,10 +42,10 @@ class ContactLaw:
 
 
 @cache
-def body_struct(real: type, law: ContactLaw) -> type:
+def body_struct(real: type) -> type:
     """Struct of a body and its motion over the substeps of one frame."""
     vec3, quat = wp.types.vector(3, real), wp.types.quaternion(real)
-    Shape = shape_struct(real, law.shape)
+    Shape = shape_struct(real)
 
     @wp.struct
     class Body:
@@ -76,10 +76,11 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
     The opposite impulse is added to the body; `atomic` is needed where many threads do so at once (a GPU).
     """
     vec3 = wp.types.vector(3, real)
-    Body = body_struct(real, law)
+    Body = body_struct(real)
     outward = signed_distance(real, law.shape)
     bilateral, free, torque = law.bilateral, law.free, law.torque
 
+    # Warp's own sum would be rounded otherwise on a CPU, too: its product and sum are fused differently.
     @wp.func
     def take(total: wp.array(dtype=vec3), i: int, amount: vec3):
         if wp.static(atomic):
@@ -140,7 +141,7 @@ def axle_step(real: type) -> SceneKernel:
     implicitly."""
     vec3 = wp.types.vector(3, real)
 
-    @scene_kernel()
+    @SceneKernel
     def step(
         _: int,
         axle: wp.array(dtype=wp.float64),  # height [m], its rate [m/s], vertical impulse of this frame [N s]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..launch import Launch, scene_kernel
+from ..launch import Launch, SceneKernel
 
 _REACH = 2  # layers of ghost nodes: one more than the splines of a particle on the plane reach
 
@@ -41,7 +41,7 @@ def ghost_kernels(real: type) -> SimpleNamespace:
     def node_of(row: int, layer: int, stride: int, extent: int):
         return (row // stride) * stride * extent + row % stride + layer * stride
 
-    @scene_kernel()
+    @SceneKernel
     def fold(row: int, nodes: vec4s, pairs: layers, sign: vec4, stride: int, extent: int):
         """Add ghost layers to their images; `sign` mirrors a node's momentum, `stride` and `extent` are the axis'."""
         for q in range(pairs.shape[0]):
@@ -52,7 +52,7 @@ def ghost_kernels(real: type) -> SimpleNamespace:
             if ghost != image:
                 nodes[ghost] = vec4()
 
-    @scene_kernel()
+    @SceneKernel
     def unfold(row: int, velocity: vec4s, pairs: layers, sign: vec4, stride: int, extent: int):
         """Give ghost layers the velocity of their images."""
         for q in range(pairs.shape[0]):
@@ -60,7 +60,7 @@ def ghost_kernels(real: type) -> SimpleNamespace:
             image = node_of(row, pairs[q][1], stride, extent)
             velocity[ghost] = wp.cw_mul(sign, velocity[image])
 
-    @scene_kernel()
+    @SceneKernel
     def wrap(p: int, x: wp.array(dtype=vec3), turns: wp.array(dtype=int), axis: int, length: real):
         """Bring particles back into 0 <= x < length along an axis and count the turns."""
         at = x[p]
@@ -79,12 +79,8 @@ def ghost_kernels(real: type) -> SimpleNamespace:
 class GhostNodes:
     """Launches that keep ghost nodes and their images in agreement.
 
-    Args:
-        real: precision.
-        device: Warp device.
-        grid: the solver's struct.
-        layers: axis → ghost layers and their images, shape (m, 2).
-        mirrored: whether the layers along y are mirror images; all others are one period apart.
+    `layers` are those of an axis and their images, shape (m, 2). With `mirrored` the layers along y are mirror images;
+    all others are one period apart.
     """
 
     def __init__(

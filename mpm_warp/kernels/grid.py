@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..launch import scene_kernel
+from ..launch import SceneKernel
 
 
 @cache
@@ -117,7 +117,7 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
                 share *= grid.beyond_walls[axis]
         return share
 
-    @scene_kernel()
+    @SceneKernel
     def begin(
         n: int,
         grid: Grid,
@@ -142,7 +142,7 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
         before[n] = result
         inverse_mass[n] = inverse
 
-    @scene_kernel()
+    @SceneKernel
     def step(n: int, grid: Grid, velocity: vec4s, inverse_mass: reals, impulse: vec4s):
         # `static` around the walls' functions: Warp knows a kernel by its text and its functions, but not under which
         # names it calls these. Without, walls x slip, y no_slip would get the kernel of x no_slip, y slip.

@@ -35,7 +35,7 @@ import numpy as np
 import warp as wp
 
 from ..effects import Effects
-from ..launch import Launch, scene_kernel
+from ..launch import Launch, SceneKernel
 from .fluidity import fluidity, soil_struct
 from .ghost_nodes import GhostNodes
 from .grid import grid_struct, particle_struct
@@ -75,8 +75,8 @@ def wall_sink(shape: tuple[int, int, int], low: Sequence[int], high: Sequence[in
 
 
 @cache
-def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamespace:
-    """Kernels in precision `real`; `atomic` is needed where many threads write to the grid at once (a GPU).
+def nonlocal_kernels(real: type, effects: Effects) -> SimpleNamespace:
+    """Kernels in precision `real`:
 
     - `project`: volume, fluidity and s from the particles to `sums`,
     - `prepare`: `sums` to means in `field` (filled volume, G, s, g), clearing the sums,
@@ -107,14 +107,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
             mu = wp.sqrt(real(2.0) * size) * ac[0] / dt
             return vec3(real(1.0), local_fluidity(mu, ac[1], soil), slowing(mu, soil))
 
-    @wp.func
-    def deposit(sums: vec4s, at: int, amount: vec4):
-        if wp.static(atomic):
-            wp.atomic_add(sums, at, amount)
-        else:
-            sums[at] = sums[at] + amount
-
-    @scene_kernel()
+    @SceneKernel
     def project(p: int, particles: Particles, grid: Grid, soil: Soil, sums: vec4s):
         found = source(p, particles, grid.dt, soil)
         if found[0] > real(0.0):
@@ -131,11 +124,11 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
                 for j in range(3):
                     row = ((base[0] + i) * grid.ny + base[1] + j) * grid.nz + base[2]
                     at = (wx[i] * wy[j]) * amount
-                    deposit(sums, row, wz[0] * at)
-                    deposit(sums, row + 1, wz[1] * at)
-                    deposit(sums, row + 2, wz[2] * at)
+                    wp.atomic_add(sums, row, wz[0] * at)
+                    wp.atomic_add(sums, row + 1, wz[1] * at)
+                    wp.atomic_add(sums, row + 2, wz[2] * at)
 
-    @scene_kernel()
+    @SceneKernel
     def prepare(n: int, sums: vec4s, field: vec4s):
         s = sums[n]
         filled = s[0]
@@ -160,7 +153,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
             return grid.nz
         return 1
 
-    @scene_kernel()
+    @SceneKernel
     def sweep(
         n: int,
         ratio: real,  # (A d / dx)^2
@@ -197,7 +190,7 @@ def nonlocal_kernels(real: type, effects: Effects, atomic: bool) -> SimpleNamesp
                 sharp -= real(0.25) * (before[1] - real(2.0) * here[1] + after[1])
         return sharp
 
-    @scene_kernel()
+    @SceneKernel
     def place(n: int, grid: Grid, soil: Soil, field: vec4s, cooperation: vec4s):
         found = field[n]
         amount = real(0.0)
@@ -227,8 +220,6 @@ def nonlocal_launches(
     """What computes the cooperative term: in order, after the grid step and before the particles read the grid.
 
     Args:
-        real: precision.
-        effects: which physics.
         sink: R of each node, see `wall_sink`.
         particles, grid, soil: the solver's structs.
         field: filled volume [cells], mean g or g_loc [1/s], s [-] and g [1/s] of the nodes, shape (nodes, 4).
@@ -236,7 +227,7 @@ def nonlocal_launches(
         ghost_nodes: with plain signs: what is carried here has no direction, so a mirror does not turn it.
     """
     device, count = field.device, len(field)
-    kernels = nonlocal_kernels(real, effects, atomic=device.is_cuda)
+    kernels = nonlocal_kernels(real, effects)
     sums, other = (wp.zeros_like(field) for _ in range(2))
     walls = wp.array(sink, dtype=real, device=device)
     ratio = (soil.cooperative_length / grid.spacing) ** 2

@@ -10,37 +10,22 @@ OUT_OF_REACH = 1.0e6  # [m], for points that cannot touch
 
 
 @cache
-def shape_struct(real: type, shape: str) -> type:
-    """Struct of a shape's sizes [m] in precision `real`."""
+def shape_struct(real: type) -> type:
+    """Struct of a body's sizes [m] in precision `real`; a shape sets and reads only some of them."""
     vec3 = wp.types.vector(3, real)
 
-    if shape == "box":
-
-        @wp.struct
-        class BoxSize:
-            half: vec3
-
-        return BoxSize
-
-    if shape == "cylinder":
-
-        @wp.struct
-        class CylinderSize:
-            radius: real
-            half_width: real
-            grousers: int
-            tip_radius: real
-            grouser_half: real  # half the thickness
-            grouser_offset: real  # added to the grousers' distance: they begin to act at a depth of their own
-
-        return CylinderSize
-
     @wp.struct
-    class MeshSize:
-        id: wp.uint64
-        half: vec3  # of the box that holds the mesh and everything in contact with it
+    class Size:
+        half: vec3  # of a box; of the box that holds a mesh and everything in contact with it
+        radius: real  # of a cylinder, like what follows
+        half_width: real
+        grousers: int
+        tip_radius: real
+        grouser_half: real  # half the thickness
+        grouser_offset: real  # added to the grousers' distance: they begin to act at a depth of their own
+        id: wp.uint64  # of a mesh
 
-    return MeshSize
+    return Size
 
 
 def shape_data(body: Tool, real: type, margin: float, device: wp.Device) -> tuple[object, wp.Mesh | None]:
@@ -49,25 +34,22 @@ def shape_data(body: Tool, real: type, margin: float, device: wp.Device) -> tupl
     Args:
         margin: distance at which contact begins, negative inside [m].
     """
-    vec3 = wp.types.vector(3, real)
-    data = shape_struct(real, body.surface)()
-    if body.surface == "box":
-        data.half = vec3(*body.half_size)
-        return data, None
+    data, mesh, half = shape_struct(real)(), None, body.half_size
     if body.surface == "cylinder":
         data.radius, data.half_width = 0.5 * body.diameter, 0.5 * body.width
         data.grousers, data.tip_radius = body.grousers, body.tip_radius
         data.grouser_half = 0.5 * body.grouser_thickness
         # A bar can be thinner than twice the depth at which contact begins; it then begins half-way to its middle.
         data.grouser_offset = min(0.0, margin + 0.25 * body.grouser_thickness)
-        return data, None
-    vertices, triangles, _ = body.mesh
-    mesh = wp.Mesh(
-        points=wp.array(vertices, dtype=wp.vec3, device=device),
-        indices=wp.array(triangles.ravel(), dtype=int, device=device),
-        support_winding_number=True,
-    )
-    data.id, data.half = mesh.id, vec3(*(body.half_size + max(0.0, margin)))
+    elif body.surface == "mesh":
+        vertices, triangles, _ = body.mesh
+        mesh = wp.Mesh(
+            points=wp.array(vertices, dtype=wp.vec3, device=device),
+            indices=wp.array(triangles.ravel(), dtype=int, device=device),
+            support_winding_number=True,
+        )
+        data.id, half = mesh.id, half + max(0.0, margin)
+    data.half = wp.types.vector(3, real)(*half)
     return data, mesh
 
 
@@ -104,7 +86,7 @@ def _nearest_face(real: type) -> wp.Function:
 
 def _box(real: type) -> wp.Function:
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    Size = shape_struct(real, "box")
+    Size = shape_struct(real)
     nearest_face = _nearest_face(real)
 
     @wp.func
@@ -118,7 +100,7 @@ def _box(real: type) -> wp.Function:
 
 def _cylinder(real: type) -> wp.Function:
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    Size = shape_struct(real, "cylinder")
+    Size = shape_struct(real)
     nearest_face = _nearest_face(real)
 
     @wp.func
@@ -152,7 +134,7 @@ def _cylinder(real: type) -> wp.Function:
 
 def _mesh(real: type) -> wp.Function:
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    Size = shape_struct(real, "mesh")
+    Size = shape_struct(real)
 
     @wp.func
     def mesh_distance(q: vec3, size: Size):

@@ -10,13 +10,13 @@ flat array of 4-vectors: momentum and mass, or impulse and mass times the partic
 its mean.
 """
 
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 
 import warp as wp
 
 from ..effects import Effects
-from ..launch import scene_kernel
+from ..launch import SceneKernel
 from .constitutive import constitutive
 from .contact import ContactLaw, body_struct, contact
 from .fluidity import fluidity, soil_struct
@@ -34,12 +34,13 @@ def transfer(real: type, effects: Effects, contact_law: ContactLaw | None, atomi
     (a GPU).
     """
     # Warp writes a product and the sum it goes into as two statements: without the flag they stay two instructions.
-    fused = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast"}
+    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast"
+    fused_kernel = partial(SceneKernel, module_options={"cpu_compiler_flags": flags})
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
     law = constitutive(real, effects)
     vec6, mat33 = law.vec6, law.mat33
-    Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real, contact_law or ContactLaw())
+    Soil, Grid, Body = soil_struct(real), grid_struct(real), body_struct(real)
     Particles, vec4s, reals, ints = particle_struct(real), *(wp.array(dtype=t) for t in (vec4, real, int))
     with_body = contact_law is not None
     push = contact(real, contact_law or ContactLaw(), atomic)
@@ -91,7 +92,7 @@ def transfer(real: type, effects: Effects, contact_law: ContactLaw | None, atomi
                 at = plus(at, real(1.0), row_y)
             plane = plus(plane, real(1.0), row_x)
 
-    @scene_kernel(fused)
+    @fused_kernel
     def to_grid(p: int, particles: Particles, grid: Grid, momentum: vec4s, top_speed: reals, fault: ints):
         x = particles.position[p]
         v = particles.velocity[p]
@@ -107,7 +108,7 @@ def transfer(real: type, effects: Effects, contact_law: ContactLaw | None, atomi
         start = mass * v - q * f
         deposit(base, f, vec4(start[0], start[1], start[2], mass), q, grid, momentum)
 
-    @scene_kernel(fused)
+    @fused_kernel
     def scatter(p: int, particles: Particles, grid: Grid, body: Body, impulse: vec4s):
         base, f = base_and_offset(particles.home[p], grid)
         mass = part(p, grid) * grid.particle_mass
@@ -124,7 +125,7 @@ def transfer(real: type, effects: Effects, contact_law: ContactLaw | None, atomi
         swelling = mass * particles.swelling[p]
         deposit(base, f, vec4(start[0], start[1], start[2], swelling), q, grid, impulse)
 
-    @scene_kernel(fused)
+    @fused_kernel
     def gather(p: int, particles: Particles, grid: Grid, velocity: vec4s, cooperation: vec4s, fault: ints):
         base, f = base_and_offset(particles.home[p], grid)
         wx = weights(f[0])
@@ -181,7 +182,7 @@ def transfer(real: type, effects: Effects, contact_law: ContactLaw | None, atomi
             fail(fault, p, grid.substep[0], wp.where(near, 1, 0))
 
     # A kernel of its own: in one with the transfer the C++ compiler makes both slower.
-    @scene_kernel(fused)
+    @fused_kernel
     def material(p: int, particles: Particles, grid: Grid, soil: Soil):
         # What `update` means by its last number; the excess is what cooperative flow adds (nonlocal_fluidity.py).
         g = real(0.0)
@@ -231,7 +232,7 @@ def transfer(real: type, effects: Effects, contact_law: ContactLaw | None, atomi
             x[axis] = wp.min(x[axis], grid.origin[axis] + real(grid.high[axis]) * grid.spacing)
         return x
 
-    @scene_kernel(fused)
+    @fused_kernel
     def from_grid(p: int, particles: Particles, grid: Grid, before: vec4s, keep: reals):
         # The particle's own velocity changes by what changed on the grid; of the part that the grid does not resolve
         # the share `keep` is left.

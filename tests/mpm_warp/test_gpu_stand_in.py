@@ -8,24 +8,24 @@ import warp as wp
 from stand_in import Checked, Threads, compiler, on_stand_in
 
 from mpm_warp import Bed, Plate, Solver
-from mpm_warp.launch import Executor, Job, Launch, Program, find_device, scene_kernel
+from mpm_warp.launch import Executor, Job, Launch, Program, SceneKernel, find_device
 from sgns_testing.scenes import cut
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="needs g++ on Linux")
 
 
-@scene_kernel()
+@SceneKernel
 def from_neighbour(i: int, a: wp.array(dtype=float)):
     if i + 1 < a.shape[0]:
         a[i] = a[i + 1]
 
 
-@scene_kernel()
+@SceneKernel
 def beyond_the_end(i: int, a: wp.array(dtype=float)):
     a[i + 1] = 1.0
 
 
-@scene_kernel()
+@SceneKernel
 def one_more(i: int, a: wp.array(dtype=float)):
     a[i] = a[i] + 1.0
 

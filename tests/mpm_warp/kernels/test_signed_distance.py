@@ -18,7 +18,7 @@ start_warp()
 @cache
 def question(real, shape):
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    Size, outward = shape_struct(real, shape), signed_distance(real, shape)
+    Size, outward = shape_struct(real), signed_distance(real, shape)
 
     @wp.kernel(module="unique", enable_backward=False)
     def ask(q: wp.array(dtype=vec3), size: Size, found: wp.array(dtype=vec4)):
