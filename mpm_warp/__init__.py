@@ -12,8 +12,6 @@ from .scenes import Body, Column, Excavation, Incline, Wheel
 from .solver import Frame, Solver, frames_together
 from .state import SceneError, SolverStopped, State
 
-Push = Body  # its former name
-
 __all__ = [
     "Bed",
     "Body",
@@ -28,7 +26,6 @@ __all__ = [
     "Material",
     "MeshBody",
     "Plate",
-    "Push",
     "Scene",
     "SceneError",
     "Solver",

@@ -275,5 +275,5 @@ def test_the_tool_of_start_here_is_closed(workplace: Path, monkeypatch: pytest.M
     exec(path, {})
     rows = [tuple(map(float, row.split(","))) for row in Path("path.csv").read_text().splitlines()[1:]]
     body = mpm_warp.MeshBody(file="wedge.stl", scale=0.001)
-    scene = mpm_warp.Push(bed=mpm_warp.Bed(size=(0.8, 0.6, 0.15)), tool=body, path=tuple(rows), duration=2.0)
+    scene = mpm_warp.Body(bed=mpm_warp.Bed(size=(0.8, 0.6, 0.15)), tool=body, path=tuple(rows), duration=2.0)
     assert scene.warnings() == []

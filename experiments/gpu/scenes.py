@@ -13,12 +13,12 @@ sys.path.insert(1, str(Path(__file__).resolve().parents[2] / "support"))
 
 from mpm_warp import (
     Bed,
+    Body,
     Column,
     Effects,
     Frame,
     Incline,
     Material,
-    Push,
     Scene,
     Solver,
     Walls,
@@ -144,7 +144,7 @@ def _other_bodies(folder: Path) -> list[Case]:
     path = tuple((t, x, 0.2, z, 0.0, 0.0, 0.0, 1.0) for t, x, z in rows)
     size = (0.062, 0.104, 0.1)
     file = write_obj(folder / "box.obj", box_corners(size, (1.0, 2.0, 3.0)), BOX_FACES)
-    pushed = Push(bed=BED, tool=Box(size=size), path=path, duration=0.1)
+    pushed = Body(bed=BED, tool=Box(size=size), path=path, duration=0.1)
     return [
         Case("wheel", (wheel,)),
         Case("wheel with grousers that hold the soil", (replace(wheel, bilateral=True, **bars),)),

@@ -10,6 +10,7 @@ from leakage import leakage
 
 from mpm_warp import (
     Bed,
+    Body,
     Box,
     Column,
     Effects,
@@ -17,7 +18,6 @@ from mpm_warp import (
     Frame,
     Incline,
     Material,
-    Push,
     Scene,
     Solver,
     Walls,
@@ -187,7 +187,7 @@ def impact(speed: float) -> tuple[float, str]:
     end = (start - stop) / speed
     rows = ((0.0, start), (end, stop), (0.2, stop))
     path = tuple((t, 0.2, 0.2, z, 0.0, 0.0, 0.0, 1.0) for t, z in rows)
-    scene = Push(bed=bed, tool=Box(size=(0.1, 0.1, 0.06)), path=path, duration=0.1, frame_rate=1000.0)
+    scene = Body(bed=bed, tool=Box(size=(0.1, 0.1, 0.06)), path=path, duration=0.1, frame_rate=1000.0)
     frames = frames_of(scene)
     gained, work = energies(scene, frames) - energies(scene, frames)[0], work_on_soil(frames)
     moving = slice(round(end * 1000.0), None)
@@ -231,7 +231,7 @@ def against_the_wall() -> tuple[float, str]:
     bed = Bed(size=(0.32, 0.16, 0.12), spacing=0.02, headroom=0.6)
     path = along(0.06, 0.25, 0.05, 0.0, 1.0, y=0.08)
     tool = Box(size=(0.06, 0.158, 0.22))
-    scene = Push(bed=bed, tool=tool, path=path, duration=1.2, frame_rate=100.0)
+    scene = Body(bed=bed, tool=tool, path=path, duration=1.2, frame_rate=100.0)
     frames = frames_of(scene)
     beyond = max(float(np.max(f.position[:, 0] - 0.32)) for f in frames)
     # What soil under the peak pressure has as its speed when the pressure is let go, 2 sigma / (rho c), and never more

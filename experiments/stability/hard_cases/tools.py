@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from leakage import leakage
 
-from mpm_warp import Effects, Excavation, MeshBody, Plate, Push, Solver
+from mpm_warp import Body, Effects, Excavation, MeshBody, Plate, Solver
 from sgns_testing.meshes import box_corners, box_triangles, write_obj
 from sgns_testing.scenes import cut
 
@@ -136,12 +136,12 @@ def thin(cells: float, speed: float) -> tuple[float, str]:
     return 100.0 * leakage(frames, scene.body), f"draft {-force:.3g} N"
 
 
-def mesh_scene(folder: Path, triangles: np.ndarray) -> Push:
+def mesh_scene(folder: Path, triangles: np.ndarray) -> Body:
     """A box of triangles goes down and forward."""
     file = write_obj(folder / "box.obj", box_corners((0.044, 0.193, 0.2)), triangles)
     rows = [(0.0, 0.104, ABOVE), (0.1, 0.104, IN_SOIL), (0.3, 0.144, IN_SOIL)]
     path = tuple((t, x, 0.2, z, 0.0, 0.0, 0.0, 1.0) for t, x, z in rows)
-    return Push(bed=cut().bed, tool=MeshBody(file=str(file)), path=path, duration=0.3)
+    return Body(bed=cut().bed, tool=MeshBody(file=str(file)), path=path, duration=0.3)
 
 
 def flipped_mesh() -> float:

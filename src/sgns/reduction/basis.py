@@ -156,7 +156,9 @@ class Basis:
             values |= {k: float(state[k]) for k in _NUMBERS} | {k: str(state[k]) for k in _WORDS}
             values["fitted_on"] = [str(name) for name in state["fitted_on"]]
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise UserError(f"{where}: not a basis ({error!r:.300}); fit it again with `sgns reduce`") from error
+            raise UserError(
+                f"{where}: not a basis ({error!r:.300}); fit it again with `sgns reduce`"
+            ) from error
         if not all(bool(torch.as_tensor(values[k]).isfinite().all()) for k in (*_ARRAYS, *_NUMBERS)):
             raise UserError(
                 f"{where}: the basis holds values that are not finite; fit it again with `sgns reduce`"

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpm_warp import Bed, Box, MeshBody, Push, Scene, SceneError, Solver
+from mpm_warp import Bed, Body, Box, MeshBody, Scene, SceneError, Solver
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
 BED = Bed(size=(0.32, 0.24, 0.10), spacing=0.02, headroom=0.1)
@@ -30,7 +30,7 @@ def test_sliding_friction_is_coulombs_at_any_speed(speed, friction):
     height = (
         0.03 - 0.01 - 0.0001
     )  # the highest particles' centres lie half a particle spacing below the surface
-    scene = Push(
+    scene = Body(
         bed=BED,
         tool=lid,
         path=path(height, speed, duration, x=0.158),
@@ -47,7 +47,7 @@ def test_sliding_friction_is_coulombs_at_any_speed(speed, friction):
 def test_a_mesh_box_feels_what_a_box_feels(tmp_path):
     size = (0.062, 0.104, 0.10)  # no particle is equally near to two faces
     file = write_obj(tmp_path / "box.obj", 1e3 * box_corners(size, (1.0, 2.0, 3.0)), BOX_FACES)
-    one = Push(bed=BED, tool=Box(size=size), path=path(0.052, 0.1, sinking=0.2), duration=0.15)
+    one = Body(bed=BED, tool=Box(size=size), path=path(0.052, 0.1, sinking=0.2), duration=0.15)
     two = replace(one, tool=MeshBody(file=str(file), scale=1e-3))
     a, b = forces(one), forces(two)
     assert np.abs(a[:, [0, 2]]).max(axis=0).min() > 1.0
@@ -57,7 +57,7 @@ def test_a_mesh_box_feels_what_a_box_feels(tmp_path):
 def test_a_mesh_scene_survives_plain_data_with_its_mesh(tmp_path):
     """Data that a mesh was read for may come from any file, and open none."""
     file = write_obj(tmp_path / "box.obj", box_corners((0.06, 0.1, 0.1)), BOX_FACES)
-    scene = Push(bed=BED, tool=MeshBody(file=str(file)), path=path(0.2, 0.1))
+    scene = Body(bed=BED, tool=MeshBody(file=str(file)), path=path(0.2, 0.1))
     with pytest.raises(SceneError, match="does not come with these data"):
         Scene.from_dict(scene.to_dict())
     data = scene.to_dict()

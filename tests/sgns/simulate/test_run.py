@@ -12,11 +12,11 @@ from omegaconf import OmegaConf
 
 from mpm_warp import (
     Bed,
+    Body,
     Effects,
     Excavation,
     MeshBody,
     Plate,
-    Push,
     Scene,
     Solver,
     SolverStopped,
@@ -194,10 +194,10 @@ def test_a_bed_without_a_body_can_go_on(stops, tmp_path):
         assert run.state.frame == LAST
 
 
-def pushed(file) -> Push:
+def pushed(file) -> Body:
     rows = tuple((t, 0.1 + 0.5 * t, 0.1, 0.03, 0.0, 0.0, 0.0, 1.0) for t in (0.0, 0.1))
     bed = Bed(size=(0.4, 0.2, 0.16), spacing=0.04)
-    return Push(bed=bed, tool=MeshBody(file=str(file)), path=rows, duration=0.1)
+    return Body(bed=bed, tool=MeshBody(file=str(file)), path=rows, duration=0.1)
 
 
 @pytest.fixture
