@@ -227,6 +227,13 @@ def test_every_setting_is_on_the_site(hooks: ModuleType) -> None:
                     assert f"| `{key}` |" in page or f"| `{key}." in page, (file, key)
 
 
+def test_the_page_of_all_settings_has_ranges(hooks: ModuleType) -> None:
+    lines = hooks.reference_page().splitlines()
+    assert "| `hidden_width` | 128 | 1 to 10000 | width of every layer |" in lines
+    assert "| `gravity` | 9.81 m/s^2 | 0 to 100000 | downwards |" in lines
+    assert "## Simulate" in lines and "## Wheel (`scene`)" in lines
+
+
 def test_a_settings_page_has_values_and_comments(hooks: ModuleType) -> None:
     text = "# About.\na: 1.0   # first [m],\n         # and more\nb:  # group\n  c: [1, 2]  # a | b\n  d: '#no'\n"
     assert hooks.about(text) == ["About."]
