@@ -10,8 +10,6 @@ from typing import Any, ClassVar, Literal
 from mpm_warp.settings import Settings, setting, settings
 from sgns.config import UserError
 
-Device = Literal["cpu", "cuda"]
-
 
 class Group(Settings):
     """Base of the groups: what is not allowed is a `UserError`, and they are plain data in checkpoints."""
