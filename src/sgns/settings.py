@@ -260,7 +260,7 @@ def _seed(words: str) -> Any:
 
 
 def _device() -> Any:
-    return setting("cpu", "where it is computed")
+    return setting("cpu", "cpu or cuda")
 
 
 def _num_modes() -> Any:
@@ -413,6 +413,14 @@ COMMANDS: dict[str, type[Group]] = {
     "advise": Advise,
     "check": Check,
 }
+MAIN_KEYS: dict[str, list[tuple[str, type[Group], tuple[str, ...]]]] = {
+    "reduce": [("reduction", ReductionSettings, ("num_modes", "tolerance"))],
+    "train": [
+        ("reduction", ReductionSettings, ("num_modes",)),
+        ("training", TrainingSettings, ("max_steps",)),
+    ],
+}
+"""Keys of groups that the help of a command shows beside its own: group, class, names."""
 MODELS: dict[Any, tuple[Any, Any]] = {
     "network": (ModelSettings, TrainingSettings),
     "polynomial": (PolynomialSettings, FitSettings),

@@ -99,8 +99,30 @@ def command_help(command: str) -> str:
     for group, default in groups.items():
         options = (f"{name} (default)" if name == default else name for name in options_of(group))
         lines.append(f"  {group:<{width}}  {', '.join(options)}")
-    text = Template(template).substitute(APP_CONFIG_GROUPS="\n".join(lines))
+    text = Template(template).substitute(
+        APP_CONFIG_GROUPS="\n".join(lines), KEYS="\n".join(key_lines(command))
+    )
     return f"{text.rstrip()}\n\nAll settings and their values: sgns {command} --cfg job\n"
+
+
+def key_lines(command: str) -> list[str]:
+    """A line for each key of a command, and for the main keys of its groups, from their definitions."""
+    from mpm_warp.settings import described  # loads Warp: a second
+    from sgns.settings import COMMANDS, MAIN_KEYS, Errors
+
+    rows = [
+        (f"{group}.{name}", *rest)
+        for group, cls, names in MAIN_KEYS.get(command, ())
+        for name, *rest in described(cls)
+        if name in names
+    ]
+    for name, *rest in described(COMMANDS[command]):
+        rows += (
+            [(f"error.{part}", *more) for part, *more in described(Errors)]
+            if name == "error"
+            else [(name, *rest)]
+        )
+    return [f"  {name:<22} {words}{allowed and f' ({allowed})'}" for name, _, allowed, words in rows]
 
 
 def _settings(command: str) -> dict:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -11,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+import sgns.settings as typed
+from mpm_warp.settings import described
 from sgns import __version__
 from sgns.cli.commands import COMMANDS
 from sgns.cli.help import groups_of, options_of
@@ -80,6 +83,10 @@ def test_help_of_a_command(command: str, empty_folder: Path) -> None:
     assert result.returncode == 0
     assert result.stdout.startswith(f"sgns {command}: ")
     assert "Examples:" in result.stdout and "$" not in result.stdout
+    if command != "check":  # takes paths
+        own = typed.COMMANDS[command]
+        keys = [name for name, *_ in described(own) if name != "error"]
+        assert all(re.search(rf"^  {name} +\S", result.stdout, re.M) for name in keys)
     for group, default in groups_of(command).items():
         if options_of(group):
             assert f"  {group} " in result.stdout
