@@ -339,3 +339,20 @@ def test_a_wheels_summary_leaves_the_settling_out():
     words = scene.summary(force, torque, poses)
     assert "drawbar pull 2.00 N, vertical force 60.00 N" in words
     assert "torque -0.500 N m" in words
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """Driving for 0.6 s at 40 % slip, in double precision."""
+    scene = wheel(slip=0.4, settle=0.2, duration=0.8)
+    return scene, list(Solver(scene, precision="float64").frames())
+
+
+def test_poses_hold_the_computed_height(driven):
+    scene, frames = driven
+    poses = np.array([f.body_pose for f in frames])
+    planned = scene.body_poses()
+    np.testing.assert_allclose(poses[:, [0, 1, 3, 4, 5, 6]], planned[:, [0, 1, 3, 4, 5, 6]], atol=1e-12)
+    assert poses[-1, 2] < planned[-1, 2]
+    middle = np.array([f.body_points.mean(axis=0) for f in frames])
+    np.testing.assert_allclose(middle, poses[:, :3], atol=1e-9)

@@ -67,3 +67,15 @@ def test_a_column_is_round_and_as_heavy_as_it_should_be():
     assert np.ptp(slab.filled[0][:, 1]) > 0.38
     assert len(slab.filled[0]) * slab.filled[1] == pytest.approx(slab.soil_volume)
     assert len({scene.arrangement_hash, slab.arrangement_hash, column().arrangement_hash}) == 3
+
+
+def test_the_flow_finds_its_speed():
+    """Slowed down by a tenth, it comes back towards the steady profile."""
+    scene = replace(LAYER, duration=1.0)
+    solver = Solver(scene)
+    frames = solver.frames()
+    steady = next(frames).velocity[:, 0].mean()
+    solver.particles.velocity.assign(0.9 * solver.particles.velocity.numpy())
+    speed = [f.velocity[:, 0].mean() / steady for f in frames]
+    assert speed[0] < 0.93
+    assert speed[-1] > 0.95
