@@ -168,13 +168,14 @@ class Solver:
 
         positions, volume = scene.filled
         velocities, (ln_j, strain) = scene.initial_velocities(), initial_stress(scene)
-        self._grid, layers = lay_grid(scene, real, self.time_step, volume, self._half is not None)
+        self.grid, layers = lay_grid(scene, real, self.time_step, volume, self._half is not None)
+        """The struct of the grid, see kernels/grid.py."""
         if self._half is not None:
-            kept, self._grid.on_plane = self._half.kept, self._half.on_plane
+            kept, self.grid.on_plane = self._half.kept, self._half.on_plane
             positions, velocities, ln_j, strain = positions[kept], velocities[kept], ln_j[kept], strain[kept]
         self._soil = soil_parameters(real, scene.material, max(scene.bed.size))
         shear, bulk = 2.0 * scene.material.shear_modulus, scene.material.bulk_modulus
-        n, node_count = len(positions), self._grid.nx * self._grid.ny * self._grid.nz
+        n, node_count = len(positions), self.grid.nx * self.grid.ny * self.grid.nz
         padded = node_count + 1  # see kernels/node_rows.py
         self.particles = _with_arrays(
             particle_struct(real),
@@ -198,12 +199,13 @@ class Solver:
             zeros(vec4, padded if effects.nonlocality else 0) for _ in range(2)
         )
         self._top_speed, self._keep = zeros(real, 1), zeros(real, 1)
-        self._grid.substep, self._fault = zeros(int, 1), zeros(int, 4)
+        self.grid.substep, self._fault = zeros(int, 1), zeros(int, 4)
         periodic = (axis for axis, kind in enumerate(scene.bed.walls.conditions) if kind == "periodic")
         self._turns = {axis: zeros(int, n) for axis in periodic}
-        self._body: RigidBody | None = None
+        self.body: RigidBody | None = None
+        """The tool or wheel; None without one."""
         if scene.body is not None:
-            self._body = RigidBody(scene, effects, real, device, self.substeps_per_frame, self.time_step, n)
+            self.body = RigidBody(scene, effects, real, device, self.substeps_per_frame, self.time_step, n)
         self._remap, self._steps = self._programs(layers)
         self._memory = Memory(self._lasting())
         if self._start is not None:
@@ -217,22 +219,22 @@ class Solver:
         arrays |= {f"turns_{'xyz'[axis]}": turns for axis, turns in self._turns.items()}
         if self.effects.nonlocality:
             arrays["cooperative_fluidity"] = self._cooperative_field
-        return arrays | (self._body.lasting() if self._body is not None else {})
+        return arrays | (self.body.lasting() if self.body is not None else {})
 
     def _programs(self, layers: dict[int, np.ndarray]) -> tuple[Program, Program]:
         """A remap, and the steps from there to the next one."""
-        real, scene, device, body, particles = self._real, self.scene, self.device, self._body, self.particles
+        real, scene, device, body, particles = self._real, self.scene, self.device, self.body, self.particles
         momentum, velocity, before, impulse = self._momentum, self._velocity, self._before, self._impulse
         kernels = transfer(real, self.effects, body.law if body else None, atomic=device.is_cuda)
         node_kernels, wrap = grid_step(real, scene.bed.walls.conditions), ghost_kernels(real).wrap
-        ghost_nodes = GhostNodes(real, device, self._grid, layers, mirrored=self._half is not None)
+        ghost_nodes = GhostNodes(real, device, self.grid, layers, mirrored=self._half is not None)
         body_data = body.data if body else body_struct(real)()
 
         def over_particles(kernel: SceneKernel, *arguments: Any) -> Launch:
-            return Launch(kernel, self.computed_count, [particles, self._grid, *arguments], device)
+            return Launch(kernel, self.computed_count, [particles, self.grid, *arguments], device)
 
         def over_nodes(kernel: SceneKernel, *arguments: Any) -> Launch:
-            return Launch(kernel, len(self._inverse_mass), [self._grid, *arguments], device)
+            return Launch(kernel, len(self._inverse_mass), [self.grid, *arguments], device)
 
         remap = [
             Launch(wrap, len(turns), [particles.position, turns, axis, scene.bed.size[axis]], device)
@@ -257,7 +259,7 @@ class Solver:
         return Program(remap), Program(begin, step, [over_particles(kernels.from_grid, before, self._keep)])
 
     def _nonlocal_launches(self, layers: dict[int, np.ndarray]) -> list[Launch]:
-        grid, field, cooperation = self._grid, self._cooperative_field, self._cooperation
+        grid, field, cooperation = self.grid, self._cooperative_field, self._cooperation
         sink = np.zeros(len(self._inverse_mass))
         if self.scene.material.fluidity_at_walls == "zero":
             sink = wall_sink((grid.nx, grid.ny, grid.nz), grid.low, grid.high)
@@ -270,9 +272,9 @@ class Solver:
 
     def _advance(self, index: int) -> Iterator[Job]:
         """From frame index - 1 to frame `index`."""
-        self._grid.substep.zero_()
-        if self._body is not None:
-            self._body.start_frame(index - 1)
+        self.grid.substep.zero_()
+        if self.body is not None:
+            self.body.start_frame(index - 1)
         left = self.substeps_per_frame
         while left:
             self._top_speed.zero_()
@@ -298,8 +300,8 @@ class Solver:
         found = found or limits.lost_fluidity(particles.excess.numpy())
         if found is not None:
             raise self._stopped(index, self.substeps_per_frame, *found)
-        if self._body is not None:
-            self._body.check(index / self.scene.frame_rate, limits.top_speed)
+        if self.body is not None:
+            self.body.check(index / self.scene.frame_rate, limits.top_speed)
 
     def _stopped(self, index: int, substep: int, particle: int, cause: str) -> SolverStopped:
         time = (index - 1) / self.scene.frame_rate + substep * self.time_step
@@ -316,8 +318,8 @@ class Solver:
         time = index / scene.frame_rate
         pose = scene.poses_at(np.array([time]))[0]
         impulse = np.zeros((2, 3))
-        if self._body is not None:
-            pose, impulse = self._body.pose(time), self._body.impulse() * (scene.frame_rate if index else 0.0)
+        if self.body is not None:
+            pose, impulse = self.body.pose(time), self.body.impulse() * (scene.frame_rate if index else 0.0)
         position, velocity = self.particles.position.numpy(), self.particles.felt_velocity.numpy()[:, :3]
         for axis, turns in self._turns.items():
             position = position.copy()  # on the CPU it is the solver's own memory

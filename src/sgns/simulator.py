@@ -121,6 +121,7 @@ class Simulator:
 
     Attributes:
         basis: Modes of the soil.
+        dynamics: What steps the modes: network or polynomials.
         start_positions: Of all particles at rest [m], shape (n, 3).
         body_points: Those of the training runs, in the body frame [m], shape (M, 3).
         mean_force: Of the training runs [N], shape (3,): the simplest prediction of a force.
@@ -158,7 +159,7 @@ class Simulator:
         dynamics, self.basis = surrogate.dynamics, surrogate.basis
         if num_modes is not None:
             dynamics, self.basis = dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
-        self._dynamics = dynamics
+        self.dynamics = dynamics
         self.history, self.num_modes = dynamics.history, dynamics.num_modes
         self.context_keys, self.predicts_body = dynamics.context_keys, dynamics.predicts_body
         self.frame_rate, self.card = surrogate.frame_rate, surrogate.card
@@ -241,7 +242,7 @@ class Simulator:
             poses = [] if pose is None else [pose] * self.history
         else:
             latent, poses = self._checked_beginning(history)
-        stepper = self._dynamics.stepper(len(points), self._told(context))
+        stepper = self.dynamics.stepper(len(points), self._told(context))
         # All is in order: nothing is changed before.
         self._frame, self._points, self._context, self._stepper = 0, points, context, stepper
         self._poses, self._latent = poses, latent.clone()[None].to(self.device)
@@ -286,7 +287,7 @@ class Simulator:
         (1, d, r, 3), and force and torque. What fails changes nothing."""
         # One frame more than the network sees, because the first motion needs a frame before it.
         window = np.stack([*poses, pose])
-        body = self._dynamics.track(window, in_world_frame(window, self._points)).frames(slice(1, None))
+        body = self.dynamics.track(window, in_world_frame(window, self._points)).frames(slice(1, None))
         memory = self._stepper.memory
         try:
             with torch.inference_mode():
@@ -295,7 +296,7 @@ class Simulator:
                 latent = torch.cat([self._latent[:, 1:], step.latent[:, None]], dim=1)
             if self.predicts_body:
                 there = body.position[0, -2] + step.displacement[0]
-                pose = self._dynamics.predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
+                pose = self.dynamics.predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
         except BaseException:  # an interruption as well
             self._stepper.memory = memory
             raise
@@ -344,7 +345,7 @@ class Simulator:
         context = self._context_of(values)
         told = self._told(context)
         began = time.perf_counter()
-        found = self._dynamics.follow(poses[None], points, told, latent, self._pace, given, loads)
+        found = self.dynamics.follow(poses[None], points, told, latent, self._pace, given, loads)
         wall_time = elapsed(began, time.perf_counter())
         states, force, torque, poses, world = (part[0] for part in found)
         excess = partial(self._surrogate.training_range.excess, poses, points, states, context)
@@ -378,7 +379,7 @@ class Simulator:
         start = self._start_latent.expand(self.history, -1, -1)
         began = time.perf_counter()
         parts = [
-            self._dynamics.follow(poses[first : first + paths_at_once], points, told, start, self._pace)[:4]
+            self.dynamics.follow(poses[first : first + paths_at_once], points, told, start, self._pace)[:4]
             for first in range(0, len(poses), paths_at_once)
         ]
         latent, force, torque, poses = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -438,7 +439,7 @@ class Simulator:
             return self.body_points.copy()
         # Runs without points have a network that needs none.
         found = finite_array(points, "array of body points", ("M" if len(self.body_points) else 0, 3))
-        fitted = self.predicts_body and self._dynamics.settings.body_nodes == "points"
+        fitted = self.predicts_body and self.dynamics.settings.body_nodes == "points"
         if fitted and np.linalg.matrix_rank(found - found[0]) < 2:
             raise UserError(
                 f"the {len(found)} body points lie on one line; the pose of a body that the network moves needs three "

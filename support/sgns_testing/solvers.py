@@ -9,7 +9,7 @@ import warp as wp
 
 def momenta(solver):
     """Linear and angular momentum of the particles, the affine part (C dx^2 / 4) included."""
-    mass = solver._grid.particle_mass
+    mass = solver.grid.particle_mass
     soil = solver.particles
     x, v, c = soil.position.numpy(), soil.velocity.numpy(), soil.velocity_gradient.numpy()
     spin = np.stack([c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], axis=-1)

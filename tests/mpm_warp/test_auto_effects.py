@@ -219,8 +219,8 @@ def test_no_array_of_what_is_off():
     """Sizes of what the solver allocates for each effect, and the kernels it launches, on and off."""
     plain, halved, driven = Solver(SHEARED), Solver(SHEARED, Effects(symmetry=True)), Solver(WHEEL)
     silent = Solver(SHEARED, Effects(torque=False))
-    assert (len(plain._body.data.impulse), len(silent._body.data.impulse)) == (2, 1)
-    assert plain._body._axle is None and len(driven._body._axle) == 3
+    assert (len(plain.body.data.impulse), len(silent.body.data.impulse)) == (2, 1)
+    assert plain.body._axle is None and len(driven.body._axle) == 3
     assert (len(halved.particles.position), len(plain.particles.position)) == (1920, 3840)
     fluid = Solver(SHEARED, Effects(fluidity=True))
     assert (len(plain.particles.fluidity), len(fluid.particles.fluidity)) == (0, 3840)
@@ -229,7 +229,7 @@ def test_no_array_of_what_is_off():
     ]  # fmt: skip
     assert {"fold", "unfold"} <= {k.kernel.name for k in launches(halved)}
     column = Solver(COLUMN, effects_for(COLUMN)[0])
-    assert column._body is None
+    assert column.body is None
 
 
 def test_without_torque_zeros_are_recorded_and_the_force_is_the_same():

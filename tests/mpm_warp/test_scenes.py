@@ -260,11 +260,11 @@ def test_momentum_goes_from_the_wheel_to_the_soil():
     impulse = sum(f.force for f in frames) / scene.frame_rate
     assert np.linalg.norm(impulse) > 1e-3
     soil, _ = momenta(solver)
-    mass = solver.particle_count * solver._grid.particle_mass
+    mass = solver.particle_count * solver.grid.particle_mass
     np.testing.assert_allclose(
         soil + mass * 9.81 * time * np.array([0, 0, 1]), -impulse, atol=1e-10 * np.linalg.norm(impulse)
     )
-    speed = solver._body._axle.numpy()[1]
+    speed = solver.body._axle.numpy()[1]
     assert scene.axle.mass * (speed + 9.81 * time) == pytest.approx(impulse[2], rel=1e-10)
 
 
@@ -277,7 +277,7 @@ def test_bilateral_contact_holds_soil_that_a_separable_one_lets_go():
         frames = solver.frames()
         for _ in range(10):
             next(frames)
-        solver._body._axle.assign([solver._body._axle.numpy()[0], 0.5, 0.0])
+        solver.body._axle.assign([solver.body._axle.numpy()[0], 0.5, 0.0])
         lifted[bilateral] = next(frames).force[2]
     assert lifted[False] >= 0.0
     assert lifted[True] < -1.0

@@ -41,7 +41,7 @@ def test_momentum_is_conserved(effects):
     for _ in solver.frames():
         pass
     after = momenta(solver)
-    size = solver._grid.particle_mass * np.abs(solver.particles.velocity.numpy()).sum()
+    size = solver.grid.particle_mass * np.abs(solver.particles.velocity.numpy()).sum()
     np.testing.assert_allclose(after[0], before[0], atol=1e-12 * size)
     np.testing.assert_allclose(after[1], before[1], atol=1e-12 * size)
     assert np.linalg.norm(before[1]) > 1e-3 * size * 0.1  # there was something to conserve

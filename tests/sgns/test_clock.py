@@ -44,10 +44,10 @@ def test_a_trial_ends_and_takes_some_time(tmp_path, odd_clock, monkeypatch):
     monkeypatch.setattr(
         campaign_runs, "_barrier", type("Barrier", (), {"wait": lambda self, timeout: None})()
     )
-    counts, seconds = campaign_runs._try([job(scene, tmp_path / "run.h5")])
+    counts, seconds = campaign_runs.time_jobs([job(scene, tmp_path / "run.h5")])
     assert counts == [scene.frame_count - 1]
     assert seconds > 0.0
 
 
 def test_other_times_can_be_divided_by(odd_clock):
-    assert full_space_cost._wall_time(lambda: torch.zeros(1), 3) > 0.0
+    assert full_space_cost.wall_time(lambda: torch.zeros(1), 3) > 0.0

@@ -179,7 +179,7 @@ def test_modes_stay_near_their_training_range(trained, kind) -> None:
     for num_modes in (4, 2):
         simulator = trained.simulator(kind, num_modes=num_modes)
         runs = np.concatenate([run.latent[:, :num_modes] for run in trained.data.runs("train")])
-        low, high = (bound.numpy() for bound in simulator._dynamics.reach())
+        low, high = (bound.numpy() for bound in simulator.dynamics.reach())
         width = runs.max(axis=0) - runs.min(axis=0)
         beyond = np.maximum(runs.min(axis=0) - low, high - runs.max(axis=0))
         # A mode that varies little is given a tenth of the widest one's range.
@@ -205,7 +205,7 @@ def test_nothing_runs_away_far_from_everything(trained, kind) -> None:
     simulator, path = trained.simulator(kind), trained.run.pose.repeat(50, axis=0)
     path[100:, :3] += 1e6 * np.sin(np.arange(len(path) - 100))[:, None]
     rollout = simulator.rollout(path)
-    low, high = (bound.numpy() for bound in simulator._dynamics.reach())
+    low, high = (bound.numpy() for bound in simulator.dynamics.reach())
     assert (rollout.latent >= low).all() and (rollout.latent <= high).all()
     assert np.isfinite(rollout.force).all()
 

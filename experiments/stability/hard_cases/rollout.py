@@ -180,7 +180,7 @@ def far_away(kind: str) -> tuple[float, str]:
     found = simulator.rollout(path, values=run.scene)
     if not sound(found):
         return math.nan, "not finite"
-    low, high = (bound.numpy() for bound in simulator._dynamics.reach())
+    low, high = (bound.numpy() for bound in simulator.dynamics.reach())
     beyond = np.maximum(np.maximum(low - found.latent, found.latent - high), 0.0)
     return float(beyond.max()), f"the force reaches {np.abs(found.force).max():.1e} N"
 

@@ -202,7 +202,7 @@ def push_without_gravity() -> tuple[float, str]:
     scene = cut(bed=free.bed, gravity=0.0, motion="path", path=path, duration=0.05, frame_rate=200.0)
     solver = Solver(scene)
     impulse = sum(f.force for f in solver.frames()) / scene.frame_rate
-    gained = solver._grid.particle_mass * solver.particles.velocity.numpy().astype(float).sum(axis=0)
+    gained = solver.grid.particle_mass * solver.particles.velocity.numpy().astype(float).sum(axis=0)
     return float(np.linalg.norm(impulse + gained) / np.linalg.norm(gained)), f"{gained[0]:.3g} N s given"
 
 

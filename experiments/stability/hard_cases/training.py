@@ -133,7 +133,7 @@ def no_variance() -> tuple[float, str]:
     data = fresh_data(scene={"depth": 0.05, "speed": 0.1, "rake": 0.0, "motion": "ramp"})
     output = new_folder()
     skill = train_synthetic(data, output, max_steps=60, validate_every=60, learning_rate=5e-3)
-    dynamics = Simulator.load(output / "best.ckpt")._dynamics
+    dynamics = Simulator.load(output / "best.ckpt").dynamics
     windows = TrainingWindows(data.runs("train"), 4, 3, "pose", 0)
     batch = windows.windows(windows.targets)
     values = [
@@ -217,7 +217,7 @@ def precision(dtype: torch.dtype) -> tuple[float, str]:
     paths = {}
     for kind in (torch.float64, dtype):
         simulator = Simulator.load(synthetic_network())
-        dynamics: LatentDynamics = simulator._dynamics
+        dynamics: LatentDynamics = simulator.dynamics
         dynamics.network = Cast(dynamics.network, kind)
         # Through `advance`: the fast stepper multiplies weights out itself.
         paths[kind] = stepped(simulator, run.pose)

@@ -141,9 +141,9 @@ def full_space_cost(path: Path, settings: ModelSettings, repeats: int) -> FullSp
 
     with single_thread():
         with torch.inference_mode():
-            frame = _wall_time(lambda: dynamics.advance(window.history, window.body), repeats)
+            frame = wall_time(lambda: dynamics.advance(window.history, window.body), repeats)
         forget_peak()
-        step = _wall_time(training_step, repeats)
+        step = wall_time(training_step, repeats)
     return FullSpaceCost(
         parameters=sum(weight.numel() for weight in dynamics.parameters()),
         training_step=step,
@@ -153,7 +153,7 @@ def full_space_cost(path: Path, settings: ModelSettings, repeats: int) -> FullSp
     )
 
 
-def _wall_time(action: Callable[[], object], repeats: int) -> float:
+def wall_time(action: Callable[[], object], repeats: int) -> float:
     """Median after one call to warm up [s]."""
     action()
     found = []

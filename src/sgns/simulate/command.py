@@ -25,7 +25,7 @@ from sgns.simulate.workers import simulate_campaign
 log = logging.getLogger(__name__)
 
 
-def _base_scene(settings: dict[str, Any]) -> dict[str, Any]:
+def base_scene(settings: dict[str, Any]) -> dict[str, Any]:
     """The scene a campaign names and changes, with the command's own overrides of scene.* and material.* on top."""
     if settings.get("scene") is None:
         raise UserError(
@@ -51,7 +51,7 @@ def main(cfg: DictConfig) -> float | None:
             raise UserError("continue_from goes on with one run; leave out dataset=")
         restart = restart_from(cfg, HydraConfig.get().overrides.task)
         same = {name: getattr(restart, name) for name in ("effects", "reasons", "seed", "precision")}
-        return _simulate_one(restart.scene, cfg, **same, restart=restart)
+        return simulate_one(restart.scene, cfg, **same, restart=restart)
     asked = asked_effects(cfg)
     if cfg.get("dataset") is not None:  # `dataset: null` in a defaults list leaves no key
         settings = plain(cfg.dataset)
@@ -59,7 +59,7 @@ def main(cfg: DictConfig) -> float | None:
             raise UserError(
                 "dataset.where picks among runs that are there; to simulate fewer change dataset.draw"
             )
-        campaign = plan(settings, _base_scene(settings), asked, cfg.solver.precision, cfg.seed)
+        campaign = plan(settings, base_scene(settings), asked, cfg.solver.precision, cfg.seed)
         batch = 1 if cfg.device == "cpu" else cfg.solver.batch
         simulate_campaign(campaign, device=cfg.device, batch=batch, shard=cfg.shard, shards=cfg.shards)
         return None
@@ -72,10 +72,10 @@ def main(cfg: DictConfig) -> float | None:
     for name, decision in decisions.items():
         log.info("%s", decision_line(name, decision))
     reasons, precision = recorded(decisions), cfg.solver.precision
-    return _simulate_one(scene, cfg, effects=effects, reasons=reasons, seed=cfg.seed, precision=precision)
+    return simulate_one(scene, cfg, effects=effects, reasons=reasons, seed=cfg.seed, precision=precision)
 
 
-def _simulate_one(scene: Scene, cfg: DictConfig, **settings: Any) -> float:
+def simulate_one(scene: Scene, cfg: DictConfig, **settings: Any) -> float:
     """Simulate a scene into `cfg.output` with a bar and a few words about it; see `scene_stages`."""
     output = Path(cfg.output)
     with only_here(output):

@@ -80,7 +80,7 @@ def simulate_campaign(
     costs = {name: run_cost(scene) for name, scene in campaign.scenes.items()}
     by_length = sorted(costs, key=lambda name: costs[name].particle_steps, reverse=True)
     share = by_length[shard::shards]
-    missing = [name for name in share if not _done(campaign.file(name), campaign.scenes[name])]
+    missing = [name for name in share if not is_done(campaign.file(name), campaign.scenes[name])]
     for name in set(share) - set(missing):  # nobody will write these again
         remove_abandoned(campaign.file(name))
     part = f", {len(share)} of them in shard {shard} of {shards}" if shards > 1 else ""
@@ -92,10 +92,10 @@ def simulate_campaign(
         log.info("%s", line)
     size = sum(costs[name].size for name in missing)
     require_space(campaign.path, size)
-    _compile(campaign, missing, device)
+    compile_kernels(campaign, missing, device)
     workers = min(workers or (1 if device != "cpu" else len(os.sched_getaffinity(0))), len(missing))
     batch = min(batch, math.ceil(len(missing) / workers))
-    pool = _Workers(campaign, {name: costs[name] for name in missing}, device, workers, batch)
+    pool = Workers(campaign, {name: costs[name] for name in missing}, device, workers, batch)
     failed = pool.make_all(f"about {size_words(size)} of disk")
     if failed:
         name, message = next(iter(failed.items()))
@@ -104,7 +104,7 @@ def simulate_campaign(
         )
 
 
-def _compile(campaign: Campaign, names: list[str], device: str) -> None:
+def compile_kernels(campaign: Campaign, names: list[str], device: str) -> None:
     """Compile the kernels that the scenes need, once; the processes find them in Warp's cache.
 
     Kernels can differ only where scenes differ in their effects or in something else than the size of a number.
@@ -143,7 +143,7 @@ class _Job:
         return Scene.from_dict(self.scene, self.mesh)
 
 
-class _Workers:
+class Workers:
     """Worker processes, what they have done, and how long the rest will take."""
 
     def __init__(
@@ -172,7 +172,7 @@ class _Workers:
         with self._pool:
             try:
                 self._measure()
-                log.info("about %s with %d at once, %s", self._left(), self.at_once, disk)
+                log.info("about %s with %d at once, %s", self.time_left(), self.at_once, disk)
                 # Every run is for itself, but a worker that makes several at once gets its share of them together.
                 shares = self.workers if self.batch > 1 else len(self._jobs)
                 for share in (self._jobs[number::shares] for number in range(shares)):
@@ -198,7 +198,7 @@ class _Workers:
         """Let all workers step runs from all over the list for a moment, at the same time."""
         sample = [self._jobs[i * len(self._jobs) // self.at_once] for i in range(self.at_once)]
         shares = [sample[worker :: self.workers] for worker in range(self.workers)]
-        trials = [self._pool.submit(_try, share) for share in shares]
+        trials = [self._pool.submit(time_jobs, share) for share in shares]
         for share, trial in zip(shares, trials, strict=True):
             frames, seconds = trial.result()
             for job, count in zip(share, frames, strict=True):
@@ -213,14 +213,14 @@ class _Workers:
         with tqdm(total=total, desc=f"{self.at_once} at once", bar_format=layout, disable=None) as bar:
             while rest := self._rest():
                 time.sleep(0.2)
-                now, steps = time.monotonic(), self._steps_made()
+                now, steps = time.monotonic(), self.steps_made()
                 self._see(steps - made, elapsed(last, now), busy=min(self.at_once, len(rest)))
                 made, last = steps, now
                 done = f"{runs - len(rest)} of {runs} runs"
-                bar.set_postfix_str(f"{done}, {self._left()} left", refresh=False)
+                bar.set_postfix_str(f"{done}, {self.time_left()} left", refresh=False)
                 bar.update(total - sum(rest.values()) - bar.n)
                 if bar.disable and now - last_line > _LOG_EVERY:
-                    log.info("%s, %s left", done, self._left())
+                    log.info("%s, %s left", done, self.time_left())
                     last_line = now
             bar.set_postfix_str(f"{runs} of {runs} runs", refresh=False)
             bar.update(total - bar.n)
@@ -231,7 +231,7 @@ class _Workers:
         self._steps_seen = kept * self._steps_seen + steps
         self._seconds_seen = kept * self._seconds_seen + seconds * busy
 
-    def _steps_made(self) -> int:
+    def steps_made(self) -> int:
         """Particle-steps in all frames so far; a run's first frame takes none."""
         counts = zip(self._frames_done, self.costs.values(), strict=True)
         return sum(max(0, frames - 1) * cost.steps_per_frame for frames, cost in counts)
@@ -245,7 +245,7 @@ class _Workers:
             if name not in self._futures or not (ended or self._futures[name].done())
         }
 
-    def _left(self) -> str:
+    def time_left(self) -> str:
         """Time to the end of the last run at the speed seen so far, in words."""
         if not self._steps_seen:
             return "an unknown time"
@@ -279,7 +279,7 @@ def _start_worker(frames_done: Any, ended: Any, barrier: Any) -> None:
     threading.Thread(target=leave_with_parent, daemon=True).start()
 
 
-def _try(jobs: list[_Job]) -> tuple[list[int], float]:
+def time_jobs(jobs: list[_Job]) -> tuple[list[int], float]:
     """Frames made of each run and the seconds they took all together, while the other workers do the same."""
     scenes, effects = [job.read_scene() for job in jobs], [job.physics["effects"] for job in jobs]
     device, precision = jobs[0].physics["device"], jobs[0].physics["precision"]
@@ -316,7 +316,7 @@ def _make(job: _Job) -> Generator[tuple[str, str] | Job, None, None]:
     try:
         scene = job.read_scene()
         with file_lock(job.file) as ours:
-            if not ours or _done(job.file, scene):
+            if not ours or is_done(job.file, scene):
                 outcome = "elsewhere", ""
             else:
                 for stage in scene_stages(scene, job.file, **job.physics, progress=count_frame):
@@ -327,7 +327,7 @@ def _make(job: _Job) -> Generator[tuple[str, str] | Job, None, None]:
     yield outcome
 
 
-def _done(file: Path, scene: Scene) -> bool:
+def is_done(file: Path, scene: Scene) -> bool:
     """Whether the run is there and is of this scene; a file that cannot be read is made again."""
     if not file.exists():
         return False

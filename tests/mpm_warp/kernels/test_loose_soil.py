@@ -50,7 +50,7 @@ def after_a_frame(kind, bed, effects=None, precision="float32"):
 
 def density_of(solver):
     """Of the nodes, over that of dense soil."""
-    grid = solver._grid
+    grid = solver.grid
     return solver._before.numpy()[:-1, 3].reshape(grid.nx, grid.ny, grid.nz)
 
 
@@ -92,7 +92,7 @@ def test_an_undisturbed_bed_is_dense_up_to_its_walls(walls, symmetry, precision)
     x_walls, y_walls = walls, "slip" if symmetry else walls
     bed = Bed(size=(0.2, 0.24, 0.1), spacing=0.02, initial_stress="none", walls=Walls(x_walls, y_walls))
     solver, _ = after_a_frame(Scene, bed, Effects(symmetry=symmetry), precision)
-    grid, density = solver._grid, density_of(solver)
+    grid, density = solver.grid, density_of(solver)
     heights = float(grid.origin[2]) + bed.spacing * np.arange(grid.nz)
     below = (heights > -0.1 - 1e-6) & (heights < -1e-6)
     inside = []
@@ -112,7 +112,7 @@ def test_walls_that_lie_within_a_cell_are_dense_too(beyond, symmetry):
     kind = {"particles_per_cell": 27, "initial_stress": "none", "walls": Walls("slip", "slip")}
     bed = Bed(size=(size, size, 0.06), spacing=0.02, **kind)
     solver, _ = after_a_frame(Scene, bed, Effects(symmetry=symmetry))
-    grid, density = solver._grid, density_of(solver)
+    grid, density = solver.grid, density_of(solver)
     at_height = grid.low[2] + 1
     middle_y = (grid.high[1] + (grid.low[1] if not symmetry else 2)) // 2
     walls = [density[x, middle_y, at_height] for x in (grid.low[0], grid.high[0])]

@@ -27,7 +27,7 @@ class Column:
         scene = Scene(bed=bed, material=material, gravity=0.0, duration=0.1)
         self.solver = solver = Solver(scene, effects, precision=real)
         self.material, self.particles, self.g = material, solver.particles, solver.particles.fluidity
-        grid, self.field = solver._grid, solver._cooperative_field
+        grid, self.field = solver.grid, solver._cooperative_field
         self.shape = (grid.nx, grid.ny, grid.nz)
         floor = wall_sink(self.shape, (-1, -1, grid.low[2]), (2**30,) * 3)
         self.launches = nonlocal_launches(

@@ -24,7 +24,7 @@ def planned(name, *overrides):
         patch.setattr(simulate.HydraConfig, "get", lambda: current)
         cfg = compose("simulate", task)
         settings = OmegaConf.to_container(cfg.dataset, resolve=True)
-        return plan(settings, simulate._base_scene(settings), {}, "float32", cfg.seed)
+        return plan(settings, simulate.base_scene(settings), {}, "float32", cfg.seed)
 
 
 def cuts(name):

@@ -56,10 +56,10 @@ def test_an_output_that_is_a_pipe_or_taken_is_refused_before_anything_is_compute
     cfg = OmegaConf.create({"output": str(tmp_path / "run.h5"), "device": "cpu"})
     scene = Excavation()
     with only_here(tmp_path / "run.h5"), pytest.raises(UserError, match=f"made by process {os.getpid()}"):
-        simulate._simulate_one(scene, cfg)
+        simulate.simulate_one(scene, cfg)
     os.mkfifo(tmp_path / "run.stopped.h5")
     with pytest.raises(UserError, match=r"run\.stopped\.h5: it is a pipe"):
-        simulate._simulate_one(scene, cfg)
+        simulate.simulate_one(scene, cfg)
     os.mkfifo(tmp_path / "run.h5")
     with pytest.raises(UserError, match=r"run\.h5: it is a pipe"):
-        simulate._simulate_one(scene, cfg)
+        simulate.simulate_one(scene, cfg)

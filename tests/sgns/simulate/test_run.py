@@ -105,7 +105,7 @@ def test_going_on_with_half_the_step(stopped):
     assert done.returncode == 0, done.stderr
     assert check_run(output) == []
     assert not kept.exists()  # it has served its purpose
-    assert campaign_runs._done(output, small())  # a campaign takes it for its own
+    assert campaign_runs.is_done(output, small())  # a campaign takes it for its own
     reference = list(Solver(small(courant=0.3)).frames())
     with Run(output) as run:
         assert run.frame_count == small().frame_count

@@ -46,8 +46,8 @@ def order(monkeypatch):
         self._pool.shutdown()
         return {}
 
-    monkeypatch.setattr(campaign_runs._Workers, "make_all", make_all)
-    monkeypatch.setattr(campaign_runs, "_compile", lambda *_: None)
+    monkeypatch.setattr(campaign_runs.Workers, "make_all", make_all)
+    monkeypatch.setattr(campaign_runs, "compile_kernels", lambda *_: None)
     return names
 
 
@@ -142,7 +142,7 @@ def test_kernels_are_compiled_once_for_each_kind_of_scene_and_set_of_effects(tmp
     ):
         compiled.clear()
         c = replace(campaign(tmp_path, draw=draw, runs=None), effects=effects)
-        campaign_runs._compile(c, list(c.scenes), "cpu")
+        campaign_runs.compile_kernels(c, list(c.scenes), "cpu")
         assert sorted(compiled) == kernels
 
 
@@ -150,20 +150,20 @@ def test_time_left_follows_from_the_work_left_and_the_speed_seen(tmp_path):
     c = campaign(tmp_path, runs=6)
     costs = {name: run_cost(scene) for name, scene in c.scenes.items()}
     per_frame = costs[next(iter(costs))].steps_per_frame
-    workers = campaign_runs._Workers(c, costs, "cpu", 4)
+    workers = campaign_runs.Workers(c, costs, "cpu", 4)
     try:
-        assert workers._left() == "an unknown time"
+        assert workers.time_left() == "an unknown time"
         # A frame takes a worker 100 s; six runs of three steps on four workers end after two runs.
         workers._steps_seen, workers._seconds_seen = 10 * per_frame, 1000.0
-        assert workers._left() == "10 min"
+        assert workers.time_left() == "10 min"
         # Then an hour at half that speed, with three of the workers busy: the estimate says so.
         for _ in range(60):
             workers._see(0.9 * per_frame, seconds=60.0, busy=3)
-        assert workers._left() == "20 min"
+        assert workers.time_left() == "20 min"
         # Four runs have only one step left (frames 0 to 2 are there), two have not begun.
         workers._frames_done[:] = [3, 3, 3, 3, 0, 0]
-        assert workers._steps_made() == 8 * per_frame
-        assert workers._left() == "13 min"
+        assert workers.steps_made() == 8 * per_frame
+        assert workers.time_left() == "13 min"
     finally:
         workers._pool.shutdown()
 

@@ -45,7 +45,7 @@ def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for name in (
         "sgns.simulate.command.simulate_scene",
-        "sgns.simulate.workers._compile",
+        "sgns.simulate.workers.compile_kernels",
         "sgns.train.lightning_module.run_trainer",
         "sgns.train.polynomial.best_polynomial",
         "sgns.evaluate.command.roll_out",
