@@ -141,10 +141,10 @@ def finite_frames(rollout: Rollout) -> int:
 def require_known_bed(simulator: Simulator, scene: Scene, checkpoint: str | Path) -> None:
     """Refuses a scene whose particles are not the ones the checkpoint's basis was fitted on."""
     if scene.arrangement_hash != simulator.arrangement_hash:
-        if scene.bed.arrangement_hash == simulator.arrangement_hash and len(scene.displaced):
+        if len(scene.displaced):
             raise UserError(
                 f"the tool is in the soil at the start, where {len(scene.displaced)} particles of the bed are left out; "
-                f"{checkpoint} knows the whole bed: let the path begin above the soil"
+                f"{checkpoint} knows other particles: let the path begin above the soil"
             )
         raise UserError(
             f"this scene's bed is not the one that {checkpoint} knows: "
