@@ -17,6 +17,7 @@ from .poses import in_body_frame, in_world_frame, rotation_matrices, rotation_ve
 from .settings import Settings, build, setting, settings
 from .state import SceneError
 from .tool_geometry import distances
+from .units import place_unit, size_warning
 
 MOST_FRAMES = 1_000_000
 MOST_COURANT = 0.8
@@ -148,6 +149,11 @@ class Scene(Settings):
         return first + np.random.default_rng(0).integers(np.minimum(every, count - first))
 
     @property
+    def open_sides(self) -> bool:
+        """Whether nothing is in the way of a body at the sides: walls of a channel stand for more of the same soil."""
+        return self.bed.walls.conditions[1] in ("slip", "periodic")
+
+    @property
     def soil_volume(self) -> float:
         """Space that the soil takes up at the start [m^3]."""
         return float(np.prod(self.bed.size))
@@ -222,6 +228,22 @@ class Scene(Settings):
         way, angle = self.displacement(time)
         return way + angle * (self.body.reach if self.body is not None else 0.0)
 
+    def passing_times(self) -> np.ndarray:
+        """Times of the frames and between them [s], so close that no point of the body moves more than a grid spacing
+        from one to the next; of a very long way less close."""
+        times = self._with_turns(self.times())
+        way = self.largest_displacement(times)
+        steps = np.maximum(1.0, np.ceil(way / max(self.bed.spacing, way.sum() / _MOST_POSES)))
+        ends = np.concatenate([[0.0], np.cumsum(steps)])
+        return np.interp(np.arange(ends[-1] + 1.0), ends, times)
+
+    def lowest_points(self, poses: np.ndarray) -> np.ndarray:
+        """z of the body's lowest point at poses (T, 7) [m], shape (T,)."""
+        assert self.body is not None
+        outline, up = self.body.outline(), rotation_matrices(poses[:, 3:])[:, 2]
+        parts = np.array_split(up, 1 + len(up) * len(outline) // _MOST_POINTS)
+        return poses[:, 2] + np.concatenate([(part @ outline.T).min(axis=1) for part in parts])
+
     def body_points(self) -> np.ndarray:
         """Body nodes in the body frame [m], shape (M, 3)."""
         return self.body.points() if self.body is not None else np.zeros((0, 3))
@@ -278,18 +300,18 @@ class Scene(Settings):
     def _check_thickness(self, body: Tool, what: str) -> None:
         """A body must be thick enough for soil to be inside before it is pushed out."""
         if body.half_thickness + self.contact_distance < 0.1 * self.bed.spacing:
+            odd = size_warning(body.outline(), self.bed.size, self.open_sides)
             raise SceneError(
                 f"{what} of {2.0 * body.half_thickness:g} m is too thin for a grid of {self.bed.spacing:g} m: "
-                "soil would pass through; use a smaller bed.spacing (at most half the thickness is good)"
+                f"soil would pass through; {odd or 'use a smaller bed.spacing (at most half the thickness is good)'}"
             )
 
     def _check_inside(self, body: Tool, what: str, remedy: str) -> None:
         """The part of the body that is below the surface must stay within the bin."""
         lx, ly, lz = self.bed.size
-        # Nothing is in the way of a body at the sides of a channel, whose walls stand for more of the same soil.
-        side = math.inf if self.bed.walls.conditions[1] in ("slip", "periodic") else 0.0
+        side = math.inf if self.open_sides else 0.0
         low, high = np.array([0.0, -side, -lz]) - _ROUNDING, np.array([lx, ly + side, math.inf]) + _ROUNDING
-        times = self._passing_times()
+        times = self.passing_times()
         poses, outline = self.poses_at(times), body.outline()
         place, around = poses[:, :3], np.abs(rotation_matrices(poses[:, 3:])) @ body.half_size
         leaving = ((place - around < low) | (place + around > high)).any(axis=1)
@@ -302,19 +324,13 @@ class Scene(Settings):
                 axis = int(np.argmax(outside[pose].any(axis=0)))
                 at = points[pose, np.argmax(outside[pose, :, axis]), axis]
                 allowed = (f"0 to {lx:g} m", f"0 to {ly:g} m", f"at least {-lz:g} m")[axis]
+                odd = size_warning(outline, self.bed.size, self.open_sides)
+                if self._path and (unit := place_unit(np.array(self._path)[:, 1:4], self.bed.size)):
+                    odd = f"the path's positions look like {unit} and are taken as metres"
                 raise SceneError(
                     f"{what} leaves the bin at {times[some[pose]]:.3f} s: {'xyz'[axis]} = {at:.4f} m, "
-                    f"allowed {allowed} below the surface; {remedy}"
+                    f"allowed {allowed} below the surface; {odd or remedy}"
                 )
-
-    def _passing_times(self) -> np.ndarray:
-        """Times of the frames and between them [s], so close that no point of the body moves more than a grid spacing
-        from one to the next; of a very long way less close."""
-        times = self._with_turns(self.times())
-        way = self.largest_displacement(times)
-        steps = np.maximum(1.0, np.ceil(way / max(self.bed.spacing, way.sum() / _MOST_POSES)))
-        ends = np.concatenate([[0.0], np.cumsum(steps)])
-        return np.interp(np.arange(ends[-1] + 1.0), ends, times)
 
 
 Scene.classes["bed"] = Scene

@@ -143,7 +143,7 @@ def require_known_bed(simulator: Simulator, scene: Scene, checkpoint: str | Path
     if scene.arrangement_hash != simulator.arrangement_hash:
         if len(scene.displaced):
             raise UserError(
-                f"the tool is in the soil at the start, where {len(scene.displaced)} particles of the bed are left out; "
+                f"the tool is in the soil at the start, where {len(scene.displaced)} particles are left out; "
                 f"{checkpoint} knows other particles: let the path begin above the soil"
             )
         raise UserError(

@@ -88,7 +88,9 @@ def test_unknown_bed_is_refused_in_one_line_that_names_it(simulator):
 def test_a_tool_that_starts_in_the_soil_is_refused(simulator):
     scene = FakeScene(simulator, "other")
     scene.displaced = (3, 4)
-    with pytest.raises(UserError, match=r"in the soil at the start, where 2 particles .*begin above the soil"):
+    with pytest.raises(
+        UserError, match=r"in the soil at the start, where 2 particles .*begin above the soil"
+    ):
         require_known_bed(simulator, scene, "best.ckpt")
 
 
