@@ -174,7 +174,7 @@ def test_a_body_from_the_command_line(tmp_path):
         "the path is that of the tool's centre of mass; around it the tool reaches from -22 to"
         in done.stdout
     )
-    assert "the tool never touches soil: its lowest point stays 76.5 mm" in done.stdout + done.stderr
+    assert "the tool never touches soil: its lowest point stays 76.7 mm" in done.stdout + done.stderr
 
 
 def test_a_datasets_warnings_come_once_for_each_kind():
