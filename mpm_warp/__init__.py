@@ -7,6 +7,7 @@ from .discretisation import asymmetry
 from .effects import Effects
 from .limits import substeps_per_frame
 from .material import Material
+from .preview import Preview
 from .scene import Scene
 from .scenes import Body, Column, Excavation, Incline, Wheel
 from .solver import Frame, Solver, frames_together
@@ -26,6 +27,7 @@ __all__ = [
     "Material",
     "MeshBody",
     "Plate",
+    "Preview",
     "Scene",
     "SceneError",
     "Solver",

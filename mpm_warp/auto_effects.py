@@ -12,7 +12,6 @@ import numpy as np
 from .discretisation import asymmetry, require_symmetry
 from .effects import Effects
 from .limits import scene_size
-from .poses import rotation_matrices
 from .scene import Scene
 from .scenes import Column, bagnold_speed
 from .settings import Settings, setting, settings
@@ -64,8 +63,7 @@ def _of_body(scene: Scene) -> Flow | None:
     if body is None:
         return None
     poses = scene.body_poses()
-    heights = rotation_matrices(poses[:, 3:])[:, 2] @ body.outline().T
-    depth = -(poses[:, 2] + heights.min(axis=1))
+    depth = -scene.lowest_points(poses)
     way, angle = scene.displacement(scene.times())
     speed = np.maximum(way, angle * body.reach) * scene.frame_rate
     if scene.axle is None:

@@ -183,4 +183,4 @@ def initial_stress(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         share = vertical * (1.0 - ratio) / (6.0 * material.shear_modulus)
         strain[:, :3] = share[:, None] * np.array([-1.0, -1.0, 2.0])
         strain[:, 4] = density * pull * depth / (2.0 * material.shear_modulus)
-    return ln_j, strain
+    return np.delete(ln_j, scene.displaced), np.delete(strain, scene.displaced, axis=0)

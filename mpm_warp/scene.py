@@ -5,22 +5,29 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
 
-from .bed import Bed
+from .bed import Bed, digest
 from .bodies import Axle, MeshBody, Tool
 from .material import Material
-from .poses import rotate, rotation_vectors, sampled_poses
+from .poses import in_body_frame, in_world_frame, rotation_matrices, rotation_vectors, sampled_poses
 from .settings import Settings, build, setting, settings
 from .state import SceneError
+from .tool_geometry import distances
+from .units import place_unit, size_warning
 
 MOST_FRAMES = 1_000_000
 MOST_COURANT = 0.8
 """Largest `courant`. From 0.86 on a cut's forces come out too small, with nothing else to see
 (experiments/stability/step.csv)."""
+
+_ROUNDING = 1e-9
+"""Lengths that differ by less are the same [m]."""
+_MOST_POSES, _MOST_POINTS = 100_000, 1_000_000
+"""That are looked at for walls in a way, and at a time."""
 
 
 @settings
@@ -105,8 +112,30 @@ class Scene(Settings):
 
     @property
     def filled(self) -> tuple[np.ndarray, float]:
-        """Particle positions (n, 3) [m] and the volume of one [m^3]."""
+        """Particle positions (n, 3) of the bed without a tool [m] and the volume of one [m^3]."""
         return self.bed.filled
+
+    @cached_property
+    def displaced(self) -> np.ndarray:
+        """Indices of the particles of `filled` that are left out, because the body is where they would be at time 0,
+        increasing; nearly always none.
+
+        Particles in the midst of a body would be thrown out. So where the centre of one is inside it, and more than a
+        tenth of a particle spacing beyond where contact begins, all go that contact would push.
+        """
+        body, nobody = self.body, np.zeros(0, dtype=np.int64)
+        if body is None:
+            return nobody
+        pose = self.poses_at(np.zeros(1))[0]
+        if pose[2] - np.abs(rotation_matrices(pose[3:])[2]) @ body.half_size > -1e-9:
+            return nobody  # above the soil
+        points = in_body_frame(pose, self.filled[0])
+        near = np.flatnonzero((np.abs(points) < body.half_size + max(0.0, self.contact_distance)).all(axis=1))
+        if len(near) == 0:
+            return nobody
+        overlap = self.contact_distance - distances(body, points[near], max(0.0, self.contact_distance))
+        deep = max(self.contact_distance, 0.1 * self.bed.particle_spacing)
+        return near[overlap > 0.0] if (overlap > deep).any() else nobody
 
     @property
     def stored(self) -> np.ndarray:
@@ -115,9 +144,14 @@ class Scene(Settings):
         Which one is drawn at random, always the same way: at fixed steps a lattice would be recorded in some of
         its layers only.
         """
-        count, every = len(self.filled[0]), self.bed.store_every
+        count, every = len(self.initial_positions()), self.bed.store_every
         first = np.arange(0, count, every)
         return first + np.random.default_rng(0).integers(np.minimum(every, count - first))
+
+    @property
+    def open_sides(self) -> bool:
+        """Whether nothing is in the way of a body at the sides: walls of a channel stand for more of the same soil."""
+        return self.bed.walls.conditions[1] in ("slip", "periodic")
 
     @property
     def soil_volume(self) -> float:
@@ -126,7 +160,7 @@ class Scene(Settings):
 
     def initial_velocities(self) -> np.ndarray:
         """Soil at time 0 [m/s], shape (n, 3), float64."""
-        return np.zeros_like(self.filled[0])
+        return np.zeros_like(self.initial_positions())
 
     @property
     def body(self) -> Tool | None:
@@ -194,18 +228,36 @@ class Scene(Settings):
         way, angle = self.displacement(time)
         return way + angle * (self.body.reach if self.body is not None else 0.0)
 
+    def passing_times(self) -> np.ndarray:
+        """Times of the frames and between them [s], so close that no point of the body moves more than a grid spacing
+        from one to the next; of a very long way less close."""
+        times = self._with_turns(self.times())
+        way = self.largest_displacement(times)
+        steps = np.maximum(1.0, np.ceil(way / max(self.bed.spacing, way.sum() / _MOST_POSES)))
+        ends = np.concatenate([[0.0], np.cumsum(steps)])
+        return np.interp(np.arange(ends[-1] + 1.0), ends, times)
+
+    def lowest_points(self, poses: np.ndarray) -> np.ndarray:
+        """z of the body's lowest point at poses (T, 7) [m], shape (T,)."""
+        assert self.body is not None
+        outline, up = self.body.outline(), rotation_matrices(poses[:, 3:])[:, 2]
+        parts = np.array_split(up, 1 + len(up) * len(outline) // _MOST_POINTS)
+        return poses[:, 2] + np.concatenate([(part @ outline.T).min(axis=1) for part in parts])
+
     def body_points(self) -> np.ndarray:
         """Body nodes in the body frame [m], shape (M, 3)."""
         return self.body.points() if self.body is not None else np.zeros((0, 3))
 
     def initial_positions(self) -> np.ndarray:
         """Soil at time 0 [m], shape (n, 3), float64."""
-        return self.filled[0]
+        positions = self.filled[0]
+        return np.delete(positions, self.displaced, axis=0) if len(self.displaced) else positions
 
     @property
     def arrangement_hash(self) -> str:
-        """See `Bed.arrangement_hash`."""
-        return self.bed.arrangement_hash
+        """See `Bed.arrangement_hash`; another one where particles are left out."""
+        found = self.bed.arrangement_hash
+        return digest([found, "without", self.displaced.tolist()]) if len(self.displaced) else found
 
     def warnings(self) -> list[str]:
         """What a user should know about this scene before it runs."""
@@ -248,29 +300,37 @@ class Scene(Settings):
     def _check_thickness(self, body: Tool, what: str) -> None:
         """A body must be thick enough for soil to be inside before it is pushed out."""
         if body.half_thickness + self.contact_distance < 0.1 * self.bed.spacing:
+            odd = size_warning(body.outline(), self.bed.size, self.open_sides)
             raise SceneError(
                 f"{what} of {2.0 * body.half_thickness:g} m is too thin for a grid of {self.bed.spacing:g} m: "
-                "soil would pass through; use a smaller bed.spacing (at most half the thickness is good)"
+                f"soil would pass through; {odd or 'use a smaller bed.spacing (at most half the thickness is good)'}"
             )
 
     def _check_inside(self, body: Tool, what: str, remedy: str) -> None:
         """The part of the body that is below the surface must stay within the bin."""
         lx, ly, lz = self.bed.size
-        # Nothing is in the way of a body at the sides of a channel, whose walls stand for more of the same soil.
-        side = math.inf if self.bed.walls.conditions[1] in ("slip", "periodic") else 0.0
-        limits = (("x", 0.0, lx), ("y", -side, ly + side), ("z", -lz, math.inf))
-        outline, times = body.outline(), self._with_turns(self.times())
-        for time, pose in zip(times, self.poses_at(times), strict=True):
-            points = rotate(pose[3:], outline) + pose[:3]
-            below = points[:, 2] < 0.0
-            for (name, low, high), place in zip(limits, points.T, strict=True):
-                outside = below & ((place < low) | (place > high))
-                if outside.any():
-                    allowed = f"{low:g} to {high:g} m" if math.isfinite(high) else f"at least {low:g} m"
-                    raise SceneError(
-                        f"{what} leaves the bin at {time:.3f} s: {name} = {place[outside][0]:.4f} m, "
-                        f"allowed {allowed} below the surface; {remedy}"
-                    )
+        side = math.inf if self.open_sides else 0.0
+        low, high = np.array([0.0, -side, -lz]) - _ROUNDING, np.array([lx, ly + side, math.inf]) + _ROUNDING
+        times = self.passing_times()
+        poses, outline = self.poses_at(times), body.outline()
+        place, around = poses[:, :3], np.abs(rotation_matrices(poses[:, 3:])) @ body.half_size
+        leaving = ((place - around < low) | (place + around > high)).any(axis=1)
+        maybe = np.flatnonzero(leaving & (place[:, 2] < around[:, 2]))
+        for some in np.array_split(maybe, 1 + len(maybe) * len(outline) // _MOST_POINTS):
+            points = in_world_frame(poses[some], outline)
+            outside = ((points < low) | (points > high)) & (points[:, :, 2:] < 0.0)
+            if outside.any():
+                pose = int(np.argmax(outside.any(axis=(1, 2))))
+                axis = int(np.argmax(outside[pose].any(axis=0)))
+                at = points[pose, np.argmax(outside[pose, :, axis]), axis]
+                allowed = (f"0 to {lx:g} m", f"0 to {ly:g} m", f"at least {-lz:g} m")[axis]
+                odd = size_warning(outline, self.bed.size, self.open_sides)
+                if self._path and (unit := place_unit(np.array(self._path)[:, 1:4], self.bed.size)):
+                    odd = f"the path's positions look like {unit} and are taken as metres"
+                raise SceneError(
+                    f"{what} leaves the bin at {times[some[pose]]:.3f} s: {'xyz'[axis]} = {at:.4f} m, "
+                    f"allowed {allowed} below the surface; {odd or remedy}"
+                )
 
 
 Scene.classes["bed"] = Scene

@@ -166,7 +166,7 @@ class Solver:
         def zeros(dtype: Any, count: int) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device)
 
-        positions, volume = scene.filled
+        positions, volume = scene.initial_positions(), scene.filled[1]
         velocities, (ln_j, strain) = scene.initial_velocities(), initial_stress(scene)
         self.grid, layers = lay_grid(scene, real, self.time_step, volume, self._half is not None)
         """The struct of the grid, see kernels/grid.py."""

@@ -5,6 +5,7 @@ from functools import cache
 import warp as wp
 
 from ..bodies import Tool
+from ..launch import SceneKernel
 
 OUT_OF_REACH = 1.0e6  # [m], for points that cannot touch
 
@@ -59,6 +60,19 @@ def signed_distance(real: type, shape: str) -> wp.Function:
     signed distance [m], negative inside. Inside a corner the nearest face counts; inside a grouser's root the
     distance is a lower bound."""
     return {"box": _box, "cylinder": _cylinder, "mesh": _mesh}[shape](real)
+
+
+@cache
+def distance_kernel(shape: str) -> SceneKernel:
+    """Kernel that finds the signed distances of points in the body frame, in double precision."""
+    real = wp.float64
+    vec3, Size, outward = wp.types.vector(3, real), shape_struct(real), signed_distance(real, shape)
+
+    @SceneKernel
+    def distance(i: int, points: wp.array(dtype=vec3), size: Size, found: wp.array(dtype=real)):
+        found[i] = outward(points[i], size)[3]
+
+    return distance
 
 
 @cache

@@ -141,6 +141,11 @@ def finite_frames(rollout: Rollout) -> int:
 def require_known_bed(simulator: Simulator, scene: Scene, checkpoint: str | Path) -> None:
     """Refuses a scene whose particles are not the ones the checkpoint's basis was fitted on."""
     if scene.arrangement_hash != simulator.arrangement_hash:
+        if len(scene.displaced):
+            raise UserError(
+                f"the tool is in the soil at the start, where {len(scene.displaced)} particles are left out; "
+                f"{checkpoint} knows other particles: let the path begin above the soil"
+            )
         raise UserError(
             f"this scene's bed is not the one that {checkpoint} knows: "
             f"{bed_differences(simulator.scene, scene.to_dict())}; set the scene's bed to the "

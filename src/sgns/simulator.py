@@ -231,7 +231,7 @@ class Simulator:
             if scene.arrangement_hash != self.arrangement_hash:
                 raise UserError(
                     f"the scene's particles ({scene.arrangement_hash}) are not those of the checkpoint "
-                    f"({self.arrangement_hash}); use the bed of simulator.scene"
+                    f"({self.arrangement_hash}); use the bed of simulator.scene and begin above the soil"
                 )
             points, pose, values = scene.body_points(), first_pose(scene.body_poses()), scene.to_dict()
         elif scene is not None:

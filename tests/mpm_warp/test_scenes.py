@@ -164,6 +164,22 @@ def test_a_path_that_leaves_the_bin_between_frames():
     sampled(*((t + 0.5, 0.24, z) for t, z in heights))  # the scene ends before
 
 
+def test_a_path_that_passes_through_a_wall_between_two_rows():
+    """At both rows all that is below the surface is within the bin; half-way a corner has come through the wall."""
+    path = ((0.0, -0.1, 0.2, 0.032, 0, 0, 0, 1), (0.01, 0.3, 0.2, 0.0, 0, 0, 0, 1))
+    with pytest.raises(
+        SceneError, match=r"the body leaves the bin at 0\.00\d s: x = -0\.\d+ m, allowed 0 to"
+    ):
+        Body(bed=cut().bed, tool=Box(size=(0.1, 0.1, 0.06)), path=path, duration=0.1)
+    # A turn by half a circle: at its ends the box is along y, half-way it sticks out along x.
+    turn = tuple(
+        (t, 0.06, 0.2, 0.0, *Rotation.from_euler("z", a, degrees=True).as_quat())
+        for t, a in ((0, 0), (0.01, 179))
+    )
+    with pytest.raises(SceneError, match=r"the body leaves the bin at 0\.00\d s: x = -0\.0"):
+        Body(bed=cut().bed, tool=Box(size=(0.06, 0.2, 0.06)), path=turn, duration=0.1)
+
+
 # --- The wheel: its motion, its load, and what the soil does to it --------------------------------------
 
 
@@ -253,7 +269,7 @@ def test_momentum_goes_from_the_wheel_to_the_soil():
     """A wheel falls on a free block: both lose to gravity only, and one gains what the other loses."""
     bed = replace(block().bed, low=(0.1, 0.1, -0.1), high=(0.2, 0.2, 0.0))
     times = {"settle": 0.02, "duration": 0.04, "frame_rate": 100.0}
-    scene = wheel(bed=bed, load=5.0, damping=0.0, start=0.5, slip=0.9, clearance=-0.012, **times)
+    scene = wheel(bed=bed, load=5.0, damping=0.0, start=0.5, slip=0.9, clearance=-0.004, **times)
     solver = Solver(scene, precision="float64")
     frames = list(solver.frames())
     time = scene.duration

@@ -88,11 +88,11 @@ def test_bed_in_balance_stays_still(initial_stress):
 
 
 def diagonal_path(dy: float, shift: float = 0.0, spin: float = 0.0):
-    """A plate that starts in the soil and moves along x and y."""
+    """A plate that starts in the soil, close to the particles in front, and moves along x and y."""
     rows = []
     for t in (0.0, 0.02):
         angle = 0.5 * spin * t
-        rows.append([t, 0.2 + 0.3 * t + shift, 0.2 + dy * t, 0.04, 0, 0, math.sin(angle), math.cos(angle)])
+        rows.append([t, 0.2028 + 0.3 * t + shift, 0.2 + dy * t, 0.04, 0, 0, math.sin(angle), math.cos(angle)])
     return tuple(tuple(r) for r in rows)
 
 

@@ -28,6 +28,7 @@ class FakeScene:
 
     frame_rate = 60.0
     mesh = None
+    displaced = ()
 
     def __init__(self, simulator, arrangement_hash=None, bed=None):
         self.poses = simulator.known[0][0]
@@ -82,6 +83,15 @@ def test_unknown_bed_is_refused_in_one_line_that_names_it(simulator):
         require_known_bed(simulator, FakeScene(simulator, "other", bed), "best.ckpt")
     # Equal beds still differ in something.
     assert "arrangement" in bed_differences({"bed": {"spacing": 1}}, {"bed": {"spacing": 1}})
+
+
+def test_a_tool_that_starts_in_the_soil_is_refused(simulator):
+    scene = FakeScene(simulator, "other")
+    scene.displaced = (3, 4)
+    with pytest.raises(
+        UserError, match=r"in the soil at the start, where 2 particles .*begin above the soil"
+    ):
+        require_known_bed(simulator, scene, "best.ckpt")
 
 
 def test_other_frame_rate_is_refused(simulator):

@@ -62,7 +62,7 @@ def run_cost(scene: Scene) -> RunCost:
         SceneError: it is too large to be computed.
     """
     substeps = substeps_per_frame(scene)  # before its particles are made
-    particles, stored = len(scene.filled[0]), len(scene.stored)
+    particles, stored = len(scene.initial_positions()), len(scene.stored)
     per_frame = (
         stored * _BYTES_PER_PARTICLE + len(scene.body_points()) * _BYTES_PER_BODY_POINT + _BYTES_PER_FRAME
     )

@@ -12,14 +12,22 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from mpm_warp import Scene
+from mpm_warp import Preview, Scene
 from sgns.config import UserError
 from sgns.data.files import only_here
 from sgns.data.run import Run
 from sgns.data.writer import require_run_place
 from sgns.simulate.campaign import plan, require_space, run_cost
 from sgns.simulate.run import restart_from, simulate_scene
-from sgns.simulate.scene import asked_effects, decided, decision_line, plain, recorded, scene_from_config
+from sgns.simulate.scene import (
+    asked_effects,
+    decided,
+    decision_line,
+    plain,
+    recorded,
+    scene_from_config,
+    warning_summary,
+)
 from sgns.simulate.workers import simulate_campaign
 
 log = logging.getLogger(__name__)
@@ -60,13 +68,18 @@ def main(cfg: DictConfig) -> float | None:
                 "dataset.where picks among runs that are there; to simulate fewer change dataset.draw"
             )
         campaign = plan(settings, base_scene(settings), asked, cfg.solver.precision, cfg.seed)
+        for line in warning_summary(campaign.scenes):
+            log.warning("%s", line)
         batch = 1 if cfg.device == "cpu" else cfg.solver.batch
         simulate_campaign(campaign, device=cfg.device, batch=batch, shard=cfg.shard, shards=cfg.shards)
         return None
     if (cfg.shard, cfg.shards) != (0, 1):
         raise UserError("shard and shards divide the runs of a dataset; give dataset=... or leave them out")
     scene = scene_from_config(cfg)
-    for warning in scene.warnings():
+    preview = Preview.of(scene)
+    for line in preview.lines:
+        log.info("%s", line)
+    for warning in preview.warnings:
         log.warning("%s", warning)
     effects, decisions = decided(scene, asked)
     for name, decision in decisions.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import csv
 import io
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from mpm_warp import Decision, Effects, Scene, Tolerances, effects_for
+from mpm_warp import Decision, Effects, Preview, Scene, Tolerances, effects_for
 from mpm_warp.inputs import read_text
 from sgns.config import UserError, flattened
 
@@ -73,6 +74,22 @@ def read_path(file: Path) -> list[list[float]]:
     except ValueError:
         raise UserError(f"scene.path: line {number} of {file} holds something that is not a number") from None
     return values
+
+
+def warning_summary(scenes: Mapping[str, Scene]) -> list[str]:
+    """What a user should know about the runs of a dataset before they are made, by name: one line for each kind of
+    warning, with how often it comes and the words of the first."""
+    found: dict[str, list[str]] = {}
+    for name, scene in scenes.items():
+        for words in Preview.of(scene).warnings:
+            found.setdefault(re.sub(r"[\d.e+-]*\d", "", words), []).append(f"{name}: {words}")
+    lines = [f"{len(every)} of {len(scenes)} runs, such as {every[0]}" for every in found.values()]
+    if len({scene.arrangement_hash for scene in scenes.values()}) > 1:
+        lines.append(
+            "the runs do not start from the same particles, and `sgns reduce` takes one bed: let all tools begin above "
+            "the soil, or at one place in it, and draw no keys of scene.bed"
+        )
+    return lines
 
 
 # --- From the group `effects` of the settings to the physics of one scene -------------------------------

@@ -71,6 +71,7 @@ def test_a_preset_differs_from_its_kind_in_what_it_states(name: str) -> None:
     changes = stated("scene", name, scene.kind)
     expected = OmegaConf.merge(type(scene)().to_dict(), changes, {"bed": {"seed": 0}})
     assert scene == Scene.from_dict(OmegaConf.to_container(expected))
+    assert len(scene.displaced) == 0  # no tool of ours starts in the soil
 
 
 @pytest.mark.parametrize("name", SOILS)

@@ -8,14 +8,14 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from mpm_warp import Decision, Effects, SceneError, Tolerances, Wheel
+from mpm_warp import Decision, Effects, Scene, SceneError, Tolerances, Wheel
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run
 from sgns.rollout import require_same_freedom
 from sgns.simulate.campaign import plan
 from sgns.simulate.command import simulate_campaign
-from sgns.simulate.scene import asked_effects, decided, scene_from_config
+from sgns.simulate.scene import asked_effects, decided, scene_from_config, warning_summary
 from sgns_testing.commands import composed, sgns
 
 # --- Effects --------------------------------------------------------------------------------------------
@@ -169,3 +169,28 @@ def test_a_body_from_the_command_line(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "mean force" in done.stdout
     assert Run(tmp_path / "run.h5").body_points.shape[1] == 4
+    # Where the origin came to lie in the tool, and that nothing will happen.
+    assert (
+        "the path is that of the tool's centre of mass; around it the tool reaches from -22 to"
+        in done.stdout
+    )
+    assert "the tool never touches soil: its lowest point stays 76.7 mm" in done.stdout + done.stderr
+
+
+def test_a_datasets_warnings_come_once_for_each_kind():
+    q = (0, 0, 0, 1)
+    rows = [[(0.0, 0.2, 0.2, z, *q), (1.0, 0.25, 0.2, z, *q)] for z in (0.3, 0.2, 0.03)]
+    base = {"kind": "body", "bed": {"size": [0.48, 0.4, 0.16], "spacing": 0.04}, "duration": 0.1}
+    base["tool"] = {"shape": "box", "size": [0.1, 0.1, 0.08]}
+    scenes = {f"run{number}": Scene.from_dict(base | {"path": path}) for number, path in enumerate(rows)}
+    (line,) = warning_summary(scenes)
+    assert line.startswith(
+        "2 of 3 runs, such as run0: the tool never touches soil: its lowest point stays 260 mm"
+    )
+    assert warning_summary({"run2": scenes["run2"]}) == []
+    # Tools that start at different places in the soil: no basis holds both.
+    scenes["deep"] = Scene.from_dict(base | {"path": [(t, 0.2, 0.2, -0.04, *q) for t in (0.0, 1.0)]})
+    _, still, buried, mixed = warning_summary(scenes)
+    assert still.startswith("1 of 4 runs, such as deep: the tool does not move")
+    assert buried.startswith("1 of 4 runs, such as deep: the tool is in the soil at the start")
+    assert mixed.startswith("the runs do not start from the same particles")

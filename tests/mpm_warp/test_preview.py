@@ -1,0 +1,110 @@
+"""What is known of a scene before it runs: where its tool is and gets to, units, and what would come to nothing."""
+
+import re
+
+import numpy as np
+import pytest
+
+from mpm_warp import Bed, Body, Box, Column, Excavation, MeshBody, Preview, SceneError, Walls, Wheel
+from sgns_testing.meshes import box_corners, box_triangles
+from sgns_testing.scenes import cut
+
+BED = Bed(size=(0.8, 0.6, 0.15), spacing=0.02)
+ROWS = np.array([(0.0, 0.2, 0.3, 0.12), (0.5, 0.2, 0.3, 0.03), (2.0, 0.5, 0.3, 0.03)])
+"""t [s], x, y, z [m]: half a second down, then forward."""
+
+
+def body(rows=ROWS, **kw) -> Body:
+    path = tuple((*row, 0, 0, 0, 1) for row in np.asarray(rows, dtype=float).tolist())
+    return Body(**({"bed": BED, "tool": Box(size=(0.08, 0.2, 0.1)), "path": path} | kw))
+
+
+def mesh(scale: float) -> MeshBody:
+    size = scale * np.array((0.05, 0.2, 0.1))
+    return MeshBody.of_mesh(box_corners(size, -0.5 * size), box_triangles())
+
+
+def test_where_a_tool_is_and_gets_to():
+    """The box's lowest point is 5 cm below its centre, which falls by 18 cm a second."""
+    found = Preview.of(body())
+    assert found.lowest == pytest.approx(-0.02)
+    assert found.lowest_at == pytest.approx(0.5)
+    assert found.first_touch == pytest.approx(0.07 / 0.18, abs=0.02)
+    np.testing.assert_allclose(found.reach, [[-0.04, -0.1, -0.05], [0.04, 0.1, 0.05]])
+    assert found.displaced == 0 and found.warnings == ()
+    origin, way = found.lines
+    assert "from -40 to 40 mm along x, -100 to 100 mm along y, -50 to 50 mm along z" in origin
+    assert way == "its lowest point gets 20 mm deep (at 0.50 s); it first touches soil at 0.40 s"
+
+
+def test_scenes_that_come_to_something_say_no_more_than_before():
+    for scene in (cut(), Excavation(), Wheel(), Column(), body(tool=mesh(1.0))):
+        assert list(Preview.of(scene).warnings) == scene.warnings()
+    assert Preview.of(Column()).lowest is None
+    assert Preview.of(Wheel()).lines == ()  # its height is free
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (ROWS * [1, 1000, 1000, 1000], "never touches soil: .* stays 29.9 m above .* look like millimetres"),
+        (ROWS * [1, 100, 100, 100], "never touches soil: .* look like centimetres"),
+        (ROWS * [1000, 1, 1, 1], r"times are 0 to 2000, .* 0\.1 % is used; they look like milliseconds"),
+        (np.add(ROWS, [1.7e9, 0, 0, 0]), "look like those of a clock; subtract the first"),
+        (np.add(ROWS, [1.7e12, 0, 0, 0]), "look like those of a clock; subtract the first"),
+        (np.add(ROWS, [5, 0, 0, 0]), "times are 5 to 7, the run's 0 to 2 s: the tool does not move"),
+        (ROWS * [1000, 1, 1, 1] + [3000, 0, 0, 0], "the tool does not move; they look like milliseconds"),
+        (ROWS / [60, 1, 1, 1], "rests for nearly all of it; are the times in seconds"),
+        (np.add(ROWS, [0, 0, 0, 0.2]), "never touches soil: its lowest point stays 180 mm above the surface; z = 0 is"),
+        (ROWS[:, [0, 1, 3, 2]], "never touches soil: its lowest point stays 250 mm above"),
+        (ROWS[[0, 0, 0]] * [0, 1, 1, 1] + [[t, 0, 0, 0] for t in (0, 1, 2)], "the tool does not move"),
+    ],
+)  # fmt: skip
+def test_one_line_names_what_comes_to_nothing(rows, words):
+    (found,) = Preview.of(body(rows)).warnings
+    assert re.search(words, found), found
+
+
+def test_a_tool_that_starts_in_the_soil_is_told():
+    scene = body(ROWS[1:] - [0.5, 0, 0, 0.05])
+    (found,) = Preview.of(scene).warnings
+    assert f"in the soil at the start, 70 mm deep: {len(scene.displaced)} particles" in found
+    assert Preview.of(scene).lines[1].endswith("it is in the soil from the start")
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [
+        (0.001, "0.0002 m long, less than 1/50 of the bin .* a thousand times too small"),
+        (8.0, "1.6 m long, longer"),
+    ],
+)
+def test_the_size_of_a_tool_is_looked_at(scale, words):
+    found = Preview.of(body(np.add(ROWS, [0, 0, 0, 0.5]), tool=mesh(scale))).warnings
+    assert any(re.search(words, line) for line in found), found
+
+
+def test_a_channel_may_be_narrower_than_the_tool():
+    narrow = Bed(size=(0.8, 0.08, 0.15), spacing=0.02, walls=Walls(y="periodic"))
+    assert (
+        Preview.of(body(ROWS - [0, 0, 0.26, 0], bed=narrow, tool=Box(size=(0.08, 1.0, 0.1)))).warnings == ()
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (
+            lambda: body(ROWS * [1, 1000, 1000, 1000] - [0, 0, 0, 100]),
+            "leaves the bin .* look like millimetres",
+        ),
+        (lambda: body(tool=mesh(1000.0)), "leaves the bin .* 200 m long, .* look like millimetres"),
+        (
+            lambda: body(tool=mesh(0.001), bed=Bed(particles_per_cell=8.0)),
+            "too thin .* thousand times too small",
+        ),
+    ],
+)
+def test_what_is_refused_for_its_unit_names_it(make, words):
+    with pytest.raises(SceneError, match=words):
+        make()
