@@ -12,6 +12,7 @@ import errno
 import importlib
 import logging
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 from sgns import __version__
 from sgns.cli.help import open_closed_streams, write_error, write_output
 from sgns.config import UserError
+from sgns.interrupts import Interrupted, heeded_signals
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -94,7 +96,8 @@ class _Stopped(BaseException):
 def main() -> int:
     """Run the command named in `sys.argv`; returns the exit status."""
     open_closed_streams()
-    status = _run(sys.argv[1:])
+    with heeded_signals():
+        status = _run(sys.argv[1:])
     try:
         write_output("")  # what is still in the stream's buffer
     except UserError as error:
@@ -127,9 +130,9 @@ def _run(arguments: list[str]) -> int:
         line, status = stop.args
         write_error(f"{name}: {line}")
         return status
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         write_error(f"{name}: interrupted")
-        return 130
+        return _status(stop)
     except Exception as error:
         if (line := _line_of(error)) is None:
             raise
@@ -153,9 +156,11 @@ def run_command(cfg: DictConfig) -> float | None:
         _place_output(cfg, hydra_cfg, COMMANDS[name], in_sweep)
         check_shared(cfg, name, COMMANDS[name].needs)
         return importlib.import_module(COMMANDS[name].module).main(cfg)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         kept = _drop_empty_output(hydra_cfg)
-        raise _Stopped(label + _interruption(cfg, name, kept), 130) from None
+        said = stop.said if isinstance(stop, Interrupted) else ""
+        said = said or _interruption(cfg, name, kept)
+        raise _Stopped(f"{label}interrupted; {said}", _status(stop)) from None
     except Exception as error:
         if (line := _line_of(error)) is None:
             raise
@@ -328,8 +333,15 @@ def _drop_empty_output(hydra_cfg: Any) -> bool:
 
 def _interruption(cfg: DictConfig, name: str, kept: bool) -> str:
     if COMMANDS[name].output == "folder" and kept:
-        return f"interrupted; to go on, give the same command with output={cfg.output}"
-    return "interrupted; what is complete is kept, and the same command goes on from there"
+        return f"to go on, give the same command with output={cfg.output}"
+    if COMMANDS[name].output == "folder" or cfg.get("dataset") is not None:
+        return "what is complete is kept, and the same command goes on from there"
+    return "nothing new is kept"
+
+
+def _status(stop: KeyboardInterrupt) -> int:
+    """As a shell gives of a process that a signal ended."""
+    return 128 + (stop.number if isinstance(stop, Interrupted) else signal.SIGINT)
 
 
 def _line_of(error: Exception) -> str | None:

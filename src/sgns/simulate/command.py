@@ -9,6 +9,7 @@ from typing import Any
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 from tqdm import tqdm
 
@@ -16,9 +17,10 @@ from mpm_warp import Preview, Scene
 from sgns.config import UserError
 from sgns.data.files import only_here
 from sgns.data.run import Run
-from sgns.data.writer import require_run_place
+from sgns.data.writer import require_run_place, stopped_path
+from sgns.interrupts import Interrupted
 from sgns.simulate.campaign import plan, require_space, run_cost
-from sgns.simulate.run import restart_from, simulate_scene
+from sgns.simulate.run import Restart, restart_from, simulate_scene, unfinished
 from sgns.simulate.scene import (
     asked_effects,
     decided,
@@ -88,14 +90,33 @@ def main(cfg: DictConfig) -> float | None:
     return simulate_one(scene, cfg, effects=effects, reasons=reasons, seed=cfg.seed, precision=precision)
 
 
-def simulate_one(scene: Scene, cfg: DictConfig, **settings: Any) -> float:
+def _way_on(cfg: DictConfig) -> str:
+    """How to go on with an interrupted run."""
+    if cfg.continue_from is None and HydraConfig.get().mode == RunMode.RUN:
+        return "the same command goes on from there"
+    kept = stopped_path(Path(cfg.output))
+    return f"sgns simulate continue_from={kept} output={cfg.output} goes on from there"
+
+
+def simulate_one(scene: Scene, cfg: DictConfig, restart: Restart | None = None, **settings: Any) -> float:
     """Simulate a scene into `cfg.output` with a bar and a few words about it; see `scene_stages`."""
     output = Path(cfg.output)
     with only_here(output):
         require_run_place(output)
+        if restart is None:
+            same = {name: settings[name] for name in ("effects", "seed", "precision")}
+            restart = unfinished(output, scene, **same)
+        if restart is not None:
+            log.info("going on from frame %d of %s", restart.state.frame, restart.path)
         require_space(output.parent, run_cost(scene).size)
-        with tqdm(total=scene.frame_count, unit="frame", desc=scene.name, disable=None) as bar:
-            timing = simulate_scene(scene, output, device=cfg.device, progress=bar.update, **settings)
+        settings |= {"device": cfg.device, "restart": restart}
+        try:
+            with tqdm(total=scene.frame_count, unit="frame", desc=scene.name, disable=None) as bar:
+                timing = simulate_scene(scene, output, progress=bar.update, **settings)
+        except Interrupted as stop:
+            if stop.said:
+                stop.said += f"; {_way_on(cfg)}"
+            raise
     with Run(output) as run:
         every = scene.bed.store_every
         kept = f" (one of every {every} recorded)" if every > 1 else ""

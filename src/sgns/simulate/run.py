@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ from omegaconf import DictConfig, OmegaConf
 from mpm_warp import Effects, Scene, Solver, SolverStopped, State
 from mpm_warp.launch import Job
 from mpm_warp.solver import run_concurrently
-from sgns.config import UserError
+from sgns.config import UserError, differences
 from sgns.data.run import Run
-from sgns.data.writer import RunWriter
+from sgns.data.writer import RunWriter, stopped_path
+from sgns.interrupts import Interrupted, heed, held_back
 from sgns.numbers import elapsed
 from sgns.simulate.scene import replaced
 
@@ -83,11 +85,69 @@ def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
     """
     path = Path(str(cfg.continue_from))
     asked = _changes(cfg, overrides)
+    restart = _read_stopped(path)
+    if any(o.lstrip("+").startswith(f"{_FILE}=") for o in overrides):
+        raise UserError(f"{path} brings its own tool; leave out {_FILE}")
+    changes = restart.changes | asked
+    if restart.effects.nonlocality and "bed.headroom" in changes:
+        raise UserError(
+            "with effects.nonlocality the grid keeps what flows, so scene.bed.headroom cannot change half-way; "
+            "simulate the scene anew"
+        )
+    new_precision = any(o.startswith("solver.precision=") for o in overrides)
+    precision = cfg.solver.precision if new_precision else restart.precision
+    return replace(restart, changes=changes, precision=precision)
+
+
+def unfinished(output: Path, scene: Scene, effects: Effects, seed: int, precision: str) -> Restart | None:
+    """What an interrupted attempt at the same run left beside `output`, to go on from; None if there is nothing.
+
+    Raises:
+        UserError: it is of other settings, named by key, or damaged.
+    """
+    path = stopped_path(output)
+    if not path.exists():
+        return None
+    anew = f"remove {path} to begin anew, or choose another output"
+    try:
+        there = _read_stopped(path)
+    except UserError as error:
+        raise UserError(f"{error}; {anew}") from error
+    asked = _as_keys(scene, effects, seed, precision)
+    found = _as_keys(there.changed_scene, there.effects, there.seed, there.precision)
+    if different := differences(found, asked):
+        named = [
+            f"{key} is {_shown(old)} there and {_shown(new)} here" for key, (old, new) in different.items()
+        ]
+        more = f" and {len(named) - 3} more" if len(named) > 3 else ""
+        raise UserError(
+            f"{path} is an unfinished run of other settings: {', '.join(named[:3])}{more}; {anew}"
+        )
+    return there
+
+
+def _as_keys(scene: Scene, effects: Effects, seed: int, precision: str) -> dict[str, Any]:
+    """As on the command line."""
+    data = scene.to_dict()
+    groups = {
+        "material": data.pop("material"),
+        "effects": asdict(effects),
+        "solver": {"precision": precision},
+    }
+    return {"scene": data, **groups, "seed": seed}
+
+
+def _shown(value: Any) -> str:
+    """A value in a line about many."""
+    text = repr(value)
+    return text if len(text) < 60 else f"{text[:50]}..."
+
+
+def _read_stopped(path: Path) -> Restart:
+    """A stopped run as it is."""
     with Run(path) as run:
         if run.stopped is None:
             raise UserError(f"continue_from: {path} is a whole run; there is nothing to go on with")
-        if any(o.lstrip("+").startswith(f"{_FILE}=") for o in overrides):
-            raise UserError(f"{path} brings its own tool; leave out {_FILE}")
         scene, mesh, state = run.scene, run.mesh, run.state
     if mesh is None and isinstance(tool := scene.get("tool"), dict) and tool.get("shape") == "mesh":
         raise UserError(f"{path} does not hold the mesh of its tool; repeat the run")
@@ -96,18 +156,19 @@ def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
             f"{path} holds {run.frame_count} frames but the state of frame {state.frame}; repeat the run"
         )
     reasons, extra = run.effects, run.extra
-    effects, earlier = _effects(reasons, path), _earlier(extra, path)
-    changes = {key: value for one in earlier for key, value in one["changed"].items()} | asked
-    if effects.nonlocality and "bed.headroom" in changes:
-        raise UserError(
-            "with effects.nonlocality the grid keeps what flows, so scene.bed.headroom cannot change half-way; "
-            "simulate the scene anew"
-        )
-    precision = cfg.solver.precision
-    if not any(o.startswith("solver.precision=") for o in overrides):
-        precision = str(extra.get("precision", precision))
-    whole, took = Scene.from_dict(scene, mesh), run.wall_time_s
-    return Restart(path, whole, changes, effects, reasons, precision, run.seed, state, took, earlier)
+    earlier = _earlier(extra, path)
+    return Restart(
+        path=path,
+        scene=Scene.from_dict(scene, mesh),
+        changes={key: value for one in earlier for key, value in one["changed"].items()},
+        effects=_effects(reasons, path),
+        reasons=reasons,
+        precision=str(extra.get("precision", "float32")),
+        seed=run.seed,
+        state=state,
+        wall_time=run.wall_time_s,
+        earlier=earlier,
+    )
 
 
 def _effects(reasons: Mapping[str, Any], path: Path) -> Effects:
@@ -199,6 +260,8 @@ def scene_stages(
 
     Raises:
         SolverStopped: the line says where the frames before it are kept and how to go on.
+        Interrupted: a signal was heeded (`sgns.interrupts`), or the generator is closed early; the line says where the
+            frames are kept.
     """
     computed, state, before = scene, None, 0.0
     if restart is not None:
@@ -212,29 +275,36 @@ def scene_stages(
         "substeps_per_frame": solver.substeps_per_frame,
         "particles_simulated": solver.particle_count,
     }
-    with RunWriter(
-        output,
-        scene=scene.to_dict(),
-        effects=reasons or effects.described(),
-        arrangement_hash=scene.arrangement_hash,
-        particle_count=len(stored),
-        body_points=len(scene.body_points()),
-        frame_rate=scene.frame_rate,
-        seed=seed,
-        producer="mpm",
-        extra=made_with | ({"continued": restart.record} if restart is not None else {}),
-        mesh=scene.mesh,
-    ) as writer:
+    with (
+        RunWriter(
+            output,
+            scene=scene.to_dict(),
+            effects=reasons or effects.described(),
+            arrangement_hash=scene.arrangement_hash,
+            particle_count=len(stored),
+            body_points=len(scene.body_points()),
+            frame_rate=scene.frame_rate,
+            seed=seed,
+            producer="mpm",
+            extra=made_with | ({"continued": restart.record} if restart is not None else {}),
+            mesh=scene.mesh,
+        ) as writer,
+        ExitStack() as to_the_end,
+    ):
         for frame in restart.frames() if restart is not None else ():
             writer.append(*frame)
             progress()
         there = writer.frame_count
         # Loading kernels is not part of the cost of a run: the clock starts with the first frame, or with the first
         # work where the first frames are there already.
-        clock = _Clock(before)
+        clock, holding = _Clock(before), False
         try:
             for stage in solver.stages():
                 if isinstance(stage, Job):
+                    if stage.steps and not holding:
+                        to_the_end.enter_context(held_back())  # from here on there are frames to keep
+                        holding = True
+                    heed()
                     if there and stage.steps:
                         clock.start()
                     yield stage
@@ -246,6 +316,15 @@ def scene_stages(
                     stage.time, *soil, stage.body_points, stage.body_pose, stage.force, stage.torque
                 )
                 progress()
+        except (Interrupted, GeneratorExit) as ending:  # both where a frame is whole
+            if writer.frame_count <= max(there, 1):
+                raise
+            cause = ending.cause if isinstance(ending, Interrupted) else "its process ended"
+            kept = writer.stop(clock.seconds, cause, solver.state())
+            if isinstance(ending, GeneratorExit):
+                raise
+            words = f"{writer.frame_count} of {scene.frame_count} frames are kept in {kept}"
+            raise Interrupted(ending.number, words) from None
         except SolverStopped as stopped:
             if stopped.state is None or stopped.state.frame != writer.frame_count - 1:
                 raise

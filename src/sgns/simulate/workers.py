@@ -12,7 +12,7 @@ import time
 from collections.abc import Generator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from mpm_warp.solver import run_concurrently
 from sgns.config import UserError, flattened
 from sgns.data.files import file_lock, remove_abandoned
 from sgns.data.run import Run
+from sgns.interrupts import Interrupted, heeded_signals
 from sgns.numbers import elapsed
 from sgns.simulate.campaign import (
     Campaign,
@@ -36,13 +37,14 @@ from sgns.simulate.campaign import (
     run_cost,
     size_words,
 )
-from sgns.simulate.run import scene_stages
+from sgns.simulate.run import Restart, scene_stages, unfinished
 from sgns.simulate.scene import decision_summary, recorded
 
 log = logging.getLogger(__name__)
 
 _MEASURED = 0.3  # seconds of simulating, at least, that the first estimate rests on
 _MEMORY = 600.0  # seconds after which what was seen of the speed counts 1/e
+_FAREWELL = 30.0  # seconds that a worker has to keep what it has of its runs
 _LOG_EVERY = 60.0  # seconds between lines about the progress where there is no terminal for a bar
 
 
@@ -159,9 +161,11 @@ class Workers:
             file = campaign.file(name)
             self._jobs.append(_Job(name, number, scene.to_dict(), scene.mesh, file, physics))
         context = multiprocessing.get_context("spawn")
-        # Frames done of every run, and whether it has ended; each entry has one writer, so there is no lock.
-        self._frames_done, self._ended = context.RawArray("q", len(costs)), context.RawArray("b", len(costs))
-        shared = (self._frames_done, self._ended, context.Barrier(workers))
+        # Of every run: frames done, those of them that an attempt before had made, and whether it has ended. Each entry
+        # has one writer, so there is no lock.
+        self._frames_done, self._frames_found = (context.RawArray("q", len(costs)) for _ in range(2))
+        self._ended = context.RawArray("b", len(costs))
+        shared = (self._frames_done, self._frames_found, self._ended, context.Barrier(workers))
         self._pool = ProcessPoolExecutor(workers, context, _start_worker, shared)
         self._futures: dict[str, Future[dict[str, tuple[str, str]]]] = {}
         # What the estimates rest on: particle-steps made, and the seconds that they took, of each run for itself.
@@ -186,9 +190,12 @@ class Workers:
                     f"{self.campaign.path}; the same command goes on"
                 ) from None
             except BaseException:
+                workers = multiprocessing.active_children()
                 self._pool.shutdown(wait=False, cancel_futures=True)
-                for process in multiprocessing.active_children():
+                for process in workers:
                     process.terminate()
+                for process in workers:  # what they keep is there when the command has ended
+                    process.join(_FAREWELL)
                 raise
         if elsewhere := sum(outcome == "elsewhere" for outcome, _ in outcomes.values()):
             log.info("runs left to another process that is making them or has made them: %d", elsewhere)
@@ -232,9 +239,9 @@ class Workers:
         self._seconds_seen = kept * self._seconds_seen + seconds * busy
 
     def steps_made(self) -> int:
-        """Particle-steps in all frames so far; a run's first frame takes none."""
-        counts = zip(self._frames_done, self.costs.values(), strict=True)
-        return sum(max(0, frames - 1) * cost.steps_per_frame for frames, cost in counts)
+        """Particle-steps in all frames made here so far; a run's first frame takes none."""
+        counts = zip(self._frames_done, self._frames_found, self.costs.values(), strict=True)
+        return sum(max(0, frames - max(1, found)) * cost.steps_per_frame for frames, found, cost in counts)
 
     def _rest(self) -> dict[str, int]:
         """Particle-steps that are left of every run that is not finished."""
@@ -259,14 +266,15 @@ class Workers:
 
 # --- in the worker processes ------------------------------------------------------------------------------
 
-_frames_done: Any = None  # shared with the first process and set once, like the other two
+_frames_done: Any = None  # shared with the first process and set once, like the other three
+_frames_found: Any = None
 _ended: Any = None
 _barrier: Any = None
 
 
-def _start_worker(frames_done: Any, ended: Any, barrier: Any) -> None:
-    global _frames_done, _ended, _barrier
-    _frames_done, _ended, _barrier = frames_done, ended, barrier
+def _start_worker(frames_done: Any, frames_found: Any, ended: Any, barrier: Any) -> None:
+    global _frames_done, _frames_found, _ended, _barrier
+    _frames_done, _frames_found, _ended, _barrier = frames_done, frames_found, ended, barrier
     # Ctrl-C reaches all processes of the terminal; the first one ends the others.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     first = multiprocessing.parent_process()
@@ -274,6 +282,8 @@ def _start_worker(frames_done: Any, ended: Any, barrier: Any) -> None:
 
     def leave_with_parent() -> None:
         first.join()  # else a worker would go on alone after its parent was killed
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(_FAREWELL)
         os._exit(1)
 
     threading.Thread(target=leave_with_parent, daemon=True).start()
@@ -299,9 +309,13 @@ def time_jobs(jobs: list[_Job]) -> tuple[list[int], float]:
 def _make_share(jobs: list[_Job], batch: int) -> dict[str, tuple[str, str]]:
     """Make the runs, `batch` at once; gives what `_make` says of each."""
     outcomes = {}
-    for number, outcome in run_concurrently(map(_make, jobs), batch, jobs[0].physics["device"]):
-        outcomes[jobs[number].name] = outcome
-        _ended[jobs[number].number] = True
+    try:
+        with heeded_signals():
+            for number, outcome in run_concurrently(map(_make, jobs), batch, jobs[0].physics["device"]):
+                outcomes[jobs[number].name] = outcome
+                _ended[jobs[number].number] = True
+    except Interrupted:
+        os._exit(1)  # the pool would take it for the end of this share only
     return outcomes
 
 
@@ -319,12 +333,27 @@ def _make(job: _Job) -> Generator[tuple[str, str] | Job, None, None]:
             if not ours or is_done(job.file, scene):
                 outcome = "elsewhere", ""
             else:
-                for stage in scene_stages(scene, job.file, **job.physics, progress=count_frame):
-                    if isinstance(stage, Job):
-                        yield stage
+                restart = _begun(job, scene)
+                if restart is not None:
+                    _frames_found[job.number] = restart.state.frame + 1
+                stages = scene_stages(scene, job.file, **job.physics, progress=count_frame, restart=restart)
+                with closing(stages):  # what it keeps is written while the file is locked
+                    for stage in stages:
+                        if isinstance(stage, Job):
+                            yield stage
     except (UserError, SceneError, SolverStopped) as error:
         outcome = "failed", str(error)
     yield outcome
+
+
+def _begun(job: _Job, scene: Scene) -> Restart | None:
+    """What an interrupted attempt left; what is of other settings or damaged is made again."""
+    same = {name: job.physics[name] for name in ("effects", "seed", "precision")}
+    try:
+        return unfinished(job.file, scene, **same)
+    except UserError as error:
+        log.info("%s", error)
+        return None
 
 
 def is_done(file: Path, scene: Scene) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from typing import Any
 
 import h5py
@@ -20,17 +21,20 @@ from mpm_warp import (
     Scene,
     Solver,
     SolverStopped,
+    Wheel,
     bodies,
     effects_for,
 )
+from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run
 from sgns.data.writer import stopped_path
+from sgns.interrupts import Interrupted, heeded_signals
 from sgns.simulate import workers as campaign_runs
-from sgns.simulate.run import restart_from, simulate_scene
+from sgns.simulate.run import restart_from, scene_stages, simulate_scene, unfinished
 from sgns.simulate.scene import recorded
-from sgns_testing.commands import SHORT, refusal, sgns
+from sgns_testing.commands import SHORT, SMALL, refusal, sgns
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
 LAST = 3  # frame before the one in which the solver stops
@@ -192,6 +196,113 @@ def test_a_bed_without_a_body_can_go_on(stops, tmp_path):
         simulate_scene(scene, tmp_path / "bed.h5", effects=Effects())
     with Run(tmp_path / "bed.stopped.h5") as run:
         assert run.state.frame == LAST
+
+
+# --- interrupted, and the same command again ------------------------------------------------------------
+
+
+@pytest.fixture
+def interrupted(monkeypatch):
+    """A signal comes in the middle of the frame after LAST, once."""
+    whole, left = Solver._check, [signal.SIGTERM]
+
+    def check(self, index):
+        if index == LAST and left:
+            signal.raise_signal(left.pop())
+        whole(self, index)
+
+    monkeypatch.setattr(Solver, "_check", check)
+
+
+FAST = small(start=0.3, depth=0.06, speed=1.0)
+WHEEL = {"friction_angle": None, "damping": 0.0, "load": 20.0, "settle": 0.02}
+
+
+@pytest.mark.parametrize(
+    ("scene", "effects"),
+    [
+        (small(), Effects(symmetry=True)),
+        (
+            Wheel(bed=Bed(size=(0.4, 0.24, 0.08), spacing=0.04, headroom=0.1), duration=0.1, **WHEEL),
+            Effects(),
+        ),
+        (small(), Effects(fluidity=True, nonlocality=True)),
+        (FAST, Effects()),
+    ],
+    ids=["cut", "wheel", "nonlocal fluidity", "loose soil"],
+)
+def test_an_interrupted_run_goes_on_to_the_same_bits(scene, effects, interrupted, tmp_path):
+    output, same = tmp_path / "run.h5", {"effects": effects, "seed": 3, "precision": "float32"}
+    with pytest.raises(Interrupted) as caught, heeded_signals():
+        simulate_scene(scene, output, **same)
+    kept = stopped_path(output)
+    assert caught.value.said == f"{LAST + 1} of {scene.frame_count} frames are kept in {kept}"
+    assert list(tmp_path.iterdir()) == [kept]
+    with Run(kept) as run:
+        assert run.stopped == "interrupted by SIGTERM"
+        if scene is FAST:
+            assert (run.state.arrays["log_volume"] > 0.0).any()
+    simulate_scene(scene, output, **same, restart=unfinished(output, scene, **same))
+    simulate_scene(scene, tmp_path / "whole.h5", **same)
+    with Run(output) as one, Run(tmp_path / "whole.h5") as two:
+        assert one.content_hash == two.content_hash
+        assert two.frame_count == scene.frame_count
+    assert not kept.exists()
+    assert unfinished(output, scene, **same) is None
+
+
+def test_the_same_command_goes_on_and_another_is_refused_by_key(interrupted, tmp_path):
+    done = sgns(tmp_path, "simulate", *SMALL, "output=run.h5")
+    assert done.returncode == 128 + signal.SIGTERM
+    frames = f"{LAST + 1} of 13 frames are kept in run.stopped.h5"
+    assert done.stderr == f"sgns simulate: interrupted; {frames}; the same command goes on from there\n"
+    for change, words in (
+        ("scene.rake=7.5", "scene.rake is 10.0 there and 7.5 here"),
+        ("material.grain_density=2700.0", "material.grain_density is 2583.0 there and 2700.0 here"),
+        ("effects.nonlocality=true", "effects.nonlocality is False there and True here"),
+        ("solver.precision=float64", "solver.precision is 'float32' there and 'float64' here"),
+        ("seed=4", "seed is 0 there and 4 here"),
+    ):
+        line = refusal(tmp_path, "simulate", *SMALL, "output=run.h5", change)
+        assert "run.stopped.h5 is an unfinished run of other settings: " in line and words in line, line
+        assert "remove run.stopped.h5 to begin anew" in line
+    again = sgns(tmp_path, "simulate", *SMALL, "output=run.h5")
+    assert again.returncode == 0, again.stderr
+    assert f"going on from frame {LAST} of run.stopped.h5" in again.stdout
+    assert sgns(tmp_path, "simulate", *SMALL, "output=whole.h5").returncode == 0
+    with Run(tmp_path / "run.h5") as one, Run(tmp_path / "whole.h5") as two:
+        assert one.content_hash == two.content_hash
+
+
+def test_an_interrupted_sweep_or_continuation_says_how_its_run_goes_on(interrupted, tmp_path):
+    done = sgns(tmp_path, "simulate", *SMALL, "-m", "scene.rake=5.0", f"output={tmp_path}/run.h5")
+    kept, output = tmp_path / "0/run.stopped.h5", tmp_path / "0/run.h5"
+    way = f"sgns simulate continue_from={kept} output={output}"
+    assert done.stderr.endswith(f"are kept in {kept}; {way} goes on from there\n")
+    again = sgns(tmp_path, *way.split()[1:])
+    assert again.returncode == 0 and check_run(output) == [], again.stderr
+
+
+def test_of_runs_made_side_by_side_all_are_kept(interrupted, tmp_path):
+    scenes, same = [small(), small(rake=5.0)], {"effects": Effects(), "seed": 0, "precision": "float32"}
+    files = [tmp_path / "a.h5", tmp_path / "b.h5"]
+    tasks = [scene_stages(scene, file, **same) for scene, file in zip(scenes, files, strict=True)]
+    with pytest.raises(Interrupted), heeded_signals():
+        list(run_concurrently(tasks, 2, "cpu"))
+    assert sorted(tmp_path.iterdir()) == list(map(stopped_path, files))
+    for scene, file in zip(scenes, files, strict=True):
+        simulate_scene(scene, file, **same, restart=unfinished(file, scene, **same))
+        simulate_scene(scene, tmp_path / "whole.h5", **same)
+        with Run(file) as one, Run(tmp_path / "whole.h5") as two:
+            assert one.extra["continued"] and one.content_hash == two.content_hash
+
+
+def test_a_damaged_unfinished_run_is_refused(interrupted, tmp_path):
+    assert sgns(tmp_path, "simulate", *SMALL, "output=run.h5").returncode == 128 + signal.SIGTERM
+    with h5py.File(tmp_path / "run.stopped.h5", "r+") as file:
+        del file["state"]
+    line = refusal(tmp_path, "simulate", *SMALL, "output=run.h5")
+    assert "holds no state to go on from" in line and "remove run.stopped.h5 to begin anew" in line
 
 
 def pushed(file) -> Body:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import logging
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,8 +22,10 @@ from sgns.data.files import file_lock
 from sgns.data.run import Run
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.campaign import run_cost
+from sgns.simulate.run import simulate_scene
 from sgns.simulate.workers import simulate_campaign
 from sgns_testing.campaigns import EFFECTS, campaign
+from sgns_testing.commands import environment
 
 # Compiles a kernel when told to.
 COMPILE = """
@@ -201,3 +206,65 @@ def test_two_processes_may_compile_into_an_empty_cache_at_once(tmp_path):
     # One kernel, and no half-made folder beside it.
     assert len(list(tmp_path.glob("*/wp_grid_step*"))) == 1
     assert len(list(tmp_path.glob("*/wp_grid_step*/*.o"))) == 1
+
+
+# --- campaigns that are ended ------------------------------------------------------------------------------
+
+LONG = {"depth": [0.02, 0.03, 0.04, 0.05], "duration": [10.0], "speed": [0.02]}
+MAKE = f"""
+import pathlib, sys
+from sgns.interrupts import heeded_signals
+from sgns.simulate.workers import simulate_campaign
+from sgns_testing.campaigns import campaign
+if __name__ == "__main__":
+    made = campaign(pathlib.Path(sys.argv[1]), runs=4, draw={LONG})
+    with heeded_signals():
+        simulate_campaign(made, device="cpu", workers=2)
+"""
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def workers_of(pid: int) -> list[int]:
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [int(child) for child in children if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_the_workers_of_an_ended_campaign_keep_what_they_have_and_end(tmp_path, number):
+    script = tmp_path / "make.py"
+    script.write_text(MAKE)
+    command, runs = [sys.executable, str(script), str(tmp_path)], tmp_path / "tiny" / "runs"
+    heeding = {"env": environment(), "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **heeding)
+    deadline = time.monotonic() + 90.0
+    while process.poll() is None and len(list(runs.glob(".*.partial"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert process.poll() is None, process.communicate()
+    time.sleep(0.5)  # some frames
+    workers = workers_of(process.pid)
+    assert len(workers) == 2
+    process.send_signal(number)
+    process.communicate(timeout=60)
+    while any(map(alive, workers)) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not any(map(alive, workers))
+    kept = list(runs.glob("*.stopped.h5"))
+    assert len(kept) == 2 and not list(runs.glob(".*.partial"))
+    with Run(kept[0]) as run:
+        assert run.frame_count > 1
+    if number == signal.SIGTERM:
+        c = campaign(tmp_path, runs=4, draw=LONG)
+        simulate_campaign(c, device="cpu", workers=2)
+        name = kept[0].name.removesuffix(".stopped.h5")
+        simulate_scene(c.scenes[name], tmp_path / "whole.h5", effects=c.physics[name][0])
+        with Run(c.file(name)) as one, Run(tmp_path / "whole.h5") as two:
+            assert one.extra["continued"]
+            assert one.content_hash == two.content_hash
+        assert sorted(runs.iterdir()) == sorted(map(c.file, c.scenes))
