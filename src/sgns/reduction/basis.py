@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mpm_warp.reprs import short_repr
 from sgns.config import UserError
 from sgns.data.files import one_line, parse_json
 from sgns.data.hdf5 import BROKEN, new_hdf5, open_hdf5, own_attribute, own_dataset
@@ -47,6 +48,8 @@ class Basis:
         residual_variance: Variance outside the modes [m^2]; stored because `total_variance` minus the
             eigenvalues cancels when the layout dwarfs the motion. None: computed by that difference.
     """
+
+    __repr__ = short_repr
 
     mean: Tensor
     modes: Tensor

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from mpm_warp.reprs import short_repr
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
 from sgns.data.files import parse_json, require_replaceable
@@ -131,6 +132,8 @@ _SERIES: dict[str, tuple[int | str, ...]] = {
 class ReducedRun:
     """A run whose soil is a few modes."""
 
+    __repr__ = short_repr
+
     name: str  # file name of the run without its ending
     latent: np.ndarray  # modes [m], shape (T, r, 3)
     time: np.ndarray  # [s], shape (T,)
@@ -144,6 +147,8 @@ class ReducedRun:
 @dataclass(frozen=True, eq=False)
 class ReducedDataset:
     """A dataset in the basis of its training split."""
+
+    __repr__ = short_repr
 
     basis: Basis  # with all `max_modes` modes; `basis.sliced(r)` keeps the first r, `latent[:, :r]` likewise
     num_modes: int  # r, the modes to use: `reduction.num_modes`, or what `auto` chose
