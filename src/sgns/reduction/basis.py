@@ -281,6 +281,24 @@ def reduction_curves(basis: Basis, paths: Sequence[Path]) -> ReductionCurves:
     )
 
 
+def left_out(path: Path, basis: Basis, since: int) -> tuple[np.ndarray, np.ndarray]:
+    """Squares that the modes do not see, summed over particles and axes [m²], shape (T,) each: of a run's positions in
+    every frame, and of the way from frame `since`."""
+    with Run(path) as run:
+
+        def unseen(frames: slice) -> Tensor:
+            positions = torch.from_numpy(run.positions(frames)).to(basis.mean)
+            return positions - basis.inverse(basis.transform(positions))
+
+        start = unseen(slice(since, since + 1))
+        found = []
+        for frames in frame_chunks(run.particle_count, run.frame_count):
+            rest = unseen(frames)
+            found.append([part.square().sum((1, 2)).numpy() for part in (rest, rest - start)])
+    here, way = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return here, way
+
+
 def reconstruction_curve(paths: Sequence[Path], basis: Basis) -> np.ndarray:
     """Reduction MSE of runs in one pass: mean over frames, particles and axes [m²] for r = 0 … R, shape (R + 1,); NaN
     without runs.

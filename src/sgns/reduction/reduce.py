@@ -142,6 +142,7 @@ class ReducedRun:
     force: np.ndarray  # by the soil on the body [N], shape (T, 3)
     torque: np.ndarray  # about the centre of mass [N m], shape (T, 3)
     scene: dict[str, Any]  # the complete scene as plain data
+    path: Path | None = None  # the run file; None where there is none with particles
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +280,7 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
     """The cached reduced run, or a new one."""
     if path.exists():
         try:
-            return replace(read_reduced(path, {"r": basis.num_modes}), name=run_path.stem)
+            return replace(read_reduced(path, {"r": basis.num_modes}), name=run_path.stem, path=run_path)
         except BROKEN as error:
             log.warning("%s is damaged (%s); reducing %s again", path, error, run_path)
     with Run(run_path) as run:
@@ -290,7 +291,9 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
             if not bool(parts[-1].isfinite().all()):
                 require_positions(run_path, frames.start, positions)
         series = {name: getattr(run, name) for name in _SERIES if name != "latent"}
-        reduced = ReducedRun(run_path.stem, torch.cat(parts).numpy(), **series, scene=run.scene)
+        reduced = ReducedRun(
+            run_path.stem, torch.cat(parts).numpy(), **series, scene=run.scene, path=run_path
+        )
     write_reduced(path, reduced)
     return reduced
 
