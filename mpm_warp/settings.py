@@ -28,6 +28,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from typing_extensions import Self, dataclass_transform  # in `typing` from Python 3.11
 
+from .reprs import short
 from .state import SceneError
 
 T = TypeVar("T")
@@ -112,16 +113,28 @@ class Settings:
         for name in _fields_of(cls):
             object.__setattr__(self, name, _checked(cls, name, getattr(self, name)))
 
+    def __repr__(self) -> str:
+        """What is not the class's own default; long lists by their length."""
+        given: Any = self
+        values = {one.name: (getattr(self, one.name), _default(one)) for one in fields(given)}
+        words = [f"{name}={short(value)}" for name, (value, own) in values.items() if value != own]
+        return f"{type(self).__name__}({', '.join(words)})"
+
     @classmethod
     def from_dict(cls, data: Any) -> Self:
         """From plain data; what they do not name has its default. Errors as `build`."""
         return build(cls, data, cls.group)
 
 
+def _default(one: Any) -> Any:
+    """Of a dataclass field."""
+    return one.default if one.default_factory is MISSING else one.default_factory()
+
+
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def settings(cls: type[T]) -> type[T]:
     """An immutable dataclass of settings, which its documentation lists."""
-    cls = dataclass(frozen=True)(cls)
+    cls = dataclass(frozen=True, repr=False)(cls)
     lines = [inspect.cleandoc(cls.__doc__ or ""), "", "Settings and their defaults:"]
     for name, default, allowed, meaning in described(cls):
         lines.append(f"    {name} = {default}: {meaning}{allowed and f' ({allowed})'}")
@@ -134,7 +147,7 @@ def described(cls: type) -> list[tuple[str, str, str, str]]:
     found = []
     for one in fields(cls):
         known = _fields_of(cls)[one.name].setting
-        default = _short(one.default if one.default_factory is MISSING else one.default_factory())
+        default = repr(_default(one))
         found.append((one.name, f"{default} {known.unit}".rstrip(), known.range, known.help))
     return found
 
@@ -154,16 +167,6 @@ def reference(groups: Iterable[type[Settings]]) -> str:
             if (name, *known) not in shared:
                 lines.append(f"| `{name}` | {' | '.join(known)} |")
     return "\n".join(lines) + "\n"
-
-
-def _short(value: Any) -> str:
-    """A default; of a group of settings only those that are not the group's own."""
-    if not is_dataclass(value) or isinstance(value, type):
-        return repr(value)
-    changed = {f.name: getattr(value, f.name) for f in fields(value)}
-    own = type(value)()
-    words = [f"{name}={_short(v)}" for name, v in changed.items() if v != getattr(own, name)]
-    return f"{type(value).__name__}({', '.join(words)})"
 
 
 def build(cls: type[Settings], data: Any, where: str, make: Callable[..., Any] | None = None) -> Any:

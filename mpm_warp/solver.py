@@ -23,6 +23,7 @@ from .kernels.transfer import transfer
 from .launch import Executor, Job, Launch, Program, SceneKernel, find_device
 from .limits import PhysicalLimits, require_memory, steps_to_remap, substeps_per_frame, top_body_speed
 from .poses import rotate
+from .reprs import short_repr
 from .rigid_body import RigidBody
 from .scene import Scene
 from .state import Memory, SceneError, SolverStopped, State
@@ -33,6 +34,8 @@ PRECISIONS = {"float32": wp.float32, "float64": wp.float64}
 @dataclass(frozen=True)
 class Frame:
     """The state at one recorded time. Arrays are copies and stay valid."""
+
+    __repr__ = short_repr
 
     index: int
     time: float
@@ -92,6 +95,10 @@ class Solver:
         self._start = copy.deepcopy(start)  # every beginning needs it as it is now
         self._beginnings = 0
         self._make_ready()
+
+    def __repr__(self) -> str:
+        size = f"{self.computed_count} particles, {self.substeps_per_frame} steps per frame"
+        return f"Solver({self.scene.name}: {size}, on {self.device})"
 
     @property
     def particle_count(self) -> int:

@@ -21,7 +21,9 @@ import torch
 from torch import Tensor
 
 from mpm_warp.poses import in_world_frame
+from mpm_warp.reprs import short_repr
 from sgns.config import UserError
+from sgns.data.surface import Surface, soil_surface
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step
 from sgns.model.features import ToolMotion, context_of, markers
@@ -45,12 +47,15 @@ class State:
         pose: Tool's centre of mass [m] and quaternion x, y, z, w, shape (7,).
     """
 
+    __repr__ = short_repr
+
     frame: int
     latent: np.ndarray
     force: np.ndarray
     torque: np.ndarray
     pose: np.ndarray
     _basis: Basis = field(repr=False)
+    _scene: Mapping[str, Any] = field(repr=False)
     _excess: Callable[[], Excess | None] = field(repr=False)
 
     @property
@@ -65,6 +70,10 @@ class State:
         """Positions of all particles [m], shape (n, 3); decoded when asked for."""
         return self._basis.inverse(self.latent).numpy()
 
+    def surface(self) -> Surface:
+        """The soil's surface: x (nx,), y (ny,) and heights z (nx, ny) [m]; as `Run.surface`."""
+        return soil_surface(self.soil(), self._scene)
+
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
@@ -78,6 +87,8 @@ class Rollout:
         body_points: World frame [m], shape (T, M, 3).
         wall_time_s: Time of all steps, force included, decoding not [s].
     """
+
+    __repr__ = short_repr
 
     latent: np.ndarray
     force: np.ndarray
@@ -97,6 +108,8 @@ class Rollout:
 @dataclass(frozen=True, eq=False)
 class Rollouts:
     """Many tool paths: as of `Rollout`, with B before every shape; `wall_time_s` is that of all of them."""
+
+    __repr__ = short_repr
 
     latent: np.ndarray
     force: np.ndarray
@@ -175,6 +188,10 @@ class Simulator:
         )
         self._start_latent = self.basis.transform(surrogate.start_positions.cpu())
         self.reset()
+
+    def __repr__(self) -> str:
+        size = f"{len(self.start_positions)} particles in {self.num_modes} modes, {self.frame_rate:g} Hz"
+        return f"Simulator({self._dynamics.settings.kind}: {size}, at frame {self._frame})"
 
     def __copy__(self) -> Simulator:
         copied = object.__new__(type(self))
@@ -403,7 +420,10 @@ class Simulator:
         # It holds nothing of the simulator that goes on changing.
         excess = partial(self._surrogate.training_range.excess, poses, self._points, latent, self._context)
         force, torque = (part.copy() for part in self._load)
-        return State(self._frame, latent[-1].copy(), force, torque, poses[-1].copy(), self.basis, excess)
+        scene = self._surrogate.card["scene"]
+        return State(
+            self._frame, latent[-1].copy(), force, torque, poses[-1].copy(), self.basis, scene, excess
+        )
 
     def _context_of(self, values: Mapping[str, Any] | None) -> dict[str, float]:
         """The numbers of a scene that the network is told, by their keys."""

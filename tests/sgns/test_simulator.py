@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from sgns.config import UserError
+from sgns.data.surface import soil_surface
 from sgns.simulator import Simulator
 from sgns_testing.tiny import MODEL, POLYNOMIAL
 from sgns_testing.trained import TrainedKinds
@@ -141,6 +142,8 @@ def test_soil_is_decoded_from_the_modes(trained) -> None:
     state = simulator.reset(trained.run.pose[0])
     np.testing.assert_array_equal(state.soil(), simulator.basis.inverse(state.latent).numpy())
     np.testing.assert_array_equal(simulator.start_positions, data.start_positions)
+    surface = state.surface()
+    np.testing.assert_array_equal(surface.z, soil_surface(state.soil(), simulator.scene).z)
     # At rest the soil is the common start, as far as four modes can say it.
     error = np.abs(state.soil() - data.start_positions).max()
     assert error <= np.abs(data.start_positions - data.basis.mean.numpy()).max() + 1e-9

@@ -20,7 +20,7 @@ from mpm_warp.poses import in_body_frame, rotation_matrices
 from sgns.config import UserError, parse_yaml
 from sgns.data.files import one_line
 from sgns.data.hdf5 import BROKEN, own_dataset, own_object, own_view
-from sgns.data.run import (
+from sgns.data.run_file import (
     PRODUCERS,
     SERIES,
     STOPPED,

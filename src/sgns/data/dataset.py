@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mpm_warp.reprs import short_repr
 from sgns.config import UserError, flattened, parse_yaml
 from sgns.data.files import read_text
 
@@ -20,6 +21,8 @@ _MOST_BYTES = 1 << 26
 @dataclass(frozen=True)
 class Dataset:
     """A campaign's runs on disk."""
+
+    __repr__ = short_repr
 
     name: str
     path: Path

@@ -22,7 +22,7 @@ from sgns import __version__
 from sgns.config import UserError
 from sgns.data.files import require_replaceable
 from sgns.data.hdf5 import BROKEN, NewFile
-from sgns.data.run import (
+from sgns.data.run_file import (
     FORMAT,
     FORMAT_VERSION,
     MESH,

@@ -26,9 +26,10 @@ from sgns.data.check import scene_problems
 from sgns.data.dataset import Dataset
 from sgns.data.files import only_here, require_replaceable
 from sgns.data.run import Run
+from sgns.data.surface import surface_grid
 from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory, provenance
 from sgns.evaluate.figures import VALIDATION
-from sgns.evaluate.metrics import body_errors, mean_prediction, position_errors, surface_grid
+from sgns.evaluate.metrics import body_errors, mean_prediction, position_errors
 from sgns.evaluate.published import evaluate_published
 from sgns.evaluate.report import describe, forward_name, seen_warning, short_names, write_report
 from sgns.evaluate.results import (

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mpm_warp.reprs import short_repr
 from sgns.config import UserError
 from sgns.data.run import frame_chunks
+from sgns.data.surface import SurfaceGrid, height_map
 from sgns.model.features import is_wheel
 
 
@@ -20,76 +22,6 @@ def forward_force(scene: Mapping[str, Any]) -> tuple[str, float]:
     return ("drawbar pull Fx", 1.0) if is_wheel(scene) else ("draft −Fx", -1.0)
 
 
-# --- The free surface of a bed of particles as a height map on a regular horizontal grid ----------------
-
-# A column two particle spacings wide holds several particles of an undisturbed top layer, so that
-# the highest of them follows the surface and no column of a full bed is empty.
-SPACINGS_PER_COLUMN = 2.0
-
-
-@dataclass(frozen=True)
-class SurfaceGrid:
-    """Columns of a height map."""
-
-    x_edges: np.ndarray  # borders of the columns along x [m], shape (nx + 1,), increasing, equally spaced
-    y_edges: np.ndarray  # borders of the columns along y [m], shape (ny + 1,), increasing, equally spaced
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Number of columns along x and y: (nx, ny)."""
-        return len(self.x_edges) - 1, len(self.y_edges) - 1
-
-    @property
-    def x_centres(self) -> np.ndarray:
-        """Middle of the columns along x [m], shape (nx,)."""
-        return 0.5 * (self.x_edges[1:] + self.x_edges[:-1])
-
-
-def particle_spacing(positions: np.ndarray) -> float:
-    """Edge [m] of the cube that one particle occupies in an undisturbed bed (n, 3) [m].
-
-    The bed reaches half a spacing s beyond its outermost particles, so Π (extent + s) = n s³, solved by iteration.
-    """
-    extent = np.ptp(np.asarray(positions, dtype=np.float64), axis=0)
-    solid = extent[extent > 0.0]
-    if solid.size == 0:
-        return 1.0
-    spacing = 0.0
-    for _ in range(50):
-        spacing = (np.prod(solid + spacing) / len(positions)) ** (1.0 / solid.size)
-    return float(spacing)
-
-
-def surface_grid(positions: np.ndarray) -> SurfaceGrid:
-    """Height-map columns that cover an undisturbed bed (n, 3) [m].
-
-    Their edge is the nearest to two particle spacings that divides the bed's length and width.
-    """
-    positions = np.asarray(positions, dtype=np.float64)
-    spacing = particle_spacing(positions)
-    # The bed reaches half a spacing beyond its outermost particles.
-    low, high = positions.min(axis=0) - 0.5 * spacing, positions.max(axis=0) + 0.5 * spacing
-    counts = [max(1, round(length / (SPACINGS_PER_COLUMN * spacing))) for length in high - low]
-    return SurfaceGrid(*(np.linspace(low[axis], high[axis], counts[axis] + 1) for axis in (0, 1)))
-
-
-def height_map(positions: np.ndarray, grid: SurfaceGrid) -> np.ndarray:
-    """Height of the highest particle of every column [m], shape (nx, ny); NaN where a column holds no particle.
-
-    Particles (n, 3) [m] beyond the grid's border count for the outermost columns.
-    """
-    positions, count = np.asarray(positions), np.array(grid.shape)
-    low, high = (np.array([grid.x_edges[end], grid.y_edges[end]]) for end in (0, -1))
-    share = (positions[:, :2] - low) / (high - low)
-    share = np.clip(np.nan_to_num(share), 0.0, 1.0)  # clipped before the cast: inf has no integer
-    column, row = np.minimum((share * count).astype(np.int64), count - 1).T
-    heights = np.full(grid.shape, -np.inf)
-    np.maximum.at(heights, (column, row), positions[:, 2].astype(np.float64))
-    heights[heights == -np.inf] = np.nan
-    return heights
-
-
-# --- How far a predicted run is from a simulated one: positions, surface, force and torque --------------
 # Both runs are files of the same kind and are read in chunks of frames, so memory does not grow with the length
 # of a run. The frames of the history, which the prediction was given, count in no metric.
 
@@ -112,6 +44,8 @@ class ParticleErrors:
 @dataclass(frozen=True)
 class PositionErrors:
     """Mean-square position errors of one run at every frame after the history."""
+
+    __repr__ = short_repr
 
     time: np.ndarray  # time of the frames [s], shape (t,)
     reduction: np.ndarray  # PCA⁻¹PCA(truth) − truth [m²], shape (t,)
@@ -144,6 +78,8 @@ PRESCRIBED = BodyErrors(0.0, math.nan)
 @dataclass(frozen=True)
 class VectorErrors:
     """Sums from which every metric of a predicted force or torque follows; sums of runs add up."""
+
+    __repr__ = short_repr
 
     samples: int  # number of frames
     absolute: np.ndarray  # Σ |prediction − truth| per world axis, shape (3,)

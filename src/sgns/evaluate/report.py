@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from sgns.data.files import whole_file, write_whole
 from sgns.data.run import Run
+from sgns.data.surface import surface_grid
 from sgns.evaluate.figures import (
     energy_figure,
     error_panels,
@@ -29,7 +30,6 @@ from sgns.evaluate.figures import (
     torque_panels,
     training_figure,
 )
-from sgns.evaluate.metrics import surface_grid
 from sgns.evaluate.results import EvaluatedRun, Evaluation
 from sgns.evaluate.views import common_scales, latent_path, side_views, solid_views, subspace_view, view_times
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mpm_warp.reprs import short_repr
 from sgns.data.files import whole_file, write_whole
 from sgns.evaluate.metrics import (
     FORCE_COMPONENTS,
@@ -35,6 +36,8 @@ SURFACE_ERRORS = ("surface", "surface_frozen")
 @dataclass(frozen=True)
 class Scores:
     """Errors of a prediction and of the baselines."""
+
+    __repr__ = short_repr
 
     name: str  # of the run, or of the group of runs
     frames: int  # number of frames that count (the history does not)
@@ -209,6 +212,8 @@ class FullSpaceCost:
 @dataclass(frozen=True)
 class Evaluation:
     """Everything that a report shows, in numbers."""
+
+    __repr__ = short_repr
 
     dataset: str  # name of the dataset
     split: str  # which of its splits was evaluated

@@ -20,6 +20,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from mpm_warp.poses import in_world_frame
 from sgns.data.run import Run, frame_chunks
+from sgns.data.surface import particle_spacing
 from sgns.evaluate.depth_buffer import DepthBuffer, project
 from sgns.evaluate.figures import (
     BASELINE,
@@ -31,7 +32,6 @@ from sgns.evaluate.figures import (
     new_figure,
     styled,
 )
-from sgns.evaluate.metrics import particle_spacing
 from sgns.model.features import distance, is_wheel, markers
 from sgns.reduction.basis import Basis
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from mpm_warp.poses import in_body_frame
 from sgns.config import UserError
 from sgns.data.files import read_json, whole_file
-from sgns.data.run import require_mesh_was_read
+from sgns.data.run_file import require_mesh_was_read
 from sgns.model.dynamics import Dynamics
 from sgns.model.features import slowest_travel
 from sgns.model.network_dynamics import LatentDynamics
@@ -99,6 +99,10 @@ class Surrogate(nn.Module):
             **dynamics.card(),
             "basis": state,
         }
+
+    def __repr__(self) -> str:
+        size = f"{self.basis.num_modes} modes of {self.basis.num_particles} particles"
+        return f"Surrogate({self.dynamics.settings.kind}: {size}, {self.frame_rate:g} Hz)"
 
     @classmethod
     def of(cls, dynamics: Dynamics, reduced: ReducedDataset, card: Mapping[str, Any]) -> Surrogate:

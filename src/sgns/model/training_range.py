@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mpm_warp.poses import in_world_frame
+from mpm_warp.reprs import short_repr
 from sgns.model.features import body_track, context_of
 from sgns.reduction.reduce import ReducedRun
 
@@ -31,6 +32,9 @@ class Excess(NamedTuple):
 
     amount: np.ndarray
     quantity: list[str]
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     @property
     def largest(self) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mpm_warp.reprs import short_repr
 from sgns.config import UserError
 from sgns.data.files import one_line, parse_json
 from sgns.data.hdf5 import BROKEN, new_hdf5, open_hdf5, own_attribute, own_dataset
@@ -47,6 +48,8 @@ class Basis:
         residual_variance: Variance outside the modes [m^2]; stored because `total_variance` minus the
             eigenvalues cancels when the layout dwarfs the motion. None: computed by that difference.
     """
+
+    __repr__ = short_repr
 
     mean: Tensor
     modes: Tensor
@@ -276,6 +279,24 @@ def reduction_curves(basis: Basis, paths: Sequence[Path]) -> ReductionCurves:
         np.asarray(basis.residual_mse()),
         reconstruction_curve(paths, basis),
     )
+
+
+def left_out(path: Path, basis: Basis, since: int) -> tuple[np.ndarray, np.ndarray]:
+    """Squares that the modes do not see, summed over particles and axes [m²], shape (T,) each: of a run's positions in
+    every frame, and of the way from frame `since`."""
+    with Run(path) as run:
+
+        def unseen(frames: slice) -> Tensor:
+            positions = torch.from_numpy(run.positions(frames)).to(basis.mean)
+            return positions - basis.inverse(basis.transform(positions))
+
+        start = unseen(slice(since, since + 1))
+        found = []
+        for frames in frame_chunks(run.particle_count, run.frame_count):
+            rest = unseen(frames)
+            found.append([part.square().sum((1, 2)).numpy() for part in (rest, rest - start)])
+    here, way = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return here, way
 
 
 def reconstruction_curve(paths: Sequence[Path], basis: Basis) -> np.ndarray:

@@ -112,6 +112,9 @@ class IncrementalPCA:
         # Squared Frobenius norm of the largest error that rounding to the input type can have made [m^2].
         self._input_noise = 0.0
 
+    def __repr__(self) -> str:
+        return f"IncrementalPCA({self.num_modes} modes, {self.frame_count} frames so far)"
+
     def partial_fit(self, positions: Tensor | np.ndarray) -> IncrementalPCA:
         """Add frames to the stream; returns this object.
 

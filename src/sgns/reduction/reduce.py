@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from mpm_warp.reprs import short_repr
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
 from sgns.data.files import parse_json, require_replaceable
@@ -131,6 +132,8 @@ _SERIES: dict[str, tuple[int | str, ...]] = {
 class ReducedRun:
     """A run whose soil is a few modes."""
 
+    __repr__ = short_repr
+
     name: str  # file name of the run without its ending
     latent: np.ndarray  # modes [m], shape (T, r, 3)
     time: np.ndarray  # [s], shape (T,)
@@ -139,11 +142,14 @@ class ReducedRun:
     force: np.ndarray  # by the soil on the body [N], shape (T, 3)
     torque: np.ndarray  # about the centre of mass [N m], shape (T, 3)
     scene: dict[str, Any]  # the complete scene as plain data
+    path: Path | None = None  # the run file; None where there is none with particles
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedDataset:
     """A dataset in the basis of its training split."""
+
+    __repr__ = short_repr
 
     basis: Basis  # with all `max_modes` modes; `basis.sliced(r)` keeps the first r, `latent[:, :r]` likewise
     num_modes: int  # r, the modes to use: `reduction.num_modes`, or what `auto` chose
@@ -274,7 +280,7 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
     """The cached reduced run, or a new one."""
     if path.exists():
         try:
-            return replace(read_reduced(path, {"r": basis.num_modes}), name=run_path.stem)
+            return replace(read_reduced(path, {"r": basis.num_modes}), name=run_path.stem, path=run_path)
         except BROKEN as error:
             log.warning("%s is damaged (%s); reducing %s again", path, error, run_path)
     with Run(run_path) as run:
@@ -285,7 +291,9 @@ def reduced_run(path: Path, run_path: Path, basis: Basis) -> ReducedRun:
             if not bool(parts[-1].isfinite().all()):
                 require_positions(run_path, frames.start, positions)
         series = {name: getattr(run, name) for name in _SERIES if name != "latent"}
-        reduced = ReducedRun(run_path.stem, torch.cat(parts).numpy(), **series, scene=run.scene)
+        reduced = ReducedRun(
+            run_path.stem, torch.cat(parts).numpy(), **series, scene=run.scene, path=run_path
+        )
     write_reduced(path, reduced)
     return reduced
 

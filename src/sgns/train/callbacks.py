@@ -82,6 +82,7 @@ class RolloutValidation(L.Callback):
             {
                 "skill/validation": score.skill,
                 "skill/validation_at_rest": score.skill_at_rest,
+                "skill/validation_in_subspace": score.skill_in_subspace,
                 "force_nrmse/validation": score.force_nrmse,
                 "force_nrmse/validation_at_rest": score.force_nrmse_at_rest,
             },
@@ -91,10 +92,8 @@ class RolloutValidation(L.Callback):
         losses = ", ".join(
             f"{k} {float(trainer.callback_metrics[f'loss/{k}']):.3g}" for k in ("change", "force")
         )
-        log.info(
-            "step %d of %d: loss %s; validation skill %.3f (from rest %.3f), force NRMSE %.3f",
-            step, self.settings.max_steps, losses, score.skill, score.skill_at_rest, score.force_nrmse,
-        )  # fmt: skip
+        steps = self.settings.max_steps
+        log.info("step %d of %d: loss %s; validation: %s", step, steps, losses, score.words())
         if score.skill > self.best or not (self.output / "best.ckpt").exists():
             self.best = score.skill
             trainer.save_checkpoint(self.output / "best.ckpt")

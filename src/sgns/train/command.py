@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,7 +43,7 @@ FITS: dict[str, Fit] = {"network": NETWORK, "polynomial": POLYNOMIAL}
 
 
 def main(cfg: DictConfig) -> float:
-    """The `sgns train` command; returns the rollout skill on the validation runs."""
+    """The `sgns train` command; returns the skill of rollouts of the validation runs, in full space."""
     from sgns.data.dataset import Dataset
     from sgns.data.published import published_dataset
 
@@ -152,7 +153,11 @@ def train(
             )
         )
         score = fitted.score
-        metrics = {key: getattr(score, key) for key in ("skill", "skill_at_rest", "force_nrmse")}
+        metrics = {
+            key: getattr(score, key) for key in ("skill", "skill_at_rest", "skill_in_subspace", "force_nrmse")
+        }
+        if not math.isnan(score.position_rmse):
+            metrics["position_rmse"] = score.position_rmse
         if fitted.surrogate.dynamics.predicts_body:
             metrics["body_rmse"] = score.body_rmse
         # TensorBoard's HParams tab takes one level, scalars or text.
@@ -164,11 +169,8 @@ def train(
         logger.finalize("success")
         summary = {**fitted.about, **metrics, "seconds": round(fitted.seconds, 1)}
         write_whole(output / SUMMARY, json.dumps(summary, indent=2) + "\n")
-        log.info(
-            "trained in %.0f s; %d validation runs: skill %.3f (from rest %.3f), force NRMSE %.3f; %s",
-            fitted.seconds, len(validation_runs), score.skill, score.skill_at_rest, score.force_nrmse,
-            output / "best.ckpt",
-        )  # fmt: skip
+        runs = f"{len(validation_runs)} validation runs"
+        log.info("trained in %.0f s; %s: %s; %s", fitted.seconds, runs, score.words(), output / "best.ckpt")
         return score.skill
 
 

@@ -162,7 +162,7 @@ def fit_network(task: Task) -> Fitted:
     )
     context = surrogate.dynamics.context_keys
     rollouts = ValidationRollouts(
-        task.validation_runs, task.num_modes, model.history, model.body_nodes, context
+        task.validation_runs, task.num_modes, model.history, model.body_nodes, context, task.reduced.basis
     )
     module = SurrogateTraining(surrogate, settings)
     last = output / "last.ckpt" if task.resumed else None

@@ -29,6 +29,7 @@ from sgns.train.validation import RolloutScore, ValidationRollouts
 from sgns.train.windows import Batch, TrainingWindows, generator, random_walk
 
 if TYPE_CHECKING:
+    from sgns.reduction.basis import Basis
     from sgns.reduction.reduce import ReducedRun
 
 log = logging.getLogger(__name__)
@@ -228,11 +229,13 @@ def best_polynomial(
     model: PolynomialSettings,
     settings: FitSettings,
     seed: int = 0,
+    basis: Basis | None = None,
 ) -> FittedPolynomial:
     """Fit polynomials for every noise and penalty and take what follows some runs best.
 
     The rollouts of the runs in `choosing` choose. Where they are among those for training, they are first left out of
-    the fit; the score is that of the fit without them, the result that of the fit with them. `seed` is of the noise.
+    the fit; the score is that of the fit without them, the result that of the fit with them. `seed` is of the noise;
+    without the `basis` the score is that in the subspace.
     """
     context, free = tuple(varying_context(runs, model.context)), moves_freely(runs)
 
@@ -246,7 +249,7 @@ def best_polynomial(
     windows, dynamics = begun(fitting)
     known = {noise: moments(dynamics, windows, noise, settings.draws) for noise in settings.noises}
     log.info("%d windows, %d monomials of %d inputs", len(windows), len(dynamics.terms), len(dynamics.used))
-    rollouts = ValidationRollouts(choosing, num_modes, model.history, model.body_nodes, context)
+    rollouts = ValidationRollouts(choosing, num_modes, model.history, model.body_nodes, context, basis)
     found = candidates(known, settings.penalties, settings.linear and model.degree > 1)
     selection = select(dynamics, found, rollouts)
     score = rollouts.measure(dynamics)
@@ -266,7 +269,13 @@ def fit_polynomial(task: Task) -> Fitted:
         raise UserError(f"device is {task.device}, but polynomials are fitted on the CPU; use device=cpu")
     began = time.perf_counter()
     best = best_polynomial(
-        task.reduced.runs("train"), task.validation_runs, task.num_modes, task.model, task.settings, task.seed
+        task.reduced.runs("train"),
+        task.validation_runs,
+        task.num_modes,
+        task.model,
+        task.settings,
+        task.seed,
+        task.reduced.basis,
     )
     seconds = elapsed(began, time.perf_counter())
     surrogate = Surrogate.of(best.dynamics, task.reduced, task.card)

@@ -1,10 +1,15 @@
 """How well dynamics follow the validation runs, all at once: what every kind of model is chosen by.
 
+The error of the positions counts in full space, as in the report: with orthonormal modes it is that in the subspace
+plus what the modes leave out, which no training changes. So within a training both choose the same checkpoint; between
+numbers of modes only the total is fair.
+
 Letters: B runs, T frames of the longest run, d history positions, r modes.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,9 +20,11 @@ from torch import Tensor
 
 from sgns.model.dynamics import Dynamics
 from sgns.model.features import BodyTrack, body_track, context_of
+from sgns.reduction.basis import left_out
 from sgns.train.windows import filled, require_finite
 
 if TYPE_CHECKING:
+    from sgns.reduction.basis import Basis
     from sgns.reduction.reduce import ReducedRun
 
 
@@ -27,16 +34,32 @@ class RolloutScore(NamedTuple):
     skill: float
     """1 - sum of squared position errors / that of a soil that stays as it is after d true frames [1]."""
     skill_at_rest: float
+    skill_in_subspace: float  # the same of the modes only
+    position_rmse: (
+        float  # RMS per axis [m]; NaN where only modes are known: then `skill` is that in the subspace
+    )
     force_nrmse: float  # RMS of the force error's length / RMS of the force's length [1]
     force_nrmse_at_rest: float
     body_rmse: float  # RMS distance between predicted and true body nodes [m]; 0 for a prescribed body
     force: Tensor  # predicted from d true frames [N], shape (B, T, 3), zero in the history
 
+    def words(self) -> str:
+        """The main numbers."""
+        if math.isnan(self.position_rmse):
+            soil = f"skill in the subspace {self.skill:.3f} (from rest {self.skill_at_rest:.3f})"
+        else:
+            soil = (
+                f"position error {1e3 * self.position_rmse:.3g} mm, skill {self.skill:.3f} (in the subspace alone "
+                f"{self.skill_in_subspace:.3f}, from rest {self.skill_at_rest:.3f})"
+            )
+        return f"{soil}, force NRMSE {self.force_nrmse:.3f}"
+
 
 class ValidationRollouts:
     """Runs to be rolled out side by side; shorter ones are filled up with their last frame, which is not counted.
 
-    `context` are the keys of the scene whose numbers the dynamics are told.
+    `context` are the keys of the scene whose numbers the dynamics are told. Without the `basis`, or where there are no
+    particles, errors are those in the subspace.
     """
 
     def __init__(
@@ -46,6 +69,7 @@ class ValidationRollouts:
         history: int,
         body_nodes: str,
         context: Sequence[str] = (),
+        basis: Basis | None = None,
     ) -> None:
         for run in runs:
             require_finite(run)
@@ -66,6 +90,19 @@ class ValidationRollouts:
         self.history = history
         frame = torch.arange(longest)
         self.counted = (frame < torch.tensor(self.lengths)[:, None]) & (frame >= history)
+        # Of the positions and of their way since the history's end, what the modes do not see (see `squares`) [m^2].
+        self.unseen, self.unseen_way = 0.0, 0.0
+        self.coordinates = math.nan  # 3 n
+        paths = [run.path for run in runs if run.path is not None]
+        if basis is not None and len(paths) == len(runs):
+            kept, last = basis.sliced(num_modes), [min(history, length) - 1 for length in self.lengths]
+            parts = zip(
+                *(left_out(*one) for one in zip(paths, [kept] * len(paths), last, strict=True)), strict=True
+            )
+            self.unseen, self.unseen_way = (
+                self.squares(stacked(part)[..., None, None].sqrt()) for part in parts
+            )
+            self.coordinates = 3.0 * basis.num_particles
         # The same runs preceded by copies of frame 0: a bed at rest.
         self.padding = history - 1
         self.body_at_rest = BodyTrack(
@@ -79,10 +116,15 @@ class ValidationRollouts:
             latent, force, body = self.rolled(dynamics, given, self.body)
             at_rest, force_at_rest, _ = self.rolled(dynamics, start, self.body_at_rest)
             at_rest, force_at_rest = at_rest[:, self.padding :], force_at_rest[:, self.padding :]
-            frozen = self.squares(given[:, -1:] - self.latent)
+            frozen, error, error_at_rest = (
+                self.squares(part - self.latent) for part in (given[:, -1:], latent, at_rest)
+            )
+            all_frozen = frozen + self.unseen_way
             return RolloutScore(
-                1 - self.squares(latent - self.latent) / frozen,
-                1 - self.squares(at_rest - self.latent) / frozen,
+                1 - (error + self.unseen) / all_frozen,
+                1 - (error_at_rest + self.unseen) / all_frozen,
+                1 - error / frozen,
+                ((error + self.unseen) / (len(self.names) * self.coordinates)) ** 0.5,
                 self.force_error(force),
                 self.force_error(force_at_rest),
                 self.body_error(body) if dynamics.predicts_body else 0.0,

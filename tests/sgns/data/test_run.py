@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import h5py
@@ -10,6 +11,7 @@ import pytest
 
 from sgns.config import UserError
 from sgns.data.run import Run
+from sgns.data.surface import soil_surface
 from sgns_testing.runs import make_run
 
 
@@ -59,6 +61,46 @@ def test_opening_reads_no_soil(tmp_path):
     with Run(path) as run:
         assert np.isfinite(run.force).all() and run.frame_count == 3
         assert not np.isfinite(run.positions(1)).any()
+
+
+def test_a_table_of_forces_has_named_columns(tmp_path):
+    with Run(make_run(tmp_path / "a.h5")) as run:
+        table = run.forces()
+        assert list(table.columns) == "Fx Fy Fz Tx Ty Tz x y z qx qy qz qw".split()
+        assert table.index.name == "time" and (table.index == run.time).all()
+        np.testing.assert_array_equal(table[["Fx", "Fy", "Fz"]], run.force)
+        np.testing.assert_array_equal(table[["Tx", "Ty", "Tz"]], run.torque)
+        np.testing.assert_array_equal(table.loc[:, "x":], run.pose)
+
+
+def test_xarray_knows_dimensions_by_name(tmp_path):
+    with Run(make_run(tmp_path / "a.h5")) as run:
+        found = run.to_xarray([0, -1])
+        assert found.sizes == {"time": 2, "particle": 50, "axis": 3, "component": 7, "point": 15}
+        np.testing.assert_array_equal(found.position, run.positions([0, -1]))
+        np.testing.assert_array_equal(found.velocity.sel(axis="x"), run.velocities([0, -1])[..., 0])
+        assert float(found.force.sel(axis="z", time=run.time[-1])) == run.force[-1, 2]
+        assert float(found.pose.sel(component="qw")[0]) == run.pose[0, 6]
+        assert found.torque.units == "N m" and found.body_points.dims == ("time", "point", "axis")
+        assert run.to_xarray().sizes["time"] == 12 and run.to_xarray(3).sizes["time"] == 1
+
+
+@pytest.mark.parametrize(("name", "ask"), [("pandas", Run.forces), ("xarray", Run.to_xarray)])
+def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch, name, ask):
+    monkeypatch.setitem(sys.modules, name, None)
+    with Run(make_run(tmp_path / "a.h5")) as run, pytest.raises(UserError, match=f"pip install {name}"):
+        ask(run)
+
+
+def test_the_surface_of_a_frame(tmp_path):
+    with Run(make_run(tmp_path / "a.h5", n=4000)) as run:
+        x, y, z = run.surface(0)
+        expected = soil_surface(run.positions(0)[0], run.scene)
+        np.testing.assert_array_equal(z, expected.z)
+        assert z.shape == (len(x), len(y)) and np.nanmax(z) < 0.02
+        assert (np.nan_to_num(run.surface().z) == np.nan_to_num(run.surface(11).z)).all()
+        with pytest.raises(UserError, match=r"round\(t \* run.frame_rate\)"):
+            run.surface(0.05)
 
 
 def refused(path: Path) -> str:

@@ -11,6 +11,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from sgns.config import UserError
 from sgns.data.run import Run
+from sgns.data.surface import surface_grid
 from sgns.evaluate import figures
 from sgns.evaluate.command import read_log
 from sgns.evaluate.figures import (
@@ -28,7 +29,7 @@ from sgns.evaluate.figures import (
     torque_panels,
     training_figure,
 )
-from sgns.evaluate.metrics import ParticleErrors, PositionErrors, surface_grid
+from sgns.evaluate.metrics import ParticleErrors, PositionErrors
 from sgns_testing.pictures import pixels
 from sgns_testing.runs import make_run
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,9 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sgns.config import UserError
+from sgns.data.dataset import Dataset
+from sgns.data.run import Run
+from sgns.evaluate.command import evaluate
 from sgns.model.checkpoint import load_surrogate
 from sgns.model.dynamics import Path
 from sgns.reduction.reduce import reduce_dataset
@@ -122,10 +126,71 @@ def test_what_tensorboard_shows(trained) -> None:
     events.Reload()
     scalars = set(events.Tags()["scalars"])
     assert {"loss/change", "loss/force", "loss/torque", "loss/total"} <= scalars
-    assert {"skill/validation", "skill/validation_at_rest", "force_nrmse/validation"} <= scalars
+    assert {"skill/validation", "skill/validation_at_rest", "skill/validation_in_subspace"} <= scalars
+    assert "force_nrmse/validation" in scalars
     assert {"learning_rate", "samples_per_s", "final/skill", "final/force_nrmse"} <= scalars
     assert events.Tags()["images"] == ["force/validation"]
     assert events.Scalars("final/skill")[0].value == pytest.approx(skill)
+
+
+class Known(torch.nn.Linear):
+    """Gives the answers instead of learning them."""
+
+    predicts_body = False
+
+    def __init__(self, *answers) -> None:
+        super().__init__(1, 1)
+        self.answers = answers
+
+    def unroll(self, latent, body, context):
+        pad = body.position.shape[1] - self.answers[0].shape[1]
+        answers = [torch.cat([a[:, :1].expand(-1, pad, *a.shape[2:]), a], 1) for a in self.answers]
+        return Path(*answers, None, body)
+
+
+def test_the_training_says_the_error_of_the_report(data, trained, tmp_path, caplog) -> None:
+    folder, skill = trained
+    dataset = Dataset.open(data.folder.parent.parent)
+    checkpoint = folder / "best.ckpt"
+    evaluation = evaluate(
+        Simulator.load(checkpoint), dataset, tmp_path, split="validation", checkpoint=checkpoint
+    )
+    summary = json.loads((folder / "training.json").read_text())
+    assert summary["skill"] == skill == pytest.approx(evaluation.total.skill(), abs=1e-4)
+    assert 1e3 * summary["position_rmse"] == pytest.approx(evaluation.total.rmse_mm("total"), rel=1e-3)
+    assert summary["skill_in_subspace"] > skill
+    with caplog.at_level("INFO"):
+        run(data, tmp_path / "again", max_steps=1, validate_every=1)
+    assert re.search(r"position error [\d.]+ mm, skill -?[\d.]+ \(in the subspace alone", caplog.text)
+
+
+def test_more_modes_are_compared_in_full_space(data) -> None:
+    """Both numbers of modes predict their own subspace perfectly; only in full space the larger one is better."""
+    runs = data.runs("validation")
+    scores = []
+    for modes in (2, 4):
+        rollouts = ValidationRollouts(runs, modes, 3, "pose", basis=data.basis)
+        scores.append(rollouts.measure(Known(rollouts.latent, rollouts.force)))
+    two, four = scores
+    assert two.skill_in_subspace == four.skill_in_subspace == pytest.approx(1.0)
+    assert two.skill < four.skill < 1.0 and two.position_rmse > four.position_rmse > 0.0
+    left = reconstruction_of(runs, data.basis.sliced(2))
+    assert two.position_rmse == pytest.approx(left, rel=1e-6)
+    # Where there are no particles, as in published data, it says so.
+    alone = ValidationRollouts([replace(one, path=None) for one in runs], 2, 3, "pose", basis=data.basis)
+    found = alone.measure(Known(alone.latent, alone.force))
+    assert np.isnan(found.position_rmse) and found.words().startswith("skill in the subspace 1.000")
+
+
+def reconstruction_of(runs, basis) -> float:
+    """RMS over axes [m] that the modes leave out after the first 3 frames, mean square over frames, then over runs."""
+    squares = []
+    for one in runs:
+        with Run(one.path) as run:
+            positions = run.positions(slice(3, None))
+            rest = basis.inverse(basis.transform(positions)).numpy() - positions
+            squares.append(np.mean(rest**2))
+    return float(np.sqrt(np.mean(squares)))
 
 
 def test_start_from_another_checkpoint(data, trained, tmp_path) -> None:
@@ -147,20 +212,6 @@ def test_a_checkpoint_of_another_model_or_basis_is_refused(data, trained, tmp_pa
 
 def test_skill_of_truth_and_of_a_frozen_bed(data) -> None:
     rollouts = ValidationRollouts(data.runs("validation"), 4, 3, "pose")
-
-    class Known(torch.nn.Linear):
-        """Gives the answers instead of learning them."""
-
-        predicts_body = False
-
-        def __init__(self, *answers) -> None:
-            super().__init__(1, 1)
-            self.answers = answers
-
-        def unroll(self, latent, body, context):
-            pad = body.position.shape[1] - self.answers[0].shape[1]
-            answers = [torch.cat([a[:, :1].expand(-1, pad, *a.shape[2:]), a], 1) for a in self.answers]
-            return Path(*answers, None, body)
 
     perfect = rollouts.measure(Known(rollouts.latent, rollouts.force))
     assert perfect.skill == pytest.approx(1.0) and perfect.force_nrmse == 0.0

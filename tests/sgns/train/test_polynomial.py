@@ -30,9 +30,9 @@ def without_validation(data, count: int):
     return replace(data, _runs={"train": data.runs("train")[:count], "validation": [], "test": []})
 
 
-def fitted(runs, choosing, **changes):
+def fitted(runs, choosing, basis=None, **changes):
     settings = PolynomialSettings(**POLYNOMIAL), FitSettings.from_dict(FIT | changes)
-    return best_polynomial(runs, choosing, 4, *settings, seed=3)
+    return best_polynomial(runs, choosing, 4, *settings, seed=3, basis=basis)
 
 
 def test_what_is_written_is_what_was_fitted(data, tmp_path) -> None:
@@ -44,7 +44,7 @@ def test_what_is_written_is_what_was_fitted(data, tmp_path) -> None:
     for name, value in model.state_dict().items():
         assert torch.equal(state[name], value), name
     assert torch.equal(loaded.used, model.used) and torch.equal(loaded.terms, model.terms)
-    rollouts = ValidationRollouts(data.runs("validation"), 4, 3, "pose")
+    rollouts = ValidationRollouts(data.runs("validation"), 4, 3, "pose", basis=data.basis)
     assert rollouts.measure(loaded).skill == rollouts.measure(model).skill == skill
     summary = json.loads((tmp_path / "training.json").read_text())
     assert summary["skill"] == skill and summary["coefficients"] == model.num_terms
@@ -73,7 +73,7 @@ def test_without_validation_runs_a_third_chooses_and_all_are_fitted(data, tmp_pa
     skill = run(without_validation(data, 4), tmp_path, training=FIT | quadratic)
     assert "every third training run" in caplog.text
     runs = data.runs("train")
-    without = fitted(runs[1:3], runs[::3], **quadratic)
+    without = fitted(runs[1:3], runs[::3], data.basis, **quadratic)
     assert without.score.skill == skill
     # The same noise and penalty for all runs.
     motion = without.selection.motion

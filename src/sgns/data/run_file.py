@@ -1,0 +1,285 @@
+"""What is in a run file, whether the solver or a network made it, and where; opening one that may be anything.
+
+Letters: T frames, n soil particles, M body points; V vertices and F triangles of a tool that is a mesh.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from mpm_warp import SceneError
+from mpm_warp.bodies import checked_mesh
+from mpm_warp.inputs import MOST_BYTES, open_file
+from sgns import __version__
+from sgns.config import UserError
+from sgns.data.files import ANY_SIZE, one_line
+from sgns.data.hdf5 import BROKEN, own_attribute, own_dataset, own_object
+
+# --- What is in the file: the H5MD 1.1 tree, its units and its root attributes --------------------------
+
+FORMAT = "sgns-run"
+"""Root attribute `format`: says that the file is ours."""
+FORMAT_VERSION = 1
+"""Root attribute `format_version`: raised when an older program could no longer read the file."""
+PRODUCERS = ("mpm", "rollout")
+"""Who may have made a run: the material point solver, or a trained network."""
+_WHOLE, _REAL = (int, np.integer), (float, np.floating)
+ATTRIBUTES: dict[str, type | tuple[type, ...]] = {
+    "format": str,
+    "format_version": _WHOLE,
+    "package_version": str,
+    "producer": str,
+    "seed": _WHOLE,
+    "frame_rate": _REAL,
+    "wall_time_s": _REAL,
+    "arrangement_hash": str,
+    "content_hash": str,
+    "scene": str,
+    "effects": str,
+    "extra": str,
+}
+"""Root attributes and their types; `scene`, `effects` and `extra` are YAML text in UTF-8."""
+STOPPED = "stopped"
+"""Root attribute that only some files have: why a run ended before its time."""
+STATE = "state"
+"""Group of a run whose solver stopped: the arrays to go on from."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Numbers in a run file."""
+
+    path: str
+    """Of the dataset; of a time-dependent one, an H5MD element, the group with `value`, `step` and `time`."""
+    tail: tuple[int | str, ...]
+    """Shape, of one frame of a time-dependent one; letters stand for the counts of this run."""
+    dtype: str
+    si_unit: str
+    description: str
+
+
+# H5MD's own attribute `unit` is left unset on purpose: MDAnalysis refuses lengths in metres.
+SERIES = {
+    "position": Recorded("particles/soil/position", ("n", 3), "<f4", "m", "soil particles, world frame"),
+    "velocity": Recorded("particles/soil/velocity", ("n", 3), "<f4", "m/s", "soil particles, world frame"),
+    "body_points": Recorded(
+        "particles/body/position", ("M", 3), "<f8", "m", "fixed to the body, world frame"
+    ),
+    "force": Recorded(
+        "observables/body/force", (3,), "<f8", "N", "by the soil on the body, world frame, mean of the frame"
+    ),
+    "torque": Recorded(
+        "observables/body/torque",
+        (3,),
+        "<f8",
+        "N m",
+        "by the soil on the body about its centre of mass, world frame, mean over the frame",
+    ),
+    "pose": Recorded(
+        "observables/body/pose",
+        (7,),
+        "<f8",
+        "m, 1",
+        "centre of mass x y z [m], then unit quaternion x y z w, body to world",
+    ),
+}
+"""What is recorded in every frame."""
+MESH = {
+    "vertices": Recorded(
+        "parameters/tool/vertices", ("V", 3), "<f8", "m", "of the tool, about its centre of mass, body frame"
+    ),
+    "triangles": Recorded(
+        "parameters/tool/triangles", ("F", 3), "<i4", "", "vertices of each triangle, facing outwards"
+    ),
+}
+"""What a run has besides whose tool is a mesh."""
+
+
+def series(file: h5py.File, name: str, part: str = "value") -> h5py.Dataset:
+    """A dataset of one of `SERIES`: its `value`, `step` or `time`."""
+    return file[f"{SERIES[name].path}/{part}"]
+
+
+# --- Opening a file that may be anything ----------------------------------------------------------------
+
+
+def open_run(path: str | os.PathLike[str]) -> h5py.File:
+    """The run file, open for reading; only that it is a run of ours is certain.
+
+    Raises:
+        UserError: missing, unreadable, not HDF5, cut short, written by something else or by a newer sgns.
+    """
+    path = Path(path)
+    if not os.path.exists(path):  # unlike Path.exists, takes any name
+        raise UserError(f"no such run file: {path}; check the path, or make one with `sgns simulate`")
+    if path.is_dir():
+        raise UserError(f"{path} is a folder, not a run file; give one of the .h5 files in it")
+    try:
+        open_file(path, ANY_SIZE).close()
+    except ValueError:
+        raise UserError(f"{path} is a pipe or device, not a run file") from None
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}; check its permissions") from error
+    if not h5py.is_hdf5(path):
+        raise UserError(f"{path} is not an HDF5 file; give a run made by `sgns simulate` or `sgns rollout`")
+    try:
+        file = h5py.File(path, "r")
+    except BROKEN as error:
+        raise UserError(
+            f"{path} is cut short or damaged and cannot be opened ({_reason(error)}); "
+            "copy it again or repeat the run"
+        ) from error
+    with ExitStack() as unless_ours:
+        unless_ours.callback(file.close)
+        try:
+            made_as, version = own_attribute(file, "format"), own_attribute(file, "format_version")
+        except BROKEN as error:
+            raise UserError(
+                f"{path} is damaged ({_reason(error)}); copy it again or repeat the run"
+            ) from error
+        if not isinstance(made_as, str) or made_as != FORMAT:
+            raise UserError(
+                f"{path} is HDF5 but not a run of sgns (root attribute `format` is not {FORMAT!r}); "
+                "give a file made by `sgns simulate` or `sgns rollout`"
+            )
+        if not isinstance(version, _WHOLE):
+            raise UserError(f"{path} has no whole number as root attribute `format_version`; repeat the run")
+        if version > FORMAT_VERSION:
+            raise UserError(
+                f"{path} has run format {version}, but sgns {__version__} reads up to {FORMAT_VERSION}; "
+                "upgrade sgns"
+            )
+        unless_ours.pop_all()
+    return file
+
+
+def _reason(error: Exception) -> str:
+    """The part of an HDF5 message that tells a person something."""
+    text = one_line(error)
+    if "truncated" in text:
+        return "the file is shorter than its header says"
+    if "already open for" in text:
+        return "its writer never closed it"
+    return text
+
+
+def read_attributes(file: h5py.File) -> dict[str, Any]:
+    """The root attributes that are there, text as str."""
+    return {name: own_attribute(file, name) for name in (*ATTRIBUTES, STOPPED) if name in file.attrs}
+
+
+def read_mesh(file: h5py.File) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices (V, 3) about the centre of mass [m] and triangles (F, 3) of a run whose tool is a mesh, checked; None if
+    there is none.
+
+    Raises:
+        One of sgns.data.hdf5.BROKEN: It is damaged.
+    """
+    if own_object(file, MESH["vertices"].path) is None:
+        return None
+    try:
+        return checked_mesh(*(own_dataset(file, part.path)[...] for part in MESH.values()))
+    except SceneError as error:
+        raise ValueError(str(error)) from error
+
+
+def require_mesh_was_read(scene: object) -> None:
+    """Refuses a scene out of a file whose tool is a mesh without a digest: such a scene is a person's wish to read the
+    file it names, and no file may have wishes.
+
+    Raises:
+        ValueError: It is one.
+    """
+    tool = scene.get("tool") if isinstance(scene, dict) else None
+    if isinstance(tool, dict) and tool.get("shape") == "mesh":
+        if not isinstance(tool.get("digest"), str) or not tool["digest"]:
+            raise ValueError("its scene names a mesh file without the digest of what was read from it")
+
+
+def structure_problems(file: h5py.File) -> list[str]:
+    """What is missing or has the wrong shape, in words; reads no bulk data.
+
+    A file without such problems can be read by `Run` without surprises.
+    """
+    counts: dict[str, int] = {}  # T, n and M, from the first that shows them
+    problems = list(_attribute_problems(file))
+    for recorded in SERIES.values():
+        problems += _series_problems(file, recorded, counts)
+    return problems + _mesh_problems(file)
+
+
+def _attribute_problems(file: h5py.File) -> Iterator[str]:
+    values = read_attributes(file)
+    yield from (f"root attribute {name!r} is missing" for name in ATTRIBUTES if name not in values)
+    for name, kind in ATTRIBUTES.items():
+        if name in values and not isinstance(values[name], kind):
+            yield f"root attribute {name!r} has the wrong type ({type(values[name]).__name__})"
+    for name, allowed in (("frame_rate", "above 0 Hz"), ("wall_time_s", "0 s or more")):
+        value = values.get(name)
+        if isinstance(value, _REAL) and not (0 <= value < math.inf and (value > 0 or name == "wall_time_s")):
+            yield f"{name} is {value}; it must be {allowed}"
+    digest = values.get("content_hash")  # it becomes the name of a file
+    if isinstance(digest, str) and not re.fullmatch("[0-9a-f]{32}", digest):
+        yield f"root attribute 'content_hash' is {digest[:40]!r}, not 32 hexadecimal digits"
+
+
+def _series_problems(file: h5py.File, recorded: Recorded, counts: dict[str, int]) -> Iterator[str]:
+    datasets = {}
+    for part in ("value", "step", "time"):
+        path = f"{recorded.path}/{part}"
+        try:
+            found = own_dataset(file, path, by_frame=part == "value" and "n" in recorded.tail)
+        except KeyError:
+            yield f"dataset /{path} is missing"
+            continue
+        except ValueError as error:
+            yield str(error)
+            continue
+        if found.dtype.kind in ("iu" if part == "step" else "f"):
+            datasets[part] = found
+        else:
+            yield f"dataset /{path} has the wrong type {found.dtype}"
+    for part, found in datasets.items():
+        expected = ("T", *recorded.tail) if part == "value" else ("T",)
+        known = [counts.get(size, size) if isinstance(size, str) else size for size in expected]
+        fits = len(found.shape) == len(known) and all(
+            isinstance(size, str) or size == actual for size, actual in zip(known, found.shape, strict=True)
+        )
+        if not fits:
+            shown = ", ".join(map(str, known))  # a letter if not known yet
+            yield f"dataset {found.name} has shape {found.shape}, expected ({shown})"
+            continue
+        if found.shape[0] == 0:
+            yield f"dataset {found.name} holds no frame"
+        counts |= {size: n for size, n in zip(known, found.shape, strict=True) if isinstance(size, str)}
+
+
+def _mesh_problems(file: h5py.File) -> list[str]:
+    missing, problems = [], []
+    for part in MESH.values():
+        path = part.path
+        try:
+            if own_object(file, path) is None:
+                missing.append(f"dataset /{path} is missing")
+                continue
+            found = own_dataset(file, path)
+        except (KeyError, ValueError) as error:
+            problems.append(one_line(error).strip("'"))
+            continue
+        if found.ndim != 2 or found.shape[1] != 3 or not len(found):
+            problems.append(f"dataset /{path} has shape {found.shape}, expected (at least 1, 3)")
+        elif found.dtype != np.dtype(part.dtype):
+            problems.append(f"dataset /{path} has the wrong type {found.dtype}")
+        elif found.size * found.dtype.itemsize > MOST_BYTES:
+            problems.append(f"dataset /{path} is larger than {MOST_BYTES / 1e6:.0f} MB")
+    return problems or (missing if len(missing) == 1 else [])  # without both there is no mesh
