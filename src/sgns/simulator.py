@@ -191,7 +191,7 @@ class Simulator:
 
     def __repr__(self) -> str:
         size = f"{len(self.start_positions)} particles in {self.num_modes} modes, {self.frame_rate:g} Hz"
-        return f"Simulator({self._dynamics.settings.kind}: {size}, at frame {self._frame})"
+        return f"Simulator({self.dynamics.settings.kind}: {size}, at frame {self._frame})"
 
     def __copy__(self) -> Simulator:
         copied = object.__new__(type(self))
