@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
@@ -13,6 +14,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
 from hydra.plugins.config_source import ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
@@ -268,6 +270,7 @@ class CheckedLoader(ConfigLoader):
         from_shell: bool = True,
         validate_sweep_overrides: bool = True,
     ) -> DictConfig:
+        overrides = [*known_scene(config_name, overrides), *overrides]
         return self._checked(
             overrides,
             lambda: self._loader.load_configuration(
@@ -276,6 +279,7 @@ class CheckedLoader(ConfigLoader):
         )
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
+        sweep_overrides = [*known_scene(master_config.hydra.job.config_name, sweep_overrides), *sweep_overrides]
         overrides = [*master_config.hydra.overrides.hydra, *sweep_overrides]
         return self._checked(
             overrides, lambda: self._loader.load_sweep_config(master_config, sweep_overrides)
@@ -316,6 +320,48 @@ class CheckedLoader(ConfigLoader):
     def compute_defaults_list(self, config_name: str | None, overrides: list[str], run_mode: RunMode) -> Any:
         require_plain_overrides(overrides)
         return self._loader.compute_defaults_list(config_name, overrides, run_mode)
+
+
+# --- A rollout that names no scene plays the one of its checkpoint --------------------------------------
+
+_KNOWN = "of_checkpoint"
+
+
+def known_scene(command: str | None, overrides: Sequence[str]) -> list[str]:
+    """Overrides that choose scene and soil of the checkpoint, for a rollout that names no scene.
+
+    What a person has to give is left open: the path of a body, and the mesh file of a tool, since no file may name
+    another one to be read.
+
+    Raises:
+        UserError: The checkpoint cannot be read.
+    """
+    if command != "rollout":
+        return []
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+    except HydraException:  # composing says what is wrong
+        return []
+    given = {override.key_or_group: override for override in parsed}
+    checkpoint = given.get("checkpoint")
+    if checkpoint is None or checkpoint.is_sweep_override() or {"scene", "experiment"} & set(given):
+        return []
+    from sgns.model.checkpoint import read_checkpoint
+
+    scene = read_checkpoint(str(checkpoint.value()))["hyper_parameters"].get("scene")
+    if not isinstance(scene, dict) or not isinstance(scene.get("material"), dict):
+        raise UserError(f"{checkpoint.value()} does not say what its scene is; train again")
+    if "${" in json.dumps(scene):
+        raise UserError(f"{checkpoint.value()} has a scene with values that stand for others; give scene=...")
+    tool = scene.get("tool")
+    if isinstance(tool, dict) and tool.get("shape") == "mesh":
+        scene = scene | {"tool": tool | {"file": "???", "digest": ""}}
+    if scene.get("path") is not None:
+        scene = scene | {"path": "???"}
+    groups = {"material": scene["material"], "scene": {k: v for k, v in scene.items() if k != "material"}}
+    for group, node in groups.items():
+        ConfigStore.instance().store(name=_KNOWN, node=node, group=group, provider="sgns")
+    return [f"{group}={_KNOWN}" for group in groups if group not in given]
 
 
 # --- The settings that mean the same in every command, checked before any work is done ------------------

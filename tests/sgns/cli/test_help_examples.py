@@ -1,0 +1,112 @@
+"""The examples of the help pages run as they stand, on data so small that each takes a second."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+
+from mpm_warp import Effects
+from sgns.cli.commands import COMMANDS
+from sgns.data.run import Run
+from sgns.interrupts import Interrupted, heeded_signals
+from sgns.simulate.run import simulate_scene
+from sgns.simulate.scene import scene_from_config
+from sgns_testing.commands import SMALL, TRAIN, call, composed, refused, sgns, small_dataset
+
+# Settings that make an example small; they stand after its own.
+FEW_STEPS = [word for word in TRAIN if not word.startswith("reduction.")]
+FITTED_QUICKLY = ["training.noises=[0.1]", "training.penalties=[1e-3]", "training.threads=1"]
+SMALLER = {
+    "simulate": SMALL,
+    "reduce": ["reduction.max_modes=6"],
+    "train": ["dataset.path=data/quick", "reduction.max_modes=6"],
+    "rollout": ["scene.duration=0.1", "scene.start=0.5"],
+    "evaluate": ["dataset.path=data/quick"],
+}
+LEFT_OUT = {"frontier": "takes minutes: see tests/sgns/frontier", "submitit": "needs a cluster"}
+
+
+def examples() -> list[str]:
+    found = []
+    for command in COMMANDS:
+        page = call(command, "--help").stdout.partition("Examples:\n")[2].partition("\n\n")[0]
+        found += [line.partition("  # ")[0].strip() for line in page.splitlines() if line.strip()]
+    assert all(line.startswith("sgns ") for line in found) and len(found) > 15
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a user has been at work: a dataset, a training, a run and one that was interrupted."""
+    here = tmp_path_factory.mktemp("work")
+    small_dataset(here / "data" / "quick")
+    done = sgns(here, "train", "dataset=quick", *TRAIN, "output=outputs/first")
+    assert done.returncode == 0, done.stderr
+    assert sgns(here, "simulate", *SMALL, "output=run.h5").returncode == 0
+    scene, effects = scene_from_config(composed(*SMALL)), Effects()
+    count = iter(range(100))
+
+    def interrupt() -> None:
+        if next(count) == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(Interrupted), heeded_signals():
+        simulate_scene(
+            scene, here / "run.h5", progress=interrupt, effects=effects, reasons=effects.described()
+        )
+    return here
+
+
+def needed(folder: Path, here: Path, example: str) -> None:
+    """Give `here` what the example reads, and nothing that it makes."""
+    shutil.copytree(folder / "data", here / "data")
+    for name in re.findall(r"=(outputs/\w+)/best\.ckpt|(run[.\w]*\.h5)", example):
+        if "output=" + "".join(name) not in example:
+            source, place = folder / "".join(name), here / "".join(name)
+            place.parent.mkdir(exist_ok=True)
+            (shutil.copytree if source.is_dir() else shutil.copy)(source, place)
+
+
+@pytest.mark.parametrize("example", examples())
+def test_examples_of_the_help_run(example: str, folder: Path, empty_folder: Path) -> None:
+    for word, reason in LEFT_OUT.items():
+        if word in example:
+            pytest.skip(reason)
+    needed(folder, empty_folder, example)
+    # The runs here move in three modes only.
+    few = re.sub(r"num_modes=\d\S*", "num_modes=1,2" if " -m " in example else "num_modes=3", example)
+    _, command, *words = shlex.split(few)
+    smaller = list(SMALLER.get(command, []))
+    if "dataset=quick" in words and command == "simulate":
+        smaller += ["dataset.runs=3", "dataset.path=data/made", "scene.start=0.5"]
+    if command == "train":
+        smaller += FITTED_QUICKLY if "model=polynomial" in words else FEW_STEPS
+    if command in ("train", "reduce") and "num_modes" not in few:
+        smaller += ["reduction.num_modes=3"]
+    if any(word.startswith("continue_from=") for word in words):
+        smaller = []
+    done = call(command, *words, *smaller)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_rollout_plays_the_scene_of_its_checkpoint(folder: Path) -> None:
+    checkpoint = "checkpoint=outputs/first/best.ckpt"
+    assert sgns(folder, "rollout", checkpoint, "scene.depth=0.03", "output=own.h5").returncode == 0
+    with Run(folder / "own.h5") as run:
+        expected = scene_from_config(composed(*SMALL, "scene.depth=0.03")).to_dict()
+        assert run.scene == expected
+    with Run(folder / "run.h5") as run:
+        assert run.scene["depth"] != 0.03
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        assert "scene.slip: no such key" in refused("rollout", checkpoint, "scene.slip=0.2")
+        assert "bed is not the one" in refused("rollout", checkpoint, "scene=excavation", "output=other.h5")
+    finally:
+        os.chdir(before)
