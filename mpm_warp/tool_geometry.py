@@ -12,6 +12,8 @@ from .launch import Launch, find_device
 _HOLDS = 0.15
 """Depth of a wall's middle below where contact begins from which on it holds soil, whatever its speed
 (experiments/stability/thin_walls.csv) [grid spacings]."""
+_SAMPLES = [(1 / 3, 1 / 3), *((u / 8, v / 8) for u in (1, 3, 6) for v in (1, 3, 6) if u + v < 8)]
+"""Places in a triangle, as the shares of its first two corners."""
 _MANY_TRIANGLES = 20_000
 """So many are small: one ray from each is enough."""
 
@@ -26,13 +28,10 @@ def distances(
         thickening: of a mesh at its vertices, as the function of that name gives it [m].
     """
     device, real = find_device("cpu"), wp.float64
-    shape, mesh = shape_data(
-        body, real, margin, device, thickening
-    )  # the mesh has to live as long as the launch
+    shape, _lives_on = shape_data(body, real, margin, device, thickening)
     found = wp.zeros(len(points), dtype=real, device=device)
     given: wp.array = wp.array(points, dtype=wp.types.vector(3, real), device=device)
     Launch(distance_kernel(body.surface), len(points), [given, shape, found], device).launch()
-    del mesh
     return found.numpy()
 
 
@@ -43,24 +42,23 @@ def wall_thickness(body: MeshBody, most: float) -> np.ndarray:
     """How thick the mesh is below each of its triangles [m], shape (t,); infinite where there is no wall of at most
     `most` [m]: no other side that runs along with the triangle, as at edges that taper."""
     device = find_device("cpu")
+
+    def on_device(points: np.ndarray) -> wp.array:
+        return wp.array(points, dtype=wp.vec3, device=device)
+
     vertices, triangles, _ = body.mesh
-    data, mesh = shape_data(body, wp.float32, 0.0, device)
+    mesh = wp.Mesh(on_device(vertices), wp.array(triangles.ravel(), dtype=int, device=device))
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     thickness = np.full(len(triangles), np.inf)
     for u, v in _SAMPLES[: 1 if len(triangles) > _MANY_TRIANGLES else None]:
         begin = u * a + v * b + (1.0 - u - v) * c - 1e-6 * body.reach * normals
-        given = [wp.array(x, dtype=wp.vec3, device=device) for x in (begin, -normals)]
         found = wp.zeros(len(triangles), dtype=wp.float32, device=device)
-        Launch(wall_kernel(), len(triangles), [*given, data.id, most, found], device).launch()
+        given = [on_device(begin), on_device(-normals), mesh.id, most, found]
+        Launch(wall_kernel(), len(triangles), given, device).launch()
         thickness = np.minimum(thickness, found.numpy())
-    del mesh
     return thickness
-
-
-_SAMPLES = [(1 / 3, 1 / 3), *((u / 8, v / 8) for u in (1, 3, 6) for v in (1, 3, 6) if u + v < 8)]
-"""Places in a triangle, as the shares of its first two corners."""
 
 
 def thinnest(body: Tool, most: float) -> float:
