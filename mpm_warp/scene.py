@@ -16,7 +16,7 @@ from .material import Material
 from .poses import in_body_frame, in_world_frame, rotation_matrices, rotation_vectors, sampled_poses
 from .settings import Settings, build, setting, settings
 from .state import SceneError
-from .tool_geometry import distances, thickening
+from .tool_geometry import HOLDS, distances, thickening
 from .units import place_unit, size_warning
 
 MOST_FRAMES = 1_000_000
@@ -302,7 +302,7 @@ class Scene(Settings):
 
     def _check_thickness(self, body: Tool, what: str) -> None:
         """A body must be thick enough for soil to be inside before it is pushed out."""
-        if body.half_thickness + self.contact_distance < 0.1 * self.bed.spacing:
+        if body.half_thickness + self.contact_distance < HOLDS * self.bed.spacing:
             odd = size_warning(body.outline(), self.bed.size, self.open_sides)
             raise SceneError(
                 f"{what} of {2.0 * body.half_thickness:g} m is too thin for a grid of {self.bed.spacing:g} m: "

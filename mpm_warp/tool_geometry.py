@@ -9,9 +9,9 @@ from .bodies import MeshBody, Tool
 from .kernels.signed_distance import distance_kernel, shape_data, wall_kernel
 from .launch import Launch, find_device
 
-_HOLDS = 0.15
-"""Depth of a wall's middle below where contact begins from which on it holds soil, whatever its speed
-(experiments/stability/thin_walls.csv) [grid spacings]."""
+HOLDS = 0.1
+"""How far a wall's middle has to be beyond where contact begins for it to hold soil [grid spacings]
+(experiments/stability/thin_walls.csv)."""
 _SAMPLES = [(1 / 3, 1 / 3), *((u / 8, v / 8) for u in (1, 3, 6) for v in (1, 3, 6) if u + v < 8)]
 """Places in a triangle, as the shares of its first two corners."""
 _MANY_TRIANGLES = 20_000
@@ -70,7 +70,7 @@ def thinnest(body: Tool, most: float) -> float:
 def least_thickness(contact_distance: float, spacing: float) -> float:
     """Of a wall that holds soil with contact where it is, for a distance at which contact begins and a grid spacing
     [m]."""
-    return max(0.0, 2.0 * (_HOLDS * spacing - contact_distance))
+    return max(0.0, 2.0 * (HOLDS * spacing - contact_distance))
 
 
 def thickening(body: Tool, contact_distance: float, spacing: float) -> np.ndarray | None:
