@@ -20,6 +20,7 @@ from .launch import Launch
 from .poses import rotation_vectors
 from .scene import Scene
 from .state import SolverStopped
+from .tool_geometry import thickening
 
 LONGEST_WAY = 0.5
 """Of any point of a body in one substep [grid spacings]."""
@@ -86,7 +87,9 @@ class RigidBody:
         data.margin = scene.contact_distance
         data.layer = HOLDING_LAYER * h if scene.bilateral else 0.0
         outermost = max(0.0, scene.contact_distance + float(data.layer))
-        data.shape, self._mesh = shape_data(shape, real, outermost, device)
+        thicker = thickening(shape, scene.contact_distance, h)
+        data.shape, self._mesh = shape_data(shape, real, outermost, device, thicker)
+        outermost += 0.0 if thicker is None else float(thicker.max())
         data.reach = shape.reach + math.sqrt(3.0) * outermost + h
         data.friction = shape.friction
         data.stiffness, data.damping = contact_spring(scene, scene.filled[1])

@@ -16,7 +16,7 @@ from .material import Material
 from .poses import in_body_frame, in_world_frame, rotation_matrices, rotation_vectors, sampled_poses
 from .settings import Settings, build, setting, settings
 from .state import SceneError
-from .tool_geometry import distances
+from .tool_geometry import HOLDS, distances, thickening
 from .units import place_unit, size_warning
 
 MOST_FRAMES = 1_000_000
@@ -130,10 +130,13 @@ class Scene(Settings):
         if pose[2] - np.abs(rotation_matrices(pose[3:])[2]) @ body.half_size > -1e-9:
             return nobody  # above the soil
         points = in_body_frame(pose, self.filled[0])
-        near = np.flatnonzero((np.abs(points) < body.half_size + max(0.0, self.contact_distance)).all(axis=1))
+        thicker = thickening(body, self.contact_distance, self.bed.spacing)
+        margin = max(0.0, self.contact_distance)
+        most = margin + (0.0 if thicker is None else thicker.max())
+        near = np.flatnonzero((np.abs(points) < body.half_size + most).all(axis=1))
         if len(near) == 0:
             return nobody
-        overlap = self.contact_distance - distances(body, points[near], max(0.0, self.contact_distance))
+        overlap = self.contact_distance - distances(body, points[near], margin, thicker)
         deep = max(self.contact_distance, 0.1 * self.bed.particle_spacing)
         return near[overlap > 0.0] if (overlap > deep).any() else nobody
 
@@ -299,7 +302,7 @@ class Scene(Settings):
 
     def _check_thickness(self, body: Tool, what: str) -> None:
         """A body must be thick enough for soil to be inside before it is pushed out."""
-        if body.half_thickness + self.contact_distance < 0.1 * self.bed.spacing:
+        if body.half_thickness + self.contact_distance < HOLDS * self.bed.spacing:
             odd = size_warning(body.outline(), self.bed.size, self.open_sides)
             raise SceneError(
                 f"{what} of {2.0 * body.half_thickness:g} m is too thin for a grid of {self.bed.spacing:g} m: "

@@ -17,6 +17,8 @@ from .poses import about_y, rotate
 from .scene import Scene
 from .settings import same, setting, settings
 from .state import SceneError
+from .tool_geometry import least_thickness, thickening, thinnest
+from .units import size_warning
 
 CUT_LENGTH = 0.4
 """Horizontal travel of the published cuts [m]."""
@@ -145,12 +147,31 @@ class Body(Scene):
         super().__post_init__()
         if self.path is None:
             raise SceneError("scene.path is missing: a CSV file with columns t,x,y,z,qx,qy,qz,qw")
-        self._check_thickness(self.tool, "a body")
+        if not isinstance(self.tool, MeshBody):  # whose thin walls are made to hold
+            self._check_thickness(self.tool, "a body")
         self._check_inside(self.tool, "the body", "change scene.path or scene.duration")
 
     @property
     def body(self) -> Tool:
         return self.tool
+
+    def warnings(self) -> list[str]:
+        found, h = super().warnings(), self.bed.spacing
+        if size_warning(self.tool.outline(), self.bed.size, self.open_sides):
+            return found  # which is another matter
+        thickness = thinnest(self.tool, 2.0 * h)
+        if thickness < 2.0 * h:
+            found.append(
+                f"the tool's thinnest part is {1e3 * thickness:.3g} mm, {thickness / h:.2g} grid spacings; below 2 the "
+                "soil on its two sides feels each other: use a smaller bed.spacing"
+            )
+        thicker = thickening(self.tool, self.contact_distance, h)
+        if thicker is not None:
+            found.append(
+                f"contact with the tool's thin walls begins up to {1e3 * thicker.max():.2g} mm further out, for soil "
+                f"not to go through them; walls of {1e3 * least_thickness(self.contact_distance, h):.3g} mm need none"
+            )
+        return found
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         x, y, z = force[1:].mean(axis=0)

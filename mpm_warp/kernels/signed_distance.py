@@ -2,12 +2,14 @@
 
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from ..bodies import Tool
 from ..launch import SceneKernel
 
 OUT_OF_REACH = 1.0e6  # [m], for points that cannot touch
+ALONG = -0.95  # most cosine between the normals of a wall's two sides: what tapers faster is an edge
 
 
 @cache
@@ -25,15 +27,21 @@ def shape_struct(real: type) -> type:
         grouser_half: real  # half the thickness
         grouser_offset: real  # added to the grousers' distance: they begin to act at a depth of their own
         id: wp.uint64  # of a mesh
+        thickening: wp.array(
+            dtype=wp.float32
+        )  # at its vertices, or none: how far outside it the surface is taken
 
     return Size
 
 
-def shape_data(body: Tool, real: type, margin: float, device: wp.Device) -> tuple[object, wp.Mesh | None]:
+def shape_data(
+    body: Tool, real: type, margin: float, device: wp.Device, thickening: np.ndarray | None = None
+) -> tuple[object, wp.Mesh | None]:
     """The filled struct of a body, and the mesh that has to be kept alive with it.
 
     Args:
         margin: distance at which contact begins, negative inside [m].
+        thickening: of a mesh at its vertices [m], shape (k,), see `tool_geometry.thickening`.
     """
     data, mesh, half = shape_struct(real)(), None, body.half_size
     if body.surface == "cylinder":
@@ -50,6 +58,9 @@ def shape_data(body: Tool, real: type, margin: float, device: wp.Device) -> tupl
             support_winding_number=True,
         )
         data.id, half = mesh.id, half + max(0.0, margin)
+        if thickening is not None:
+            data.thickening = wp.array(thickening, dtype=wp.float32, device=device)
+            half = half + float(thickening.max())
     data.half = wp.types.vector(3, real)(*half)
     return data, mesh
 
@@ -73,6 +84,28 @@ def distance_kernel(shape: str) -> SceneKernel:
         found[i] = outward(points[i], size)[3]
 
     return distance
+
+
+@cache
+def wall_kernel() -> SceneKernel:
+    """Kernel that finds how thick a mesh is along rays from its surface inwards [m]; infinite where the other side is
+    further than `most` or does not run along with this one."""
+
+    @SceneKernel
+    def wall(
+        i: int,
+        begin: wp.array(dtype=wp.vec3),
+        inwards: wp.array(dtype=wp.vec3),
+        mesh: wp.uint64,
+        most: wp.float32,
+        found: wp.array(dtype=wp.float32),
+    ):
+        hit = wp.mesh_query_ray(mesh, begin[i], inwards[i], most)
+        found[i] = wp.float32(wp.inf)
+        if hit.result and wp.dot(wp.mesh_eval_face_normal(mesh, hit.face), -inwards[i]) < wp.static(ALONG):
+            found[i] = hit.t
+
+    return wall
 
 
 @cache
@@ -165,7 +198,15 @@ def _mesh(real: type) -> wp.Function:
                 n = wp.mesh_eval_face_normal(size.id, query.face)
                 if distance > wp.float32(1.0e-6) * wp.length(p):
                     n = away * (query.sign / distance)
-                found = vec4(real(n[0]), real(n[1]), real(n[2]), real(query.sign * distance))
+                distance *= query.sign
+                if size.thickening.shape[0] > 0:
+                    corners = wp.mesh_get(size.id).indices
+                    k = 3 * query.face
+                    distance -= (
+                        query.u * size.thickening[corners[k]] + query.v * size.thickening[corners[k + 1]]
+                    )
+                    distance -= (wp.float32(1.0) - query.u - query.v) * size.thickening[corners[k + 2]]
+                found = vec4(real(n[0]), real(n[1]), real(n[2]), real(distance))
         return found
 
     return mesh_distance

@@ -219,6 +219,7 @@ def rollout_scene(
 
 def main(cfg: DictConfig) -> float:
     """The `sgns rollout` command; returns wall seconds per simulated second (steps with force)."""
+    from mpm_warp import Preview
     from sgns.simulate.campaign import require_space, run_cost
     from sgns.simulate.scene import scene_from_config
     from sgns.simulator import Simulator
@@ -231,6 +232,9 @@ def main(cfg: DictConfig) -> float:
     )
     require_same_freedom(simulator, scene, cfg.checkpoint)
     require_known_bed(simulator, scene, cfg.checkpoint)
+    for warning in Preview.of(scene).warnings:
+        if warning not in scene.warnings():  # those are of the solver
+            log.warning("%s", warning)
     ignored = unlearned(simulator.scene, scene.to_dict(), simulator.context_keys)
     if ignored:
         log.warning("the network follows the tool's path only; it does not know of %s", ", ".join(ignored))

@@ -80,8 +80,10 @@ def test_a_tool_that_starts_in_the_soil_is_told():
     ],
 )
 def test_the_size_of_a_tool_is_looked_at(scale, words):
-    found = Preview.of(body(np.add(ROWS, [0, 0, 0, 0.5]), tool=mesh(scale))).warnings
-    assert any(re.search(words, line) for line in found), found
+    found, _ = Preview.of(
+        body(np.add(ROWS, [0, 0, 0, 0.5]), tool=mesh(scale))
+    ).warnings  # and touches nothing
+    assert re.search(words, found), found
 
 
 def test_a_channel_may_be_narrower_than_the_tool():
@@ -100,7 +102,7 @@ def test_a_channel_may_be_narrower_than_the_tool():
         ),
         (lambda: body(tool=mesh(1000.0)), "leaves the bin .* 200 m long, .* look like millimetres"),
         (
-            lambda: body(tool=mesh(0.001), bed=Bed(particles_per_cell=8.0)),
+            lambda: body(tool=Box(size=(5e-5, 2e-4, 1e-4)), bed=Bed(particles_per_cell=8.0)),
             "too thin .* thousand times too small",
         ),
     ],

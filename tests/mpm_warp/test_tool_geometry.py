@@ -1,11 +1,12 @@
-"""Tools in the soil at the start: distances, what is left out, and that the rest stays calm."""
+"""Tools in the soil at the start: distances, what is left out, and that the rest stays calm. Thin walls of meshes."""
 
 import numpy as np
 import pytest
+from thin_walls import measure, pushed_sheet
 
 from mpm_warp import Bed, Body, Box, Cylinder, MeshBody, Scene, Solver, Wheel, effects_for
 from mpm_warp.poses import about_y
-from mpm_warp.tool_geometry import distances
+from mpm_warp.tool_geometry import distances, thickening, thinnest, wall_thickness
 from sgns_testing.meshes import box_corners, box_triangles
 from sgns_testing.scenes import cut
 
@@ -83,3 +84,81 @@ def test_stress_around_a_buried_tool_is_that_of_the_whole_bed():
     whole, part = Solver(cut(bed=BED)).particles, Solver(buried()).particles
     kept = np.delete(np.arange(whole.position.size), buried().displaced)
     np.testing.assert_array_equal(part.stress.numpy(), whole.stress.numpy()[kept])
+
+
+# --- Thin walls of meshes -------------------------------------------------------------------------------
+
+
+def extruded(outline, width=0.2) -> MeshBody:
+    """A mesh with an outline (x, z) [m] in turn, cut into triangles from its first corner, along y."""
+    n, corners = len(outline), [(x, y, z) for y in (0.0, width) for x, z in outline]
+    side = [(0, k, k + 1) for k in range(1, n - 1)]
+    faces = [*side, *((n + c, n + b, n + a) for a, b, c in side)]
+    for a in range(n):
+        b = (a + 1) % n
+        faces += [(b, a, a + n), (b, a + n, b + n)]
+    vertices, triangles = np.array(corners), np.array(faces)
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    parts = np.einsum("ij,ij->i", a, np.cross(b, c))
+    centre = (parts[:, None] * (a + b + c)).sum(axis=0) / (4.0 * parts.sum())
+    return MeshBody.of_mesh(vertices - centre, triangles if parts.sum() > 0.0 else triangles[:, ::-1])
+
+
+# A V of sheet, 1 mm thick, seen from its inner corner: its bounding box is 10 cm deep.
+SHEET = 0.001 * np.sqrt(2.0)
+BENT = extruded([(0.0, SHEET), (-0.1, 0.1 + SHEET), (-0.1, 0.1), (0.0, 0.0), (0.1, 0.1), (0.1, 0.1 + SHEET)])
+HOLLOW = MeshBody.of_mesh(
+    np.concatenate(
+        [box_corners((0.1, 0.1, 0.1), -0.05 * np.ones(3)), box_corners((0.098,) * 3, -0.049 * np.ones(3))]
+    ),
+    np.concatenate([box_triangles(), box_triangles()[:, ::-1] + 8]),
+)
+
+
+@pytest.mark.parametrize("tool", [BENT, HOLLOW], ids=["bent", "hollow"])
+def test_walls_are_measured_through_the_mesh(tool):
+    assert tool.half_thickness > 0.04
+    assert thinnest(tool, 0.04) == pytest.approx(0.001, rel=1e-3)
+    assert thinnest(Box(size=SIZE), 0.04) == 0.05
+
+
+def test_what_tapers_is_an_edge_and_what_is_thick_no_wall():
+    wedge = extruded([(0.0, 0.0), (0.1, 0.0), (0.1, 0.06)])
+    assert np.isinf(wall_thickness(wedge, 0.1)).all()
+    assert np.isinf(wall_thickness(mesh_box(), 0.04)).all()
+    assert wall_thickness(mesh_box(), 0.06).min() == pytest.approx(0.05, rel=1e-3)
+
+
+def test_thin_walls_begin_to_act_further_out():
+    """Soil is pressed in by at least a tenth of a grid spacing before it is nearer to the other side."""
+    for density, distance in ((1.0, 0.005), (8.0, 0.0), (27.0, -5e-3 / 3)):
+        bed = Bed(spacing=0.02, particles_per_cell=density)
+        scene = buried(HOLLOW, height=0.2, bed=bed)
+        assert scene.contact_distance == pytest.approx(distance)
+        found = thickening(HOLLOW, scene.contact_distance, 0.02)
+        if density == 1.0:
+            assert found is None
+        else:
+            np.testing.assert_allclose(found, 0.002 - distance - 0.0005, rtol=1e-3)
+            at = np.array([[0.06, 0.0, 0.0], [0.0495, 0.01, 0.0], [0.0, 0.0, 0.0]])
+            expected = [0.01, -0.0005, 0.049] - found[0]
+            np.testing.assert_allclose(distances(HOLLOW, at, 0.1, found), expected, atol=1e-6)
+    assert thickening(mesh_box(), 0.0, 0.02) is None and thickening(Box(size=SIZE), 0.0, 0.02) is None
+
+
+def test_walls_that_are_thinner_than_the_grid_are_told():
+    thin = buried(HOLLOW, height=0.2, bed=Bed(spacing=0.02, particles_per_cell=8.0)).warnings()
+    assert thin[0].startswith("the tool's thinnest part is 1 mm, 0.05 grid spacings; below 2 the soil")
+    assert thin[1].endswith(
+        "begins up to 1.5 mm further out, for soil not to go through them; walls of 4 mm need none"
+    )
+    assert len(buried(HOLLOW, height=0.2).warnings()) == 2
+    assert buried(height=0.2).warnings() == []
+
+
+@pytest.mark.parametrize("thickness", [0.001, 0.002])
+def test_thin_walls_hold_soil(thickness):
+    """At 1 m/s and 8 particles per cell, which leaks without."""
+    assert measure(thickness, 8.0, 1.0, thickened=False)["through_inside"] > 0.02
+    assert measure(thickness, 8.0, 1.0, thickened=True)["through_inside"] == 0.0
+    assert pushed_sheet(thickness, 8.0, 1.0).tool.half_thickness < 0.1 * 0.02

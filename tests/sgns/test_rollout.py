@@ -1,14 +1,18 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from sgns import rollout as rolling
 from sgns.config import UserError
 from sgns.data import run as chunks
 from sgns.data.check import check_run
 from sgns.data.run import Run
 from sgns.model.training_range import Excess
 from sgns.rollout import bed_differences, require_known_bed, rollout_scene, unlearned
+from sgns.simulator import Simulator
+from sgns_testing.commands import composed
 from sgns_testing.meshes import box_corners, box_triangles
 from sgns_testing.surrogates import FakeSimulator, fitted, small_dataset
 
@@ -166,3 +170,18 @@ def test_a_rollout_holds_the_mesh_of_its_tool(simulator, tmp_path):
     with Run(tmp_path / "a.h5") as run:
         for found, known in zip(run.mesh, scene.mesh, strict=True):
             np.testing.assert_array_equal(found, known)
+
+
+def test_a_path_that_comes_to_nothing_is_told(tmp_path, monkeypatch, caplog):
+    """As `sgns simulate` does, without what is about the solver only."""
+    file = tmp_path / "path.csv"
+    file.write_text("t,x,y,z,qx,qy,qz,qw\n0,400,300,120,0,0,0,1\n2,500,300,30,0,0,0,1\n")
+    known = SimpleNamespace(scene={}, context_keys=())
+    monkeypatch.setattr(Simulator, "load", lambda *_, **__: known)
+    for check in ("require_known_bed", "require_same_freedom"):
+        monkeypatch.setattr(rolling, check, lambda *_: None)
+    monkeypatch.setattr(rolling, "rollout_scene", lambda *_, **__: rolling.RolloutTiming(1.0, 1.0, 1.0))
+    thin = ["scene=body", f"scene.path={file}", "scene.tool.size=[0.01,0.2,0.1]"]
+    rolling.main(composed(*thin, "checkpoint=a.ckpt", f"output={tmp_path / 'run.h5'}", command="rollout"))
+    (words,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert "the positions look like millimetres" in words
