@@ -30,6 +30,12 @@ def start_warp() -> None:
     Raises:
         SceneError: it has no place for compiled kernels.
     """
+    named = wp.config.kernel_cache_dir or os.getenv("WARP_CACHE_PATH") or os.getenv("XDG_CACHE_HOME")
+    if not named and os.path.expanduser("~") == "~":  # Warp would make a folder of that name here
+        raise SceneError(
+            "this user has no home folder, where Warp keeps compiled kernels; name a folder for them in the "
+            "environment variable WARP_CACHE_PATH"
+        )
     # Warp announces every kernel it loads; here only its warnings are of use.
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     quiet: AbstractContextManager = nullcontext()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +10,7 @@ import warp as wp
 
 from .bed import Bed
 from .launch import find_device
+from .machine import usable_memory
 from .material import Material
 from .rigid_body import longest_step
 from .scene import Scene
@@ -173,12 +173,7 @@ def require_memory(scene: Scene, precision: str, device: str, symmetry: bool) ->
 
 def _memory(device: wp.Device) -> float:
     """Of a device [bytes]; infinite where the system does not say."""
-    if device.is_cuda:
-        return device.total_memory
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return math.inf
+    return device.total_memory if device.is_cuda else usable_memory()
 
 
 # --- Where a solver has to stop: values that are not finite, or that soil cannot have -------------------

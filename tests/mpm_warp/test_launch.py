@@ -107,6 +107,21 @@ def test_no_place_for_a_cache_is_one_line(tmp_path):
     assert done.stderr == ""
 
 
+def test_a_user_without_a_home_is_one_line(tmp_path):
+    """As one of a container whom its system does not know."""
+    code = (
+        "import os, pwd\nfrom mpm_warp.launch import find_device\npwd.getpwuid = {}.__getitem__\n"
+        "try: find_device('cpu')\nexcept ValueError as e: print(e)"
+    )
+    names = ("HOME", "XDG_CACHE_HOME", "WARP_CACHE_PATH")
+    variables = {name: value for name, value in os.environ.items() if name not in names}
+    command, captured = [sys.executable, "-c", code], {"capture_output": True, "text": True}
+    done = subprocess.run(command, cwd=tmp_path, env=variables, **captured)
+    (line,) = done.stdout.splitlines()
+    assert "has no home folder" in line and "WARP_CACHE_PATH" in line, done
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_kernels_compile_for_a_gpu(tmp_path):
     """Also where there is none: Warp brings CUDA's compiler."""
     find_device("cpu")

@@ -166,10 +166,25 @@ def open_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     Raises:
         OSError: It cannot be read.
         ValueError: It is a pipe or device, for whose data HDF5 would wait.
+        UserError: Somebody writes to it.
     """
     open_file(Path(path), ANY_SIZE).close()
-    with h5py.File(path, "r") as file:
+    with opened(path) as file:
         yield file
+
+
+def opened(path: str | os.PathLike[str]) -> h5py.File:
+    """`h5py.File(path, "r")`, but a file that has a writer is not taken for damaged.
+
+    Raises:
+        UserError: Somebody writes to it.
+    """
+    try:
+        return h5py.File(path, "r")
+    except BlockingIOError as error:  # HDF5 locks what it writes to
+        raise UserError(
+            f"{path} is open for writing in another program; wait until that has closed it, or copy the file"
+        ) from error
 
 
 def own_attribute(owner: h5py.Group | h5py.Dataset, name: str) -> Any:

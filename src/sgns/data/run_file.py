@@ -23,7 +23,7 @@ from mpm_warp.inputs import MOST_BYTES, open_file
 from sgns import __version__
 from sgns.config import UserError
 from sgns.data.files import ANY_SIZE, one_line
-from sgns.data.hdf5 import BROKEN, own_attribute, own_dataset, own_object
+from sgns.data.hdf5 import BROKEN, opened, own_attribute, own_dataset, own_object
 
 # --- What is in the file: the H5MD 1.1 tree, its units and its root attributes --------------------------
 
@@ -133,7 +133,7 @@ def open_run(path: str | os.PathLike[str]) -> h5py.File:
     if not h5py.is_hdf5(path):
         raise UserError(f"{path} is not an HDF5 file; give a run made by `sgns simulate` or `sgns rollout`")
     try:
-        file = h5py.File(path, "r")
+        file = opened(path)
     except BROKEN as error:
         raise UserError(
             f"{path} is cut short or damaged and cannot be opened ({_reason(error)}); "
@@ -169,7 +169,7 @@ def _reason(error: Exception) -> str:
     if "truncated" in text:
         return "the file is shorter than its header says"
     if "already open for" in text:
-        return "its writer never closed it"
+        return "it is being written, or its writer never closed it"
     return text
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from mpm_warp.machine import usable_cores
 from sgns import __version__
 from sgns.data.run import Run
 from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
@@ -53,7 +54,6 @@ def command_line() -> str:
 def provenance(simulator: Simulator, checkpoint: Path) -> dict[str, str]:
     """Name → value, in the order to show; what is not known is left out."""
     settings = simulator.card.get("settings", {})
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     facts = {
         "command": command_line(),
         "checkpoint": str(checkpoint),
@@ -64,7 +64,7 @@ def provenance(simulator: Simulator, checkpoint: Path) -> dict[str, str]:
         "history frames": str(simulator.history),
         "basis fitted on": f"{len(simulator.basis.fitted_on or ())} training runs",
         "package": f"sgns {__version__}, torch {torch.__version__}, Python {platform.python_version()}",
-        "machine": f"{cpu_model()}, {cores} cores, {platform.system()}",
+        "machine": f"{cpu_model()}, {usable_cores()} cores, {platform.system()}",
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
     }
     return {name: value for name, value in facts.items() if value}

@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
 from mpm_warp.launch import Job
+from mpm_warp.machine import usable_cores
 from mpm_warp.solver import run_concurrently
 from sgns.config import UserError, flattened
 from sgns.data.files import file_lock, remove_abandoned
@@ -95,7 +96,7 @@ def simulate_campaign(
     size = sum(costs[name].size for name in missing)
     require_space(campaign.path, size)
     compile_kernels(campaign, missing, device)
-    workers = min(workers or (1 if device != "cpu" else len(os.sched_getaffinity(0))), len(missing))
+    workers = min(workers or (1 if device != "cpu" else usable_cores()), len(missing))
     batch = min(batch, math.ceil(len(missing) / workers))
     pool = Workers(campaign, {name: costs[name] for name in missing}, device, workers, batch)
     failed = pool.make_all(f"about {size_words(size)} of disk")

@@ -20,6 +20,7 @@ import lightning as L
 import numpy as np
 import torch
 from lightning.pytorch.plugins import TorchCheckpointIO
+from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from tqdm import tqdm
@@ -297,6 +298,10 @@ def make_trainer(task: Task, callbacks: list[L.Callback]) -> L.Trainer:
         raise UserError(f"device is {device!r}; allowed: cpu, cuda")
     if device == "cuda" and not torch.cuda.is_available():
         raise UserError("device is cuda but torch finds no CUDA device; use device=cpu")
+    # One process, whatever a cluster's job says of its tasks: Lightning would look for the others, requeue the job
+    # itself, and log nothing in any but the first.
+    alone = LightningEnvironment()
+    alone.set_global_rank(0)
     return L.Trainer(
         accelerator="gpu" if device == "cuda" else "cpu",
         devices=1,
@@ -310,7 +315,7 @@ def make_trainer(task: Task, callbacks: list[L.Callback]) -> L.Trainer:
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        plugins=[WholeCheckpoints()],
+        plugins=[WholeCheckpoints(), alone],
     )
 
 
@@ -342,7 +347,8 @@ def run_trainer(trainer: L.Trainer, module: SurrogateTraining, data: WindowLoade
         trainer.fit(module, data, ckpt_path=None if last is None else str(last), weights_only=True)
     except SystemExit as error:
         # Lightning turns Ctrl-C into an exit of its own.
-        raise KeyboardInterrupt from error
+        interruption = error.__context__
+        raise (interruption if isinstance(interruption, KeyboardInterrupt) else KeyboardInterrupt()) from None
     except Exception as error:
         if last is None or module.begun or isinstance(error, UserError):
             raise

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sgns.config import UserError
+from sgns.data.check import check_run
 from sgns.data.run import Run
 from sgns.data.surface import soil_surface
 from sgns_testing.runs import make_run
@@ -49,6 +50,20 @@ def test_a_closed_run_keeps_what_was_read(tmp_path):
     assert run.scene and run.producer == "mpm"
     with pytest.raises(ValueError, match="is closed"):
         run.positions()
+
+
+def test_a_run_that_is_open_elsewhere_is_not_called_damaged(tmp_path):
+    fcntl = pytest.importorskip("fcntl")
+    path = make_run(tmp_path / "a.h5")
+    with path.open("r+b") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # as HDF5 does for who writes
+        with pytest.raises(
+            UserError, match=r"a\.h5 is open for writing in another program; wait until"
+        ) as caught:
+            Run(path)
+        assert "damaged" not in str(caught.value)
+        assert check_run(path) == [str(caught.value)]
+    assert check_run(path) == []
 
 
 def test_opening_reads_no_soil(tmp_path):

@@ -113,6 +113,13 @@ def test_shards_are_the_campaign_in_shares_of_like_work(tmp_path, order):
     assert len(order) == 6
 
 
+def test_a_system_that_does_not_say_which_cores_a_process_has(tmp_path, order, monkeypatch):
+    """As macOS."""
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    simulate_campaign(campaign(tmp_path), device="cpu")
+    assert len(order) == 10
+
+
 @pytest.mark.parametrize("shard", [2, -1])
 def test_shards_it_refuses(tmp_path, shard):
     with pytest.raises(UserError, match=f"shard is {shard}; with shards=2 .* from 0 to 1"):

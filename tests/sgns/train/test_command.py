@@ -6,6 +6,10 @@ import itertools
 import json
 import os
 import re
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +30,7 @@ from sgns.simulator import Simulator
 from sgns.train import lightning_module as module
 from sgns.train.command import main, train
 from sgns.train.validation import ValidationRollouts
+from sgns_testing.commands import TRAIN, environment
 from sgns_testing.tiny import BRIEF, MODEL, REDUCTION, TRAINING, make_dataset
 
 
@@ -328,3 +333,53 @@ def test_a_pipe_stays_a_pipe(data, tmp_path, monkeypatch, name, resume) -> None:
     with pytest.raises(UserError, match=f"{name}: it is a pipe"):
         run(data, tmp_path, resume=resume)
     assert (tmp_path / name).is_fifo()
+
+
+# --- in a job of a cluster ---------------------------------------------------------------------------------
+
+SECOND_OF_TWO_TASKS = {
+    **{"SLURM_JOB_ID": "17", "SLURM_JOB_NAME": "job", "SLURM_NTASKS": "2", "SLURM_NODELIST": "here"},
+    **{"SLURM_PROCID": "1", "SLURM_LOCALID": "1", "SLURM_NODEID": "0"},
+}
+
+
+@pytest.fixture
+def begin_in_a_job(tmp_path):
+    """Begins `sgns train` in an allocation, with settings of its own."""
+    make_dataset(tmp_path / "data", frames=40)
+
+    def begin(*settings: str) -> subprocess.Popen[str]:
+        command = [
+            sys.executable,
+            "-m",
+            "sgns",
+            "train",
+            "dataset.path=data",
+            *TRAIN,
+            "output=out",
+            *settings,
+        ]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        return subprocess.Popen(command, cwd=tmp_path, env=environment() | SECOND_OF_TWO_TASKS, **pipes)
+
+    return begin
+
+
+def test_in_an_allocation_of_several_tasks_it_is_one_process(begin_in_a_job, tmp_path) -> None:
+    process = begin_in_a_job()
+    _, said = process.communicate(timeout=100)
+    assert (process.returncode, said) == (0, "")
+    assert list((tmp_path / "out" / "tensorboard").glob("events*"))  # it also logs
+
+
+@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
+def test_a_cluster_s_signal_ends_it_as_ctrl_c_does(begin_in_a_job, tmp_path, number) -> None:
+    process = begin_in_a_job("training.max_steps=1000000")
+    deadline = time.monotonic() + 60.0
+    while not (tmp_path / "out" / "last.ckpt").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert said == "sgns train: interrupted; to go on, give the same command with output=out\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "out"]  # no checkpoint of Lightning's
