@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -167,6 +168,11 @@ class EvaluatedRun:
     scores: Scores  # every metric
     wheel: bool = False  # whether its body is a wheel
 
+    @property
+    def main_errors(self) -> tuple[float, float]:
+        """Of the positions [mm] and of the force [NRMSE]."""
+        return self.scores.rmse_mm("total"), self.scores.force.overall_nrmse
+
 
 @dataclass(frozen=True)
 class NetworkTiming:
@@ -238,6 +244,29 @@ class Evaluation:
     chosen_by: Sequence[str] = ()  # names of those that chose the checkpoint
     new_rollouts: Sequence[Path] = ()  # run files without truth that are shown too
     made: dict[str, str] = field(default_factory=dict)  # how it was made: name → value, in the order to show
+
+    @property
+    def median_errors(self) -> tuple[float, float]:
+        """Over the runs, of the positions [mm] and of the force [NRMSE]; NaN where no run has any."""
+        rmse, nrmse = (
+            [error for error in errors if not math.isnan(error)]
+            for errors in zip(*(run.main_errors for run in self.runs), strict=True)
+        )
+        return statistics.median(rmse or [math.nan]), statistics.median(nrmse or [math.nan])
+
+
+def typical_and_worst(evaluation: Evaluation) -> tuple[EvaluatedRun, EvaluatedRun]:
+    """The run nearest to the medians of both main errors, by factors, and the one farthest above either of them."""
+
+    def factors(run: EvaluatedRun) -> list[float]:
+        pairs = zip(run.main_errors, evaluation.median_errors, strict=True)
+        # 1 where there is no force, or no error at all.
+        return [e / m if 0.0 < m < math.inf and not math.isnan(e) else 1.0 for e, m in pairs]
+
+    def distance(run: EvaluatedRun) -> float:
+        return sum(abs(math.log(max(factor, 1e-9))) for factor in factors(run))
+
+    return min(evaluation.runs, key=distance), max(evaluation.runs, key=lambda run: max(factors(run)))
 
 
 def seen_before(simulator: Simulator, names: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -10,6 +10,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from sgns.evaluate.figures import PICTURE_WIDTH
 from sgns.evaluate.metrics import ParticleErrors, PositionErrors, VectorErrors
 from sgns.evaluate.report import (
     FigureGroup,
@@ -23,6 +24,7 @@ from sgns.evaluate.report import (
 )
 from sgns.evaluate.results import Costs, EvaluatedRun, Evaluation, FullSpaceCost, NetworkTiming, aggregate
 from sgns.reduction.basis import Basis, ReductionCurves
+from sgns_testing.pictures import SMALLEST_TEXT
 from sgns_testing.surrogates import made_scores
 
 EVIL = '<script>alert("run&1")</script>'
@@ -70,7 +72,7 @@ class Tags(HTMLParser):
         self.tags.append(tag)
         self.links += [value for key, value in attrs if key in ("src", "href", "action", "srcset")]
         self.headings += [value for key, value in attrs if tag == "h2" and key == "id"]
-        if tag not in ("meta", "img", "br"):
+        if tag not in ("meta", "img", "br", "input"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
@@ -100,6 +102,15 @@ def summary(result):
     """The words of the first paragraph of the page."""
     text = render_report(result, []).partition("<p>")[2].partition("</p>")[0]
     return " ".join(html.unescape(text).split())
+
+
+def test_pictures_can_be_read_on_a_desktop_and_opened_in_full():
+    page = render_report(evaluation(), [group(b"\x89PNG")] * 3)
+    assert page.count('<input type="checkbox" class="zoom"') == 3 == page.count("<label>")
+    assert ".zoom:checked + img { position: fixed;" in page
+    narrowest = 16 * float(re.search(r"minmax\(min\(([\d.]+)rem, 100%\)", page)[1])
+    size = SMALLEST_TEXT * narrowest / (72 * PICTURE_WIDTH)  # [pixels of the page], of text in points
+    assert size >= 9.0
 
 
 def test_page_is_well_formed_and_needs_nothing_from_outside():
