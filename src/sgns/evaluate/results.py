@@ -176,10 +176,13 @@ class EvaluatedRun:
 
 @dataclass(frozen=True)
 class NetworkTiming:
-    """Wall seconds per simulated second of the network: medians of warm repeats on one thread."""
+    """Wall seconds per simulated second of network and solver, measured in turn on one thread: medians of warm
+    repeats."""
 
-    rollout: float  # steps with force and torque; the soil stays in the subspace
+    rollout: float  # along a known path: steps with force and torque; the soil stays in the subspace
     decoded: float  # the same, and every frame decoded to all particles
+    stepped: float  # `Simulator.step`, pose by pose, likewise in the subspace
+    solver: float  # nothing written; NaN where the run does not say what it takes to compute it again
     repeats: int  # number of timed repeats
     run: str  # run that was timed
     rollout_bytes: float = math.nan  # peak memory of the whole process while it steps; NaN if not known
@@ -303,8 +306,10 @@ def write_tables(evaluation: Evaluation, output: Path) -> None:
             "runs": [score.row() for score in scores],
             "mean_training_force_N": evaluation.mean_force,
             "wall_s_per_simulated_s": {
-                "solver": evaluation.total.solver_rate,
+                "solver": timing.solver,
+                "solver_in_run_files": evaluation.total.solver_rate,
                 "network_stepping_with_force": timing.rollout,
+                "network_pose_by_pose": timing.stepped,
                 "network_with_decoding": timing.decoded,
                 "network_threads": 1,
                 "network_repeats": timing.repeats,

@@ -171,8 +171,7 @@ def test_a_body_from_the_command_line(tmp_path):
     assert Run(tmp_path / "run.h5").body_points.shape[1] == 4
     # Where the origin came to lie in the tool, and that nothing will happen.
     assert (
-        "the path is that of the tool's centre of mass; around it the tool reaches from -22 to"
-        in done.stdout
+        "the path is that of the tool's centre of mass; around it the tool reaches from -22 to" in done.stdout
     )
     assert "the tool never touches soil: its lowest point stays 76.7 mm" in done.stdout + done.stderr
 
