@@ -36,7 +36,7 @@ class Wish:
 
     scene: str  # whose points are looked at
     limits: Mapping[str, float]  # key of `error` → largest error, in the unit of the column
-    time: float | None  # longest wall time of a step of `STEP` [s], or None
+    time: float | None  # longest wall time of a step of `STEP`, as a control loop calls it [s], or None
     particles: bool  # whether the positions of all particles are wanted in every step
     own: bool  # judge by the errors against the solver that made the training runs
     bands: Mapping[str, float]  # column → how wrong the reference itself may be
@@ -46,8 +46,10 @@ class Wish:
         return f"own_{ERRORS[key][0]}" if self.own else ERRORS[key][0]
 
     def step_time(self, point: Point) -> float:
-        """Wall time of a step of a point [s]; NaN if it is not known."""
-        return STEP * (point.decoded_cost if self.particles else point.cost)
+        """Wall time of a step of a point, pose by pose where that was measured, else along a path that is known
+        beforehand [s]; NaN if neither is known."""
+        cost = point.cost if math.isnan(point.stepped_cost) else point.stepped_cost
+        return STEP * (cost + (point.decoded_cost - point.cost if self.particles else 0.0))
 
     def error(self, point: Point, key: str) -> float:
         """What counts: of a surrogate the larger of its error and of that against the solver that made its training
@@ -104,9 +106,14 @@ def advice(points: Sequence[Point], wish: Wish) -> list[str]:
     lines = [
         f"{'use' if met else 'nothing meets this; closest'}: {point.kind}, {point.label}",
         *(f"  {line}" for line in commands(point)),
-        f"  costs {1e3 * step:.3g} ms per step of 1/60 s{soil}, on one core of {point.machine}: up to "
-        f"{1.0 / step:.3g} steps a second",
+        f"  costs {1e3 * step:.3g} ms per step of 1/60 s{called(point)}{soil}, on one core of {point.machine}: up to "
+        f"{float(f'{1.0 / step:.3g}'):g} steps a second",
     ]
+    if point.kind == "surrogate" and math.isnan(point.stepped_cost):
+        lines.append(
+            "  a step with Simulator.step, pose by pose, takes longer, up to a millisecond more; this table does not "
+            "have it: sgns evaluate measures it"
+        )
     for key, (_, _, words, unit) in ERRORS.items():
         column = wish.column(key)
         value = effective_error(point, column, wish.bands)
@@ -138,6 +145,13 @@ def advice(points: Sequence[Point], wish: Wish) -> list[str]:
         f"  rests on study {point.study}, scene {point.scene}: errors against {against}; measured with {measured}"
     )
     return lines + ([f"  note: {point.note}"] if point.note else [])
+
+
+def called(point: Point) -> str:
+    """How a step is called whose cost is known."""
+    if point.kind != "surrogate":
+        return ""
+    return " along a known path (sgns rollout)" if math.isnan(point.stepped_cost) else " with Simulator.step"
 
 
 def commands(point: Point) -> list[str]:

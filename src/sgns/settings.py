@@ -376,7 +376,7 @@ class Advise(_Command):
     error: Errors = setting(Errors, "largest errors")
     time: float | None = setting(
         None,
-        "longest wall time of one step of 1/60 s on one core",
+        "longest wall time of one step of 1/60 s on one core, as Simulator.step takes it",
         "s",
         gt=0,
         words="; it must be a number above 0",

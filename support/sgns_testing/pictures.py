@@ -8,6 +8,9 @@ from matplotlib.figure import Figure
 
 from sgns.evaluate import figures
 
+SMALLEST_TEXT = 8.0
+"""Of every picture of a report [points]."""
+
 
 def pixels(figure: Figure) -> np.ndarray:
     """The drawn picture, shape (height, width, channels); fails if it is empty."""

@@ -54,6 +54,12 @@ class FakeSimulator:
                 self.scene = run.scene
                 self.known.append((run.pose, basis.transform(run.positions()).numpy(), run.force, run.torque))
 
+    def reset(self, poses: np.ndarray, values: Any = None) -> None:
+        self.at = 0
+
+    def step(self, pose: np.ndarray) -> None:
+        self.at += 1
+
     def rollout(
         self, poses: np.ndarray, body_points: Any = None, latent_history: Any = None, values: Any = None
     ) -> Rollout:

@@ -55,6 +55,30 @@ def test_time_is_that_of_a_step() -> None:
     assert decoded[0].startswith("nothing meets this")
 
 
+def test_a_step_is_what_a_control_loop_calls() -> None:
+    unknown = answer("error.force=0.4")
+    assert "along a known path (sgns rollout)" in unknown[3] and "up to 3000 steps a second" in unknown[3]
+    assert "with Simulator.step, pose by pose, takes longer" in unknown[4]
+    known = replace(
+        POINTS[3], label="known", stepped_wall_s_per_simulated_s=0.06, wall_s_per_simulated_s=0.01
+    )
+    points = [*POINTS[:3], known]
+
+    def told(*overrides: str) -> list[str]:
+        return advice(points, wished(asked(*overrides), points))
+
+    lines = told("error.force=0.4", "time=0.002")
+    assert (
+        lines[0] == "use: surrogate, known"
+        and "costs 1 ms per step of 1/60 s with Simulator.step" in lines[3]
+    )
+    assert not any("takes longer" in line for line in lines)
+    # A whole path at once would be quick enough, 0.17 ms a step.
+    assert told("error.force=0.4", "time=0.0005")[0].startswith("nothing meets this; closest: surrogate")
+    decoded = told("error.force=0.4", "particles=true")[3]
+    assert f"costs {1e3 * (0.06 + 0.19) / 60:.3g} ms" in decoded and "all particles decoded" in decoded
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pydoc
+
 import numpy as np
 import pytest
 
@@ -58,3 +60,13 @@ def test_a_scene_prints_what_differs_from_its_defaults() -> None:
     assert repr(Excavation(depth=0.07, bed=Bed(seed=3))) == "Excavation(bed=Bed(seed=3), depth=0.07)"
     path = [(t, 0.1 + t, 0.3, 0.1, 0.0, 0.0, 0.0, 1.0) for t in np.linspace(0.0, 0.5, 500)]
     assert repr(Body(path=path)) == "Body(path=<500 items>)"
+
+
+def test_the_help_of_a_scene_lists_settings_with_units_defaults_and_ranges() -> None:
+    text = pydoc.plain(pydoc.render_doc(Excavation))
+    for line in (
+        "depth = 0.05 m: the motion reaches this far below the tip's starting height (0 or more)",
+        "rake = 10.0 degrees: angle of the plate from vertical, tip leading (-60 to 60)",
+        "motion = 'curved': of the tip (curved, ramp, rest, path)",
+    ):
+        assert line in text

@@ -6,7 +6,10 @@ file, and compared with the simulated one; baselines and times are measured besi
 
 from __future__ import annotations
 
+import copy
+import itertools
 import logging
+import math
 import os
 import statistics
 import time
@@ -27,7 +30,14 @@ from sgns.data.dataset import Dataset
 from sgns.data.files import only_here, require_replaceable
 from sgns.data.run import Run
 from sgns.data.surface import surface_grid
-from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory, provenance
+from sgns.evaluate.costs import (
+    forget_peak,
+    full_space_cost,
+    network_costs,
+    peak_memory,
+    provenance,
+    solver_rates,
+)
 from sgns.evaluate.figures import VALIDATION
 from sgns.evaluate.metrics import body_errors, mean_prediction, position_errors
 from sgns.evaluate.published import evaluate_published
@@ -61,24 +71,39 @@ def roll_out(simulator: Simulator, run: Run) -> Rollout:
 
 
 def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTiming:
-    """Times rollouts along one run's tool path, after one that warms up."""
-    times = []
+    """Times rollouts, steps and, in turn with them, the solver along one run's tool path, after one that warms up."""
+    times: list[tuple[float, ...]] = []
+    solved: list[float] = []
     with Run(path) as run, single_thread():
         simulated = (run.frame_count - simulator.history) / run.frame_rate
+        solver = solver_rates(run)
         for _ in range(repeats + 1):
             forget_peak()
             rollout = roll_out(simulator, run)
-            rollout_bytes = peak_memory()
+            peak = peak_memory()
             forget_peak()
             began = time.perf_counter()
             for latent in torch.as_tensor(rollout.latent):
                 simulator.basis.inverse(latent)
             per_second = float(rollout.wall_time_s) / simulated
-            times.append((per_second, per_second + elapsed(began, time.perf_counter()) / simulated))
-        rollout_time, decoded_time = (statistics.median(kind) for kind in zip(*times[1:], strict=True))
-        return NetworkTiming(
-            rollout_time, decoded_time, repeats, path.stem, rollout_bytes, decoded_bytes=peak_memory()
-        )
+            decoded = per_second + elapsed(began, time.perf_counter()) / simulated
+            if not times:  # before there is a solver
+                peaks = {"rollout_bytes": peak, "decoded_bytes": peak_memory()}
+            times.append((per_second, decoded, step_time(simulator, run)))
+            solved += itertools.islice(solver, 1)
+        rolled, decoded, stepped = (statistics.median(kind) for kind in zip(*times[1:], strict=True))
+        solver_time = statistics.median(solved or [math.nan])
+        return NetworkTiming(rolled, decoded, stepped, solver_time, repeats, path.stem, **peaks)
+
+
+def step_time(simulator: Simulator, run: Run) -> float:
+    """Wall seconds per simulated second of `Simulator.step` along a run's tool path, pose by pose."""
+    stepped = copy.copy(simulator)
+    stepped.reset(run.pose, values=run.scene)
+    began = time.perf_counter()
+    for pose in run.pose[1:]:
+        stepped.step(pose)
+    return elapsed(began, time.perf_counter()) * run.frame_rate / (run.frame_count - 1)
 
 
 def full_basis(dataset: Dataset, basis: Basis) -> Basis:
@@ -263,8 +288,8 @@ def log_summary(evaluation: Evaluation, report: Path) -> None:
         f"force: NRMSE {total.force.overall_nrmse:.3f} (mean force of the training split: "
         f"{total.mean_force.overall_nrmse:.3f}); {forward_name(evaluation)} MAE {total.force.mae[0]:.3g} N, vertical "
         f"MAE {total.force.mae[2]:.3g} N",
-        f"wall seconds per simulated second: network {timing.rollout:.3g} (with decoding {timing.decoded:.3g}, one "
-        f"thread), solver {total.solver_rate:.3g}",
+        f"wall seconds per simulated second, measured in turn on one thread: network along a path {timing.rollout:.3g} "
+        f"(all particles decoded {timing.decoded:.3g}), pose by pose {timing.stepped:.3g}; solver {timing.solver:.3g}",
     ]
     if full := evaluation.full_space:
         lines.append(

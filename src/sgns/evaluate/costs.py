@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
+import logging
 import math
 import os
 import platform
 import shlex
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from mpm_warp import Effects, Scene, SceneError, Solver, SolverStopped
 from mpm_warp.machine import usable_cores
 from sgns import __version__
 from sgns.data.run import Run
@@ -28,6 +31,8 @@ from sgns.numbers import elapsed
 from sgns.rollout import single_thread
 from sgns.settings import ModelSettings
 from sgns.simulator import Simulator
+
+log = logging.getLogger(__name__)
 
 # --- How a result was made: command, checkpoint, versions, machine --------------------------------------
 
@@ -107,6 +112,33 @@ def peak_memory() -> float:
             if line.startswith("VmHWM:"):
                 return 1024.0 * float(line.split()[1])
     return math.nan
+
+
+# --- The solver on a run's scene, beside the network ------------------------------------------------------
+
+SOLVER_FRAMES = 3  # of one stretch
+
+
+def solver_rates(run: Run) -> Iterator[float]:
+    """Wall seconds per simulated second of the solver, of one stretch of a run's scene after the other.
+
+    On one core, without compiling kernels and without writing; on no core of a GPU. Ends with the scene, and is empty
+    where the file does not hold all that is needed to compute it again.
+    """
+    try:
+        scene = Scene.from_dict(run.scene, run.mesh)
+        known = {one.name for one in fields(Effects)}
+        effects = Effects.from_dict({name: e["on"] for name, e in run.effects.items() if name in known})
+        frames = Solver(scene, effects, precision=run.extra["precision"]).frames()
+        for _ in range(2):  # the first frame loads kernels, the second is the first that computes
+            next(frames)
+        while True:
+            began = time.perf_counter()
+            if sum(1 for _ in itertools.islice(frames, SOLVER_FRAMES)) < SOLVER_FRAMES:
+                return
+            yield elapsed(began, time.perf_counter()) * scene.frame_rate / SOLVER_FRAMES
+    except (SceneError, SolverStopped, KeyError, TypeError, StopIteration) as error:
+        log.info("the solver cannot be timed on %s: %s", run.path.name, error)
 
 
 # --- What the same network would cost on every particle: the paper's comparison, measured on this machine

@@ -38,7 +38,7 @@ TRUTH = "#1a1a1a"
 NETWORK = "#0072b2"  # blue and vermilion of Okabe and Ito's palette: told apart by every eye
 ACCENT = "#d55e00"
 BASELINE = "#8c8c8c"
-DPI = 130
+DPI = 200  # pictures are opened in the full size of a screen
 # All of a report's pictures are this wide [inches]: on a phone one fills the screen and its words can still be
 # read, on a desk and on paper several stand side by side.
 PICTURE_WIDTH = 4.8
@@ -241,8 +241,16 @@ def compared(
     return panels
 
 
+def worth_showing(truth: Any, prediction: Any, name: str) -> np.ndarray:
+    """Which components of force or torque are not next to none beside the largest, shape (3,)."""
+    runs = [run for run in (truth, prediction) if run is not None]
+    largest = np.abs(np.concatenate([getattr(run, name) for run in runs])).max(axis=0)
+    return largest > NEGLIGIBLE_SHARE * largest.max()
+
+
 def force_panels(truth: Any, prediction: Any, history: int, mean_force: np.ndarray) -> list[Panel]:
-    """Forward, lateral and vertical force; for a wheel also its sinkage. Arguments as in `compared`."""
+    """Forward, lateral (where there is any worth mentioning) and vertical force; for a wheel also its sinkage.
+    Arguments as in `compared`."""
     forward, sign = forward_force(prediction.scene)
     labels, signs = (f"{forward} [N]", "lateral Fy [N]", "vertical Fz [N]"), np.array([sign, 1.0, 1.0])
     runs = (truth, prediction, history)
@@ -250,6 +258,8 @@ def force_panels(truth: Any, prediction: Any, history: int, mean_force: np.ndarr
     # A small component is drawn as small as it is beside the largest.
     ranges = [float(np.ptp(curve.values)) for panel in panels for curve in panel.curves if len(curve.values)]
     panels = [replace(panel, least_height=SMALLEST_PANEL * max(ranges, default=0.0)) for panel in panels]
+    if not worth_showing(truth, prediction, "force")[1]:
+        del panels[1]
     if is_wheel(prediction.scene):
         panels += compared(["sinkage [mm]"], lambda run: 1e3 * sinkage(run.scene, run.pose)[:, None], *runs)
     return panels
@@ -259,8 +269,7 @@ def torque_panels(truth: Any, prediction: Any, history: int, mean_torque: np.nda
     """Torque about the axes about which there is any worth mentioning. Arguments as in `compared`."""
     labels = ("roll Tx [N m]", "pitch Ty [N m]", "yaw Tz [N m]")
     panels = compared(labels, lambda run: run.torque, truth, prediction, history, mean_torque)
-    largest = np.abs(np.concatenate([truth.torque, prediction.torque])).max(axis=0)
-    shown = largest > NEGLIGIBLE_SHARE * largest.max()
+    shown = worth_showing(truth, prediction, "torque")
     return [panel for panel, worth in zip(panels, shown, strict=True) if worth]
 
 

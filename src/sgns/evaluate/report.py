@@ -30,7 +30,7 @@ from sgns.evaluate.figures import (
     torque_panels,
     training_figure,
 )
-from sgns.evaluate.results import EvaluatedRun, Evaluation
+from sgns.evaluate.results import EvaluatedRun, Evaluation, typical_and_worst
 from sgns.evaluate.views import common_scales, latent_path, side_views, solid_views, subspace_view, view_times
 
 # --- Numbers, runs and scenes in plain words -------------------------------------------------------------
@@ -200,8 +200,7 @@ def both_runs(chosen: EvaluatedRun) -> Iterator[tuple[Run, Run]]:
 
 def report_figures(evaluation: Evaluation) -> list[FigureGroup]:
     """Draws every picture of the report."""
-    ranked = sorted(evaluation.runs, key=lambda run: run.scores.mse["total"])
-    typical, worst = ranked[(len(ranked) - 1) // 2], ranked[-1]
+    typical, worst = typical_and_worst(evaluation)
     groups = [whole_run(evaluation, typical, "Typical run" if typical is not worst else "Run")]
     if worst is not typical:
         groups.append(whole_run(evaluation, worst, "Worst run"))
@@ -253,7 +252,11 @@ def whole_run(evaluation: Evaluation, chosen: EvaluatedRun, label: str) -> Figur
             "Height of the highest particle of every column: black simulated, blue predicted.",
             profile_figure(runs, frames, surface_grid(evaluation.start)),
         )
-    scene = ": ".join(filter(None, (chosen.label, chosen.words)))
+    own, median = (
+        f"{number(mm)} mm, {fixed(nrmse)}" for mm, nrmse in (chosen.main_errors, evaluation.median_errors)
+    )
+    errors = f"Position error and force NRMSE: {own}; median of the runs: {median}"
+    scene = ". ".join([": ".join(filter(None, (chosen.label, chosen.words))), errors])
     return FigureGroup(f"{label}: side view and surface", "whole run", [*figures, surface], scene)
 
 

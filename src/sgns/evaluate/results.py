@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -167,13 +168,21 @@ class EvaluatedRun:
     scores: Scores  # every metric
     wheel: bool = False  # whether its body is a wheel
 
+    @property
+    def main_errors(self) -> tuple[float, float]:
+        """Of the positions [mm] and of the force [NRMSE]."""
+        return self.scores.rmse_mm("total"), self.scores.force.overall_nrmse
+
 
 @dataclass(frozen=True)
 class NetworkTiming:
-    """Wall seconds per simulated second of the network: medians of warm repeats on one thread."""
+    """Wall seconds per simulated second of network and solver, measured in turn on one thread: medians of warm
+    repeats."""
 
-    rollout: float  # steps with force and torque; the soil stays in the subspace
+    rollout: float  # along a known path: steps with force and torque; the soil stays in the subspace
     decoded: float  # the same, and every frame decoded to all particles
+    stepped: float  # `Simulator.step`, pose by pose, likewise in the subspace
+    solver: float  # nothing written; NaN where the run does not say what it takes to compute it again
     repeats: int  # number of timed repeats
     run: str  # run that was timed
     rollout_bytes: float = math.nan  # peak memory of the whole process while it steps; NaN if not known
@@ -239,6 +248,29 @@ class Evaluation:
     new_rollouts: Sequence[Path] = ()  # run files without truth that are shown too
     made: dict[str, str] = field(default_factory=dict)  # how it was made: name → value, in the order to show
 
+    @property
+    def median_errors(self) -> tuple[float, float]:
+        """Over the runs, of the positions [mm] and of the force [NRMSE]; NaN where no run has any."""
+        rmse, nrmse = (
+            [error for error in errors if not math.isnan(error)]
+            for errors in zip(*(run.main_errors for run in self.runs), strict=True)
+        )
+        return statistics.median(rmse or [math.nan]), statistics.median(nrmse or [math.nan])
+
+
+def typical_and_worst(evaluation: Evaluation) -> tuple[EvaluatedRun, EvaluatedRun]:
+    """The run nearest to the medians of both main errors, by factors, and the one farthest above either of them."""
+
+    def factors(run: EvaluatedRun) -> list[float]:
+        pairs = zip(run.main_errors, evaluation.median_errors, strict=True)
+        # 1 where there is no force, or no error at all.
+        return [e / m if 0.0 < m < math.inf and not math.isnan(e) else 1.0 for e, m in pairs]
+
+    def distance(run: EvaluatedRun) -> float:
+        return sum(abs(math.log(max(factor, 1e-9))) for factor in factors(run))
+
+    return min(evaluation.runs, key=distance), max(evaluation.runs, key=lambda run: max(factors(run)))
+
 
 def seen_before(simulator: Simulator, names: Sequence[str]) -> tuple[list[str], list[str]]:
     """Of some runs' names those that the checkpoint was trained on, and those that chose it: for these a number is no
@@ -274,8 +306,10 @@ def write_tables(evaluation: Evaluation, output: Path) -> None:
             "runs": [score.row() for score in scores],
             "mean_training_force_N": evaluation.mean_force,
             "wall_s_per_simulated_s": {
-                "solver": evaluation.total.solver_rate,
+                "solver": timing.solver,
+                "solver_in_run_files": evaluation.total.solver_rate,
                 "network_stepping_with_force": timing.rollout,
+                "network_pose_by_pose": timing.stepped,
                 "network_with_decoding": timing.decoded,
                 "network_threads": 1,
                 "network_repeats": timing.repeats,

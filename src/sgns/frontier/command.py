@@ -100,6 +100,7 @@ def with_errors(
 
 TABLE = (  # heading, column of `Point`, what it is multiplied with
     ("with all particles, s per s", "decoded_cost", 1.0),
+    ("pose by pose, s per s", "stepped_cost", 1.0),
     ("force NRMSE", "force_nrmse", 1.0),
     ("mean draft, %", "draft_mean_error", 100.0),
     ("mean vertical, %", "vertical_mean_error", 100.0),

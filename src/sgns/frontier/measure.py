@@ -55,8 +55,8 @@ CODED_FRAMES = 16  # of one pass of encoding and decoding
 INCLUDES = {
     "solver": "all substeps of the recorded frames; not: compiling kernels, set-up, writing files",
     "reduction": "encoding and decoding every frame; not: reading the frames, fitting the basis",
-    "surrogate": "all steps of the network with force and torque; not: loading the checkpoint, and (in a column of "
-    "their own) decoding particles; nothing is read or written",
+    "surrogate": "all steps of the network along a whole path, with force and torque; not: loading the checkpoint, and "
+    "(in columns of their own) decoding particles and stepping pose by pose; nothing is read or written",
 }
 Measured = tuple[Point, Mapping[str, Observation]]
 Jobs = Iterator[tuple[PointSettings, Callable[[], Measured]]]
@@ -231,7 +231,7 @@ def surrogate_point(study: Study, scene: StudyScene, entry: PointSettings, workl
     training_s, samples = timed_training(reduced, cfg, output)
     simulator = Simulator.load(output / "best.ckpt")
     before = workload.measure()
-    (wall, processor, decoded), rollouts = timed_rollouts(simulator, scenes)
+    (wall, processor, decoded, stepped), rollouts = timed_rollouts(simulator, scenes)
     costs = cost_fields(wall.tolist(), [*before, *workload.measure()], statistics.median(processor))
     point = new_point(
         study,
@@ -246,6 +246,7 @@ def surrogate_point(study: Study, scene: StudyScene, entry: PointSettings, workl
         training_samples=float(samples),
         training_runs=float(len(dataset.runs("train"))),
         decoded_wall_s_per_simulated_s=statistics.median(decoded),
+        stepped_wall_s_per_simulated_s=statistics.median(stepped),
         **own_fields(own_errors(simulator, dataset), len(dataset.runs("test"))),
         **costs,
     )
@@ -298,12 +299,12 @@ def timed_rollouts(
     """Every case from rest, several times.
 
     Returns:
-        Wall time and processor time of all steps, and wall time with all frames decoded, of each repeat, mean over the
-        cases [s per simulated s], shape (3, repeats); the rollouts.
+        Wall time and processor time of all steps, and wall time with all frames decoded and that of stepping pose by
+        pose, of each repeat, mean over the cases [s per simulated s], shape (4, repeats); the rollouts.
     """
     paths = {case: (s.body_poses(), s.body_points(), s.to_dict()) for case, s in scenes.items()}
     rollouts = {}
-    times = np.zeros((REPEATS + 1, len(paths), 3))
+    times = np.zeros((REPEATS + 1, len(paths), 4))
     for repeat in times:
         for seconds, (case, (poses, points, values)) in zip(repeat, paths.items(), strict=True):
             watch = stopwatch()
@@ -312,7 +313,12 @@ def timed_rollouts(
             watch = stopwatch()
             for latent in torch.as_tensor(rollout.latent):
                 simulator.basis.inverse(latent)
-            seconds[:] = rollout.wall_time_s, processor, rollout.wall_time_s + watch()[0]
+            decoded = rollout.wall_time_s + watch()[0]
+            simulator.reset(scenes[case])
+            watch = stopwatch()
+            for pose in poses[1:]:
+                simulator.step(pose)
+            seconds[:] = rollout.wall_time_s, processor, decoded, watch()[0]
             seconds *= simulator.frame_rate / (len(poses) - 1)
     return times[1:].mean(axis=1).T, rollouts
 

@@ -55,6 +55,8 @@ class Point:
     processor_s_per_simulated_s: float = math.nan
     # with the positions of all particles in every frame, where they are not computed anyway
     decoded_wall_s_per_simulated_s: float = math.nan
+    # of surrogates: pose by pose, with a call of `Simulator.step` for each; `wall_s_...` is of a whole path at once
+    stepped_wall_s_per_simulated_s: float = math.nan
     repeats: float = math.nan  # how many repeats, or stretches of one run, the median is of
     # the reference workload (study.py), before and after, on the same core; processor time if that was shared
     workload_wall_s_per_simulated_s: float = math.nan
@@ -131,6 +133,13 @@ class Point:
             return self.cost
         return self.decoded_wall_s_per_simulated_s * self.cost / self.wall_s_per_simulated_s
 
+    @property
+    def stepped_cost(self) -> float:
+        """As `cost`, of what a control loop calls, frame by frame; NaN if it was not measured."""
+        if self.kind == "solver":
+            return self.cost
+        return self.stepped_wall_s_per_simulated_s * self.cost / self.wall_s_per_simulated_s
+
     def row(self) -> dict[str, Any]:
         """Plain values by column, numbers to five digits, empty where not known."""
         return {
@@ -164,7 +173,12 @@ class Point:
             raise UserError(f"a row of operating points lacks columns: {error}") from None
 
 
-_DIVISORS = ("wall_s_per_simulated_s", "processor_s_per_simulated_s", "decoded_wall_s_per_simulated_s")
+_DIVISORS = (
+    "wall_s_per_simulated_s",
+    "processor_s_per_simulated_s",
+    "decoded_wall_s_per_simulated_s",
+    "stepped_wall_s_per_simulated_s",
+)
 _READERS: dict[str, Callable[[Any], Any]] = {
     "str": str,
     "float": float,

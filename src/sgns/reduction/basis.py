@@ -283,19 +283,17 @@ def reduction_curves(basis: Basis, paths: Sequence[Path]) -> ReductionCurves:
 
 def left_out(path: Path, basis: Basis, since: int) -> tuple[np.ndarray, np.ndarray]:
     """Squares that the modes do not see, summed over particles and axes [m²], shape (T,) each: of a run's positions in
-    every frame, and of the way from frame `since`."""
+    every frame, and of the way from frame `since`. With orthonormal modes: all squares less those of the modes."""
+    found: list[list[Tensor]] = []
     with Run(path) as run:
-
-        def unseen(frames: slice) -> Tensor:
-            positions = torch.from_numpy(run.positions(frames)).to(basis.mean)
-            return positions - basis.inverse(basis.transform(positions))
-
-        start = unseen(slice(since, since + 1))
-        found = []
+        start = torch.from_numpy(run.positions(since)).to(basis.mean)
+        first = basis.transform(start)
         for frames in frame_chunks(run.particle_count, run.frame_count):
-            rest = unseen(frames)
-            found.append([part.square().sum((1, 2)).numpy() for part in (rest, rest - start)])
-    here, way = (np.concatenate(parts) for parts in zip(*found, strict=True))
+            positions = torch.from_numpy(run.positions(frames)).to(basis.mean)
+            latent = basis.transform(positions)
+            differences = (positions - basis.mean, latent), (positions - start, latent - first)
+            found.append([a.square().sum((1, 2)) - b.square().sum((1, 2)) for a, b in differences])
+    here, way = (torch.cat(parts).clamp_min(0.0).numpy() for parts in zip(*found, strict=True))
     return here, way
 
 

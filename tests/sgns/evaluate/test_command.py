@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from matplotlib.text import Text
 from torch.utils.tensorboard import SummaryWriter
 
 from mpm_warp.poses import in_body_frame, in_world_frame
@@ -16,9 +17,12 @@ from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run
 from sgns.evaluate import command as evaluate_module
+from sgns.evaluate import report as report_module
 from sgns.evaluate.command import full_basis, single_thread, training_means
+from sgns.evaluate.figures import png
 from sgns.evaluate.report import render_report, write_report
 from sgns.rollout import write_rollout
+from sgns_testing.pictures import SMALLEST_TEXT
 from sgns_testing.runs import make_run
 from sgns_testing.surrogates import FakeSimulator, fitted, frozen_latent, small_dataset
 
@@ -41,7 +45,7 @@ def simulator(dataset, basis, **kw):
     return FakeSimulator(basis, dataset.runs("train") + dataset.runs("test"), **kw)
 
 
-def test_whole_evaluation(dataset, basis, tmp_path):
+def test_whole_evaluation(dataset, basis, tmp_path, monkeypatch):
     known = simulator(dataset, basis, mistake=lambda z, d: z + 0.001 * np.arange(len(z))[:, None, None])
     with Run(dataset.runs("test")[0]) as run:
         rollout = known.rollout(run.pose, in_body_frame(run.pose[0], run.body_points[0]))
@@ -58,14 +62,23 @@ def test_whole_evaluation(dataset, basis, tmp_path):
         new_rollouts=[new],
         made={"command": "sgns evaluate"},
     )
+    sizes = []
+
+    def measured(figure):
+        sizes.extend(text.get_fontsize() for text in figure.findobj(Text) if text.get_text().strip())
+        return png(figure)
+
+    monkeypatch.setattr(report_module, "png", measured)
     report = write_report(result, output)
+    assert min(sizes) >= SMALLEST_TEXT
 
     with (output / "metrics.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(split) + 1
     summary = json.loads((output / "metrics.json").read_text())
     assert summary["aggregate"]["skill_frozen"] == pytest.approx(result.total.skill())
-    assert summary["wall_s_per_simulated_s"]["solver"] == pytest.approx(60.0 / 19.0)
+    assert summary["wall_s_per_simulated_s"]["solver_in_run_files"] == pytest.approx(60.0 / 19.0)
+    assert summary["wall_s_per_simulated_s"]["network_pose_by_pose"] == result.timing.stepped > 0.0
     with (output / "examples.csv").open(newline="", encoding="utf-8") as file:
         examples = list(csv.DictReader(file))
     assert [row["run"] for row in examples] == [row["run"] for row in rows]

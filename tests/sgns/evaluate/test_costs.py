@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 import torch
 
+from mpm_warp import Effects
+from sgns.data.run import Run
 from sgns.evaluate import costs
-from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory
+from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory, solver_rates
 from sgns.settings import ModelSettings
+from sgns.simulate.run import simulate_scene
 from sgns_testing.runs import make_run
+from sgns_testing.scenes import cut
 from sgns_testing.tiny import MODEL
 
 CARD = {"settings": {"training": {"batch_size": 32}}}
@@ -48,6 +52,19 @@ def test_systems_that_do_not_count_it(monkeypatch):
     monkeypatch.setattr(costs, "Path", lambda name: (_ for _ in ()).throw(OSError(name)))
     forget_peak()
     assert math.isnan(peak_memory())
+
+
+def test_the_solver_is_timed_on_the_scene_of_a_run(tmp_path, caplog):
+    scene = cut()
+    file = tmp_path / "run.h5"
+    simulate_scene(scene, file, effects=Effects())
+    with Run(file) as run:
+        rates = list(solver_rates(run))
+    # Frames 2 to 12, without the first ones, in whole stretches.
+    assert len(rates) == (scene.frame_count - 2) // costs.SOLVER_FRAMES == 3 and min(rates) > 0.0
+    with Run(make_run(tmp_path / "synthetic.h5")) as run, caplog.at_level("INFO"):
+        assert list(solver_rates(run)) == []
+    assert "the solver cannot be timed on synthetic.h5" in caplog.text
 
 
 def test_cost_of_a_network_on_every_particle(tmp_path):

@@ -159,15 +159,30 @@ def errors(scale=1.0, frames=17):
 
 def test_forces_have_their_signs_and_predictions_begin_after_the_history(truth, prediction):
     panels = force_panels(truth, prediction, HISTORY, MEAN)
-    assert [panel.label for panel in panels] == ["draft −Fx [N]", "lateral Fy [N]", "vertical Fz [N]"]
+    assert [panel.label for panel in panels] == ["draft −Fx [N]", "vertical Fz [N]"]
     draft = curves(panels[0])
     assert np.array_equal(draft["simulated (MPM)"].values, -truth.force[:, 0])
     assert np.array_equal(draft["network"].values, -prediction.force[HISTORY:, 0])
     assert np.array_equal(draft["network"].time, prediction.time[HISTORY:])
     assert draft["training mean"].values == pytest.approx(80.0)
-    # A small component is not blown up.
-    assert np.ptp(limits(panels[1])) > 0.1 * np.ptp(draft["simulated (MPM)"].values)
     pixels(history_figure(panels))
+
+
+def test_a_force_along_an_axis_without_any_is_left_out(truth, prediction):
+    def labels(lateral, forward=1.0):
+        force = prediction.force * [forward, 0.0, forward]
+        force[:, 1] = lateral * np.abs(prediction.force).max()
+        pushed = SimpleNamespace(
+            time=prediction.time, force=force, scene=prediction.scene, pose=prediction.pose
+        )
+        panels = force_panels(None, pushed, HISTORY, MEAN)
+        # A small component is not blown up.
+        assert all(np.ptp(limits(panel)) >= 0.1 * np.ptp(limits(panels[0])) for panel in panels)
+        return [panel.label.split()[0] for panel in panels]
+
+    assert labels(0.01) == ["draft", "vertical"]
+    assert labels(0.2) == ["draft", "lateral", "vertical"]
+    assert labels(0.0, forward=0.0) == ["draft", "vertical"]
 
 
 def test_wheel_has_drawbar_pull_and_its_own_sinkage(tmp_path):
@@ -175,9 +190,9 @@ def test_wheel_has_drawbar_pull_and_its_own_sinkage(tmp_path):
         Run(make_run(tmp_path / f"{seed}.h5", frames=20, n=60, seed=seed, scene=WHEEL)) for seed in (1, 2)
     ]
     panels = force_panels(*runs, HISTORY, MEAN)
-    assert [panel.label for panel in panels][::3] == ["drawbar pull Fx [N]", "sinkage [mm]"]
+    assert [panel.label for panel in panels] == ["drawbar pull Fx [N]", "vertical Fz [N]", "sinkage [mm]"]
     assert np.array_equal(curves(panels[0])["simulated (MPM)"].values, runs[0].force[:, 0])
-    depths = curves(panels[3])
+    depths = curves(panels[2])
     for label, run, frames in (
         ("simulated (MPM)", runs[0], slice(None)),
         ("network", runs[1], slice(HISTORY, None)),

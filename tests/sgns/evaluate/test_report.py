@@ -10,6 +10,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from sgns.evaluate.figures import PICTURE_WIDTH
 from sgns.evaluate.metrics import ParticleErrors, PositionErrors, VectorErrors
 from sgns.evaluate.report import (
     FigureGroup,
@@ -23,6 +24,7 @@ from sgns.evaluate.report import (
 )
 from sgns.evaluate.results import Costs, EvaluatedRun, Evaluation, FullSpaceCost, NetworkTiming, aggregate
 from sgns.reduction.basis import Basis, ReductionCurves
+from sgns_testing.pictures import SMALLEST_TEXT
 from sgns_testing.surrogates import made_scores
 
 EVIL = '<script>alert("run&1")</script>'
@@ -48,7 +50,7 @@ def evaluation(names=("run1", "run2"), split="test", rollout=0.1, words="", whee
         split=split,
         runs=runs,
         total=aggregate([run.scores for run in runs]),
-        timing=NetworkTiming(rollout, 2 * rollout, 3, names[0]),
+        timing=NetworkTiming(rollout, 2 * rollout, 3 * rollout, 10.0, 3, names[0]),
         mean_force=np.array([-90.0, 0.0, 40.0]),
         curves=ReductionCurves(np.ones(2), np.ones(2), np.ones(2), np.ones(3)),
         basis=Basis(torch.zeros(4, 3), torch.eye(4)[:, :2], torch.ones(2), 3.0, 3.0, "particle_axis"),
@@ -70,7 +72,7 @@ class Tags(HTMLParser):
         self.tags.append(tag)
         self.links += [value for key, value in attrs if key in ("src", "href", "action", "srcset")]
         self.headings += [value for key, value in attrs if tag == "h2" and key == "id"]
-        if tag not in ("meta", "img", "br"):
+        if tag not in ("meta", "img", "br", "input"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
@@ -100,6 +102,15 @@ def summary(result):
     """The words of the first paragraph of the page."""
     text = render_report(result, []).partition("<p>")[2].partition("</p>")[0]
     return " ".join(html.unescape(text).split())
+
+
+def test_pictures_can_be_read_on_a_desktop_and_opened_in_full():
+    page = render_report(evaluation(), [group(b"\x89PNG")] * 3)
+    assert page.count('<input type="checkbox" class="zoom"') == 3 == page.count("<label>")
+    assert ".zoom:checked + img { position: fixed;" in page
+    narrowest = 16 * float(re.search(r"minmax\(min\(([\d.]+)rem, 100%\)", page)[1])
+    size = SMALLEST_TEXT * narrowest / (72 * PICTURE_WIDTH)  # [pixels of the page], of text in points
+    assert size >= 9.0
 
 
 def test_page_is_well_formed_and_needs_nothing_from_outside():
@@ -144,8 +155,8 @@ def test_tables_have_every_run_and_all_of_them():
         ({"force": 0.5}, ", better than always answering"),
         ({"force": 0.58}, ", hardly better than always answering"),
         ({"force": 0.9}, ", no better than always answering"),
-        ({"rollout": 0.1}, "200 times less than the solver's 20 s."),
-        ({"rollout": 40.0}, "2.0 times more than the solver's 20 s."),
+        ({"rollout": 0.1}, "In the same measurement the solver took 10 s, 100 times as long."),
+        ({"rollout": 40.0}, "the solver took 10 s, 4.0 times less."),
         ({"names": ["one"]}, "of 1 run that it never saw, and predicted the rest."),
         ({"reduction": 0.7}, "Of the squared error 70 % is the subspace's, not the network's."),
     ],
@@ -174,10 +185,12 @@ def test_nothing_that_moved_or_pushed_is_said():
     none = VectorErrors.compare(np.zeros((2, 3)), np.zeros((2, 3)))
     still = replace(still, force=none, mean_force=none, solver_rate=math.nan)
     text = summary(replace(result, total=still))
-    assert "nothing moved" in text and "there was none" in text and "not recorded" in text
+    assert "nothing moved" in text and "there was none" in text
     page = render_report(replace(result, total=still), [])
     parsed(page)
-    assert "speed beside the solver, whose time is not recorded" in page
+    untimed = replace(result, timing=replace(result.timing, solver=math.nan))
+    assert "could not be timed" in summary(untimed)
+    assert "speed beside the solver, which could not be timed" in render_report(untimed, [])
     assert "faster than the solver" in render_report(result, [])
     assert "slower than the solver" in render_report(evaluation(rollout=40.0), [])
 

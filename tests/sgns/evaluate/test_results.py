@@ -7,8 +7,35 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sgns.evaluate.results import aggregate, example_row, seen_before, write_csv, write_json
+from sgns.evaluate.results import (
+    Evaluation,
+    aggregate,
+    example_row,
+    seen_before,
+    typical_and_worst,
+    write_csv,
+    write_json,
+)
 from sgns_testing.surrogates import made_scores
+
+
+def test_typical_and_worst_by_position_and_force():
+    def chosen(*pairs):
+        runs = [
+            SimpleNamespace(main_errors=pair, scores=None, name=str(number))
+            for number, pair in enumerate(pairs)
+        ]
+        evaluation = Evaluation(*[None] * 2, runs, *[None] * 8)
+        return [run.name for run in typical_and_worst(evaluation)]
+
+    # By position alone the typical run would be the first, and the worst the last.
+    pairs = (3.0, 0.9), (2.0, 0.3), (3.5, 0.3), (2.9, 0.25), (4.0, 0.3)
+    assert chosen(*pairs) == ["2", "0"]
+    nothing = math.nan
+    assert chosen((1.0, nothing), (3.0, nothing), (2.0, nothing)) == ["2", "1"]
+    assert chosen((1.0, 0.5), (2.0, nothing), (1.1, 0.4)) == ["2", "1"]
+    assert chosen((0.0, 0.0), (0.0, 0.0)) == ["0", "0"]
+    assert chosen((math.inf, 0.3), (2.0, 0.2), (2.1, 0.3))[1] == "0"
 
 
 def test_aggregate_by_hand(tmp_path):

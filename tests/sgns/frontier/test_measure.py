@@ -127,6 +127,7 @@ def test_points_from_training_to_observation(tmp_path):
     assert (whole.training_runs, whole.own_runs, whole.note) == (3, 1, "")
     assert whole.training_samples == 10 * TRAINING["batch_size"]
     assert 0 < whole.wall_s_per_simulated_s < whole.decoded_wall_s_per_simulated_s
+    assert whole.stepped_cost > whole.cost  # a call for every pose
     assert polynomial.settings == "dataset=quick model=polynomial"
     assert polynomial.parameters > 0 and not math.isnan(polynomial.own_force_nrmse)
     seen = asked.observation(whole, "a")

@@ -10,9 +10,11 @@ import pytest
 import torch
 
 from sgns.config import UserError
+from sgns.data import run as runs
 from sgns.data.run import Run
-from sgns.reduction.basis import CENTRINGS, Basis, reconstruction_curve
+from sgns.reduction.basis import CENTRINGS, Basis, left_out, reconstruction_curve
 from sgns.reduction.pca import IncrementalPCA
+from sgns_testing.runs import make_run
 from sgns_testing.surrogates import fitted, small_dataset
 
 
@@ -174,3 +176,17 @@ def test_reconstruction_curve_is_the_error_of_projecting(tmp_path):
     own = reconstruction_curve(dataset.runs("train"), basis)
     assert own[1:] == pytest.approx(np.asarray(basis.residual_mse()), rel=1e-4, abs=1e-14)
     assert np.isnan(reconstruction_curve([], basis)).all()
+
+
+@pytest.mark.parametrize("centring", CENTRINGS)
+def test_what_modes_leave_out_of_places_and_of_ways(tmp_path, monkeypatch, centring):
+    monkeypatch.setattr(runs, "CHUNK_BYTES", 24 * 60 * 5)  # several chunks
+    path = make_run(tmp_path / "a.h5", frames=12, n=60)
+    with Run(path) as run:
+        positions = run.positions().astype(np.float64)
+    basis = IncrementalPCA(6, 14).partial_fit(positions).basis(centring, 3)
+    rest = positions - basis.inverse(basis.transform(positions)).numpy()
+    here, way = left_out(path, basis, 2)
+    np.testing.assert_allclose(here, (rest**2).sum((1, 2)), atol=1e-12)
+    np.testing.assert_allclose(way, ((rest - rest[2]) ** 2).sum((1, 2)), atol=1e-12)
+    assert here.shape == (12,) and way[2] == 0.0
