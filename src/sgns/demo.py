@@ -22,8 +22,15 @@ NEW_ROLLOUT = [
     *NEW_SCENE,
     f"checkpoint={CHECKPOINT}",
     f"output={NEW_PATH}",
+    "overwrite=true",
 ]
-EVALUATION = ["evaluate", "dataset=quick", f"checkpoint={CHECKPOINT}", f"new_rollouts=[{NEW_PATH}]"]
+EVALUATION = [
+    "evaluate",
+    "dataset=quick",
+    f"checkpoint={CHECKPOINT}",
+    f"new_rollouts=[{NEW_PATH}]",
+    "overwrite=true",
+]
 STEPS = [
     ("simulate the runs of dataset=quick", ["simulate", "dataset=quick"]),
     ("fit the basis and train", ["train", "dataset=quick", f"output={OUTPUT}"]),

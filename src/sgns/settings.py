@@ -286,6 +286,7 @@ class Simulate(_Command):
     """`sgns simulate`."""
 
     output: str = setting("run.h5", "run file to write")
+    overwrite: bool = setting(False, "true: replace a finished run that is there at `output`")
     continue_from: str | None = setting(None, "a *.stopped.h5: goes on from its last frame")
     seed: int = _seed("of the particle arrangement and of a campaign's draws")
     device: str = _device()
@@ -298,6 +299,7 @@ class Reduce(_Command):
     """`sgns reduce`."""
 
     output: str = setting("", "folder for energy.csv; the basis is kept in the dataset's own folder")
+    overwrite: bool = setting(False, "true: replace a table that is there at `output`")
     device: str = _device()
 
 
@@ -319,6 +321,7 @@ class Rollout(_Command):
     num_modes: int | None = _num_modes()
     rate_independent: bool = setting(True, "under a slow tool soil follows its way")
     output: str = setting("rollout.h5", "run file to write, of the same kind as the solver's")
+    overwrite: bool = setting(False, "true: replace a rollout that is there at `output`")
     seed: int = _seed("of the particle arrangement")
     device: str = _device()
 
@@ -338,6 +341,7 @@ class Evaluate(_Command):
     timing_repeats: int = setting(3, "warm repeats of the timing; their median is reported", ge=3, le=1000)
     full_space: bool = setting(False, "also measure what the same network would cost on every particle")
     output: str = setting("", "folder for the report, its tables, figures and rollouts")
+    overwrite: bool = setting(False, "true: replace a report that is there at `output`")
     device: str = _device()
 
 

@@ -34,12 +34,15 @@ class Command(NamedTuple):
         summary: a line of help.
         output: what its `output` is: "file", "folder", or None where it has none.
         needs: dotted keys of paths that it cannot do without.
+        result: the file in a folder of output that shows that the work is finished. It is not replaced without
+            `overwrite=true`, and neither is a file of output. None where finished work is kept and gone on from.
     """
 
     module: str
     summary: str
     output: str | None
     needs: tuple[str, ...] = ()
+    result: str | None = None
 
 
 COMMANDS = {
@@ -48,22 +51,25 @@ COMMANDS = {
         "simulate a scene or a dataset with the material point method",
         "file",
         ("output",),
+        "",
     ),
     "reduce": Command(
         "sgns.reduction.command",
         "fit the basis (PCA) on a dataset and reduce its runs",
         "folder",
         ("dataset.path",),
+        "energy.csv",
     ),
     "train": Command("sgns.train.command", "learn a simulator from a dataset", "folder", ("dataset.path",)),
     "rollout": Command(
-        "sgns.rollout", "let a trained network play a scene", "file", ("checkpoint", "output")
+        "sgns.rollout", "let a trained network play a scene", "file", ("checkpoint", "output"), ""
     ),
     "evaluate": Command(
         "sgns.evaluate.command",
         "compare a trained network with true runs; write the report",
         "folder",
         ("dataset.path", "checkpoint"),
+        "report.html",
     ),
     "frontier": Command(
         "sgns.frontier.command", "measure what accuracy costs in time; table, figures and page", "folder"
@@ -155,6 +161,7 @@ def run_command(cfg: DictConfig) -> float | None:
     try:
         _place_output(cfg, hydra_cfg, COMMANDS[name], in_sweep)
         check_shared(cfg, name, COMMANDS[name].needs)
+        _require_new(cfg, COMMANDS[name])
         return importlib.import_module(COMMANDS[name].module).main(cfg)
     except KeyboardInterrupt as stop:
         kept = _drop_empty_output(hydra_cfg)
@@ -308,6 +315,21 @@ def _place_output(cfg: DictConfig, hydra_cfg: Any, command: Command, in_sweep: b
             cfg.output = str(path.parent / str(hydra_cfg.job.num) / path.name)
         else:
             cfg.output = str(Path(hydra_cfg.runtime.output_dir) / path)
+
+
+def _require_new(cfg: DictConfig, command: Command) -> None:
+    """Refuse to replace finished work that nobody asked to replace."""
+    if (
+        command.result is None
+        or cfg.overwrite
+        or (cfg.get("dataset") is not None and command.output == "file")
+    ):
+        return  # a campaign keeps what is finished
+    result = Path(cfg.output) / command.result
+    if result.is_file():
+        raise UserError(
+            f"{result} is there already; choose another output, or replace it with overwrite=true"
+        )
 
 
 def _drop_empty_output(hydra_cfg: Any) -> bool:

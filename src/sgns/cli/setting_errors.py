@@ -77,7 +77,7 @@ def _missing_option(error: MissingConfigException) -> str:
     options = sorted(error.options or [])
     line = f"{group}={option}: no such option; {_allowed('allowed', option, options)}"
     if group == "hydra/launcher":
-        line += "; more launchers: pip install 'sgns[launchers]'"
+        line += "; more launchers: pip install hydra-submitit-launcher (clusters) or hydra-joblib-launcher (processes)"
     return line
 
 

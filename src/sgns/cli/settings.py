@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
+from pathlib import Path
 from typing import Any, ClassVar
 
 from hydra.core.config_loader import ConfigLoader
@@ -349,13 +350,15 @@ def known_scene(command: str | None, overrides: Sequence[str]) -> list[str]:
     checkpoint = given.get("checkpoint")
     if checkpoint is None or checkpoint.is_sweep_override() or {"scene", "experiment"} & set(given):
         return []
+    if not isinstance(file := checkpoint.value(), str) or not Path(file).is_file():
+        return []  # the command says so
     from sgns.model.checkpoint import read_checkpoint
 
-    scene = read_checkpoint(str(checkpoint.value()))["hyper_parameters"].get("scene")
+    scene = read_checkpoint(file)["hyper_parameters"].get("scene")
     if not isinstance(scene, dict) or not isinstance(scene.get("material"), dict):
-        raise UserError(f"{checkpoint.value()} does not say what its scene is; train again")
+        raise UserError(f"{file} does not say what its scene is; train again")
     if "${" in json.dumps(scene):
-        raise UserError(f"{checkpoint.value()} has a scene with values that stand for others; give scene=...")
+        raise UserError(f"{file} has a scene with values that stand for others; give scene=...")
     tool = scene.get("tool")
     if isinstance(tool, dict) and tool.get("shape") == "mesh":
         scene = scene | {"tool": tool | {"file": "???", "digest": ""}}

@@ -110,3 +110,23 @@ def test_a_rollout_plays_the_scene_of_its_checkpoint(folder: Path) -> None:
         assert "bed is not the one" in refused("rollout", checkpoint, "scene=excavation", "output=other.h5")
     finally:
         os.chdir(before)
+
+
+def test_finished_work_is_replaced_only_when_asked(folder: Path) -> None:
+    cut = ["simulate", *SMALL, "output=cut.h5"]
+    rollout = ["rollout", "checkpoint=outputs/first/best.ckpt", "output=cut.h5"]
+    report = ["evaluate", "dataset.path=data/quick", "checkpoint=outputs/first/best.ckpt", "output=report"]
+    table = ["reduce", "dataset.path=data/quick", "reduction.num_modes=3", "output=table"]
+    for made in (cut, report, table):
+        assert sgns(folder, *made).returncode == 0
+    before = (folder / "cut.h5").read_bytes()
+    for command in (cut, rollout, report, table):
+        done = sgns(folder, *command)
+        assert done.returncode == 2 and done.stderr.endswith(
+            "is there already; choose another output, or replace it with overwrite=true\n"
+        )
+    assert (folder / "cut.h5").read_bytes() == before
+    for command in (cut, rollout, report, table):
+        done = sgns(folder, *command, "overwrite=true")
+        assert done.returncode == 0, done.stderr
+    assert (folder / "cut.h5").read_bytes() != before
