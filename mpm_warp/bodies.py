@@ -12,8 +12,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from .inputs import read_bytes
-from .mesh_files import read_mesh
+from .mesh_files import mesh_content, read_mesh
 from .settings import Settings, lengths, same, setting, settings
 from .solids import Solid, checked_mesh, closed_mesh
 from .state import SceneError
@@ -266,7 +265,7 @@ class MeshBody(Settings, Tool):
         if not self.file:
             raise SceneError("tool.file is missing; a mesh needs a file: STL, OBJ, PLY, OFF, GLB or 3MF")
         try:
-            digest = hashlib.blake2b(read_bytes(Path(self.file)), digest_size=8).hexdigest()
+            digest = hashlib.blake2b(mesh_content(Path(self.file)), digest_size=8).hexdigest()
         except (OSError, ValueError) as error:
             raise SceneError(f"tool.file: cannot read {self.file}: {error}") from None
         if self.digest not in ("", digest):

@@ -56,7 +56,7 @@ def read_mesh(file: Path) -> tuple[np.ndarray, np.ndarray, float | None]:
     if suffix not in _READERS:
         raise SceneError(f"tool.file is {file}; allowed: {', '.join(f'*{s}' for s in _READERS)}")
     try:
-        found = _READERS[suffix](_content(file))
+        found = _READERS[suffix](mesh_content(file))
         triangles = _triangles(found)
     except ImportError as error:
         raise SceneError(
@@ -83,7 +83,8 @@ def without_idle(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarra
     return vertices[used], place.reshape(-1, 3)
 
 
-def _content(file: Path) -> bytes:
+def mesh_content(file: Path) -> bytes:
+    """Content of a mesh file; errors as `read_bytes`."""
     try:
         return read_bytes(file, _MOST_BYTES)
     except ValueError as error:

@@ -279,7 +279,10 @@ class CheckedLoader(ConfigLoader):
         )
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
-        sweep_overrides = [*known_scene(master_config.hydra.job.config_name, sweep_overrides), *sweep_overrides]
+        sweep_overrides = [
+            *known_scene(master_config.hydra.job.config_name, sweep_overrides),
+            *sweep_overrides,
+        ]
         overrides = [*master_config.hydra.overrides.hydra, *sweep_overrides]
         return self._checked(
             overrides, lambda: self._loader.load_sweep_config(master_config, sweep_overrides)
