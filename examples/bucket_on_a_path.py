@@ -35,7 +35,7 @@ with open(folder / "path.csv", "w", newline="") as file:
     rows.writerow("t x y z qx qy qz qw".split())
     rows.writerows((t, x, 0.3, z, 0, 0, 0, 1) for t, x, z in path)
 
-command = f"""simulate scene=body scene/tool=mesh scene.tool.file={folder}/bucket.obj scene.tool.scale=0.001
+command = f"""simulate scene=body scene/tool=mesh scene.tool.file={folder}/bucket.obj scene.tool.unit=mm
     scene.path={folder}/path.csv scene.bed.size=[0.8,0.6,0.16] scene.bed.spacing=0.04 scene.duration=1.2
     output={folder}/bucket.h5"""
 subprocess.run([sys.executable, "-m", "sgns", *command.split()], check=True)

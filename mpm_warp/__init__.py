@@ -1,4 +1,7 @@
-"""A 3D material point method for granular soil, in NVIDIA Warp. Usable alone; needs warp, numpy and pydantic only."""
+"""A 3D material point method for granular soil, in NVIDIA Warp.
+
+Usable alone; needs warp, numpy, scipy, manifold3d and pydantic.
+"""
 
 from .auto_effects import Decision, Tolerances, effects_for
 from .bed import Bed, Walls, arrange

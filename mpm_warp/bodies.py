@@ -1,4 +1,4 @@
-"""The rigid bodies that touch the soil: their size, friction and nodes, and the mesh files that some are read from."""
+"""The rigid bodies that touch the soil: their size, friction and nodes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from .inputs import read_bytes
+from .mesh_files import mesh_content, read_mesh
 from .settings import Settings, lengths, same, setting, settings
+from .solids import Solid, checked_mesh, closed_mesh
 from .state import SceneError
 
 
@@ -48,6 +49,21 @@ class Tool(ABC):
     def reach(self) -> float:
         """Radius of a sphere around the origin that holds it [m]."""
         return float(np.linalg.norm(self.half_size))
+
+    @property
+    def tip(self) -> np.ndarray:
+        """Middle of the lowest face or edge in the body frame [m], shape (3,)."""
+        return np.array([0.0, 0.0, -self.half_size[2]])
+
+    @property
+    def origins(self) -> dict[str, np.ndarray]:
+        """Points that a path may be the path of, in the body frame [m], by the name that `origin` has for them."""
+        return {"com": np.zeros(3), "tip": self.tip}
+
+    @property
+    def path_point(self) -> np.ndarray:
+        """The point that `scene.path` is the path of, in the body frame [m], shape (3,)."""
+        return self.origins[getattr(self, "origin", "com")]
 
     @abstractmethod
     def points(self) -> np.ndarray:
@@ -96,11 +112,6 @@ class Plate(Settings, Tool):
     def half_size(self) -> np.ndarray:
         return 0.5 * np.array([self.thickness, self.width, self.length])
 
-    @property
-    def tip(self) -> np.ndarray:
-        """Middle of the bottom face in the body frame [m], shape (3,)."""
-        return np.array([0.0, 0.0, -0.5 * self.length])
-
     def points(self, rows: int = 3, columns: int = 5) -> np.ndarray:
         """Body nodes: rows x columns points on the front face in the body frame [m], shape (M, 3)."""
         hx, hy, hz = self.half_size
@@ -120,6 +131,9 @@ class Box(Settings, Tool):
 
     shape: Literal["box"] = setting("box", "of the body")
     size: tuple[float, float, float] = lengths((0.08, 0.20, 0.10), "sides along the body's x, y, z")
+    origin: Literal["com", "tip"] = setting(
+        "com", "whose path scene.path is: centre of mass, or middle of the underside"
+    )
     friction: float = same(Plate, "friction")
 
     @property
@@ -143,6 +157,7 @@ class Cylinder(Settings, Tool):
     shape: Literal["cylinder"] = setting("cylinder", "of the body")
     diameter: float = _length(0.15, "of the rim, without grousers")
     width: float = _length(0.083, "along the axis")
+    origin: Literal["com", "tip"] = same(Box, "origin")
     friction: float = same(Plate, "friction")
     grousers: int = setting(
         0, "bars along the rim, evenly spaced; the first is at the body's +x", ge=0, le=360
@@ -191,16 +206,14 @@ class Cylinder(Settings, Tool):
         return np.concatenate([np.stack([x, np.full(count, y), z], axis=-1) for y in (-half, half)])
 
 
-# --- Closed triangle meshes from STL and OBJ files ------------------------------------------------------
+# --- Closed triangle meshes from files ------------------------------------------------------------------
 
-_FARTHEST = 1e6  # vertex of a body [m]
-_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("extra", "<u2")])
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 
 
 @settings
 class MeshBody(Settings, Tool):
-    """A closed triangle mesh from an STL or OBJ file. Its axes are the file's; its origin becomes the centre
-    of mass of a body of uniform density.
+    """A closed triangle mesh from a file. Its axes are the file's; its mass is that of a body of uniform density.
 
     The file is read here; a body that is described together with its mesh is made by `of_mesh` and reads none.
     """
@@ -210,9 +223,23 @@ class MeshBody(Settings, Tool):
     node_count: ClassVar[int] = 16
 
     shape: Literal["mesh"] = setting("mesh", "of the body")
-    file: str = setting("", "STL (text or binary) or OBJ")
-    scale: float = setting(1.0, "metres per unit of the file, 0.001 for millimetres", gt=0)
+    file: str = setting("", "STL, OBJ, PLY or OFF; GLB or 3MF")
+    unit: Literal["file", "mm", "cm", "m", "in"] = setting(
+        "file", "of the file's lengths; file: as the file says, metres if it does not"
+    )
+    scale: float = setting(1.0, "multiplies the file's lengths", gt=0)
+    origin: Literal["com", "file", "tip"] = setting(
+        "com", "whose path scene.path is: centre of mass, the file's origin, or middle of the lowest corners"
+    )
     friction: float = same(Plate, "friction")
+    centre: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0),
+        "of mass in the file, for origin=file; filled in when it is read",
+        "m",
+        ge=-1e6,
+        le=1e6,
+        words="; it needs three lengths",
+    )
     digest: str = setting(
         "", "names the file's content; filled in when it is read, and checked if it is given"
     )
@@ -221,13 +248,13 @@ class MeshBody(Settings, Tool):
     def of_mesh(cls, vertices: np.ndarray, triangles: np.ndarray, **values: Any) -> MeshBody:
         """A body whose mesh is known, as from `mesh`; no file is opened.
 
-        Of the `values` of the fields, `file`, `scale` and `digest` only say where the mesh came from.
+        Of the `values` of the fields, `file`, `unit`, `scale` and `digest` only say where the mesh came from.
 
         Raises:
             SceneError: it is no such mesh.
         """
         body = cls.__new__(cls)
-        body.__dict__["mesh"] = (*checked_mesh(vertices, triangles), False)
+        body.__dict__["mesh"] = checked_mesh(vertices, triangles)
         cls.__init__(body, **values)
         return body
 
@@ -236,9 +263,9 @@ class MeshBody(Settings, Tool):
         if "mesh" in self.__dict__:  # from `of_mesh`
             return
         if not self.file:
-            raise SceneError("tool.file is missing; a mesh needs an STL or OBJ file")
+            raise SceneError("tool.file is missing; a mesh needs a file: STL, OBJ, PLY, OFF, GLB or 3MF")
         try:
-            digest = hashlib.blake2b(read_bytes(Path(self.file)), digest_size=8).hexdigest()
+            digest = hashlib.blake2b(mesh_content(Path(self.file)), digest_size=8).hexdigest()
         except (OSError, ValueError) as error:
             raise SceneError(f"tool.file: cannot read {self.file}: {error}") from None
         if self.digest not in ("", digest):
@@ -247,13 +274,33 @@ class MeshBody(Settings, Tool):
                 "bring the old file back, or leave out tool.digest"
             )
         object.__setattr__(self, "digest", digest)
-        _ = self.mesh  # a bad file is refused here
+        solid = self._solid  # a bad file is refused here
+        object.__setattr__(self, "centre", tuple(map(float, solid.centre * (self.origin == "file"))))
 
     @cached_property
-    def mesh(self) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Vertices about the centre of mass [m] (k, 3), triangles (t, 3), and whether they had to be turned."""
-        vertices, triangles = read_mesh(Path(self.file))
-        return closed_mesh(vertices * self.scale, triangles, self.file)
+    def _solid(self) -> Solid:
+        vertices, triangles, said = read_mesh(Path(self.file))
+        metres = _UNITS.get(self.unit, said or 1.0)
+        return closed_mesh(vertices * (self.scale * metres), triangles, self.file)
+
+    @cached_property
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices about the centre of mass [m] (k, 3), triangles (t, 3)."""
+        return self._solid.vertices, self._solid.triangles
+
+    @property
+    def tip(self) -> np.ndarray:
+        """Middle of the lowest corners."""
+        vertices = self.mesh[0]
+        low = vertices[vertices[:, 2] < vertices[:, 2].min() + 1e-6 * self.reach]
+        return 0.5 * (low.min(axis=0) + low.max(axis=0))
+
+    @property
+    def origins(self) -> dict[str, np.ndarray]:
+        found = super().origins
+        if self.origin == "file" or "_solid" in self.__dict__:
+            found["file"] = -(np.array(self.centre) if self.origin == "file" else self._solid.centre)
+        return found
 
     @property
     def half_size(self) -> np.ndarray:
@@ -281,120 +328,4 @@ class MeshBody(Settings, Tool):
         return self.mesh[0]
 
     def warnings(self) -> list[str]:
-        if self.mesh[2]:
-            return [f"{self.file}: the triangles faced inwards; they were turned round"]
-        return []
-
-
-def read_mesh(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (k, 3), in the file's unit, and triangles (t, 3) of an STL (text or binary) or OBJ file.
-
-    Corners at the same place become one vertex. Polygons of an OBJ are cut into triangles from their first corner.
-
-    Raises:
-        SceneError: the file cannot be read, or is no such mesh.
-    """
-    readers = {".stl": _stl, ".obj": _obj}
-    reader = readers.get(file.suffix.lower())
-    if reader is None:
-        raise SceneError(f"tool.file is {file}; allowed: {', '.join(f'*{s}' for s in readers)}")
-    try:
-        vertices, triangles = reader(read_bytes(file))
-    except OSError as error:
-        raise SceneError(f"tool.file: cannot read {file}: {error.strerror}") from None
-    except (ValueError, IndexError, OverflowError) as error:
-        raise SceneError(f"tool.file: {file} is not a good {file.suffix[1:].upper()} file: {error}") from None
-    if len(triangles) == 0:
-        raise SceneError(f"tool.file: {file} holds no triangles")
-    if not np.isfinite(vertices).all():
-        raise SceneError(f"tool.file: {file} holds a coordinate that is not finite")
-    vertices, place = np.unique(vertices, axis=0, return_inverse=True)
-    triangles = place.reshape(-1)[triangles]
-    a, b, c = triangles.T
-    return vertices, triangles[(a != b) & (b != c) & (c != a)]
-
-
-def closed_mesh(
-    vertices: np.ndarray, triangles: np.ndarray, name: str
-) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Vertices (k, 3) about the centre of mass of the volume that a mesh bounds, triangles (t, 3) that face outwards,
-    and whether they had to be turned round for that.
-
-    Raises:
-        SceneError: the mesh is open, or its triangles do not all face the same way.
-    """
-    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    uses = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]
-    if np.any(uses != 2):
-        raise SceneError(
-            f"tool.file: the mesh in {name} is not closed: {np.sum(uses != 2)} of {len(uses)} edges do not belong to "
-            "exactly two triangles; close it (for example with a mesh editor's repair) and try again"
-        )
-    if len(np.unique(edges, axis=0)) < len(edges):
-        raise SceneError(
-            f"tool.file: the triangles of {name} do not all face the same way; make its normals consistent "
-            "and try again"
-        )
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    parts = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0  # volumes of the tetrahedra with the origin
-    volume = float(parts.sum())
-    if abs(volume) < 1e-9 * float(np.prod(np.ptp(vertices, axis=0))) or volume == 0.0:
-        raise SceneError(f"tool.file: the mesh in {name} encloses no volume")
-    centre = (parts[:, None] * (a + b + c)).sum(axis=0) / (4.0 * volume)
-    return vertices - centre, triangles if volume > 0.0 else triangles[:, ::-1], volume < 0.0
-
-
-def checked_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh that `closed_mesh` made before and that was kept since, its vertices (k, 3) [m] to the bit.
-
-    Raises:
-        SceneError: it is none.
-    """
-    vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(triangles)
-    if vertices.ndim != 2 or triangles.ndim != 2 or vertices.shape[1] != 3 or triangles.shape[1] != 3:
-        raise SceneError(f"the mesh has vertices {vertices.shape} and triangles {triangles.shape}")
-    if triangles.dtype.kind not in "iu" or len(triangles) == 0:
-        raise SceneError("the mesh has no triangles of whole numbers")
-    if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise SceneError("the mesh has a triangle with a vertex that is not there")
-    if not np.isfinite(vertices).all() or np.abs(vertices).max() > _FARTHEST:
-        raise SceneError(f"the mesh has a vertex that is not finite or beyond {_FARTHEST:g} m")
-    triangles = triangles.astype(np.int64)
-    again, _, turned = closed_mesh(vertices, triangles, "the scene")
-    if turned or np.abs(again - vertices).max() > 1e-6 * np.abs(vertices).max():
-        raise SceneError("the mesh faces inwards or is not about its centre of mass")
-    return vertices, triangles
-
-
-def _stl(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    count = int.from_bytes(data[80:84], "little")
-    # A text file may be told by its length only: binary ones may begin with "solid", too.
-    if len(data) >= 84 and len(data) == 84 + count * _STL_TRIANGLE.itemsize:
-        corners = np.frombuffer(data, _STL_TRIANGLE, count, 84)["corners"].reshape(-1, 3).astype(float)
-    elif data.lstrip()[:5].lower() == b"solid":
-        words = [line.split() for line in data.decode("utf-8").splitlines()]
-        corners = np.array([w[1:4] for w in words if w and w[0].lower() == "vertex"], dtype=float)
-        if len(corners) % 3:
-            raise ValueError("a triangle is cut short")
-    else:
-        raise ValueError("neither text nor as long as it says; it may be cut short")
-    return corners.reshape(-1, 3), np.arange(len(corners)).reshape(-1, 3)
-
-
-def _obj(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    vertices: list[list[str]] = []
-    triangles: list[list[int]] = []
-    for line in data.decode("utf-8").splitlines():
-        words = line.split()
-        if words[:1] == ["v"]:
-            vertices.append(words[1:4])
-        elif words[:1] == ["f"]:
-            numbers = [int(word.split("/")[0]) for word in words[1:]]
-            # Indices count from 1, negative ones back from the last vertex so far.
-            corner = [n - 1 if n > 0 else len(vertices) + n for n in numbers]
-            triangles += [[corner[0], corner[k], corner[k + 1]] for k in range(1, len(corner) - 1)]
-    points = np.array(vertices, dtype=float).reshape(-1, 3)
-    index = np.array(triangles, dtype=int).reshape(-1, 3)
-    if index.size and not (0 <= index.min() and index.max() < len(points)):
-        raise ValueError("a face names a vertex that is not there")
-    return points, index
+        return [f"{self.file}: {note}" for note in self._solid.notes] if "_solid" in self.__dict__ else []

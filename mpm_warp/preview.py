@@ -50,7 +50,7 @@ class Preview:
         over = np.all((poses[:, :2] + around > 0.0) & (poses[:, :2] - around < scene.bed.size[:2]), axis=1)
         touching = np.flatnonzero((low < 0.0) & over)
         touch = float(times[touching[0]]) if len(touching) else None
-        reach = np.stack([outline.min(axis=0), outline.max(axis=0)])
+        reach = np.stack([outline.min(axis=0), outline.max(axis=0)]) - body.path_point
         odd_size = size_warning(outline, scene.bed.size, scene.open_sides)
         warnings += ([odd_size] if odd_size else []) + _of_path(scene, low, touch)
         if len(scene.displaced):
@@ -64,8 +64,20 @@ class Preview:
                 f"{1e3 * a:.0f} to {1e3 * b:.0f} mm along {axis}"
                 for axis, a, b in zip("xyz", *reach, strict=True)
             )
+            named = {
+                "com": "centre of mass",
+                "file": "origin in the file",
+                "tip": "tip (middle of its lowest face)",
+            }
+            used = getattr(body, "origin", "com")
+            others = "".join(
+                f"; the {named[name]} is at ({', '.join(f'{1e3 * x:.0f}' for x in place)}) mm from the centre of mass"
+                for name, place in body.origins.items()
+                if name != "com" and np.abs(place).max() >= 5e-4
+            )
             lines.insert(
-                0, f"the path is that of the tool's centre of mass; around it the tool reaches from {sides}"
+                0,
+                f"the path is that of the tool's {named[used]}; around it the tool reaches from {sides}{others}",
             )
         return Preview(
             lowest=float(low[deepest]),

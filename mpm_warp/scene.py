@@ -13,7 +13,14 @@ import numpy as np
 from .bed import Bed, digest
 from .bodies import Axle, MeshBody, Tool
 from .material import Material
-from .poses import in_body_frame, in_world_frame, rotation_matrices, rotation_vectors, sampled_poses
+from .poses import (
+    in_body_frame,
+    in_world_frame,
+    rotate,
+    rotation_matrices,
+    rotation_vectors,
+    sampled_poses,
+)
 from .settings import Settings, build, setting, settings
 from .state import SceneError
 from .tool_geometry import HOLDS, distances, thickening
@@ -173,7 +180,7 @@ class Scene(Settings):
     @property
     def mesh(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Vertices (k, 3) [m] about the centre of mass and triangles (t, 3) of a body that is a mesh."""
-        return self.body.mesh[:2] if isinstance(self.body, MeshBody) else None
+        return self.body.mesh if isinstance(self.body, MeshBody) else None
 
     @property
     def axle(self) -> Axle | None:
@@ -195,7 +202,10 @@ class Scene(Settings):
         Of a body with a free height the z of the start, which the solver replaces.
         """
         if self._path is not None:
-            return sampled_poses(np.asarray(self._path), np.atleast_1d(np.asarray(time, dtype=float)))
+            poses = sampled_poses(np.asarray(self._path), np.atleast_1d(np.asarray(time, dtype=float)))
+            if self.body is not None and (point := self.body.path_point).any():
+                poses[:, :3] -= rotate(poses[:, 3:], point)
+            return poses
         return np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(np.atleast_1d(time)), 1))
 
     def body_poses(self) -> np.ndarray:

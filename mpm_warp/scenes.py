@@ -57,7 +57,7 @@ def ramp(time: np.ndarray, depth: float, speed: float) -> np.ndarray:
     return np.stack([RAMP_SPEED * (first + third) + speed * second, RAMP_SPEED * (third - first)], axis=-1)
 
 
-_PATH = "rows t [s], x, y, z [m], qx, qy, qz, qw of the body's centre of mass"
+_PATH = "rows t [s], x, y, z [m], qx, qy, qz, qw of the body's centre of mass, or of tool.origin"
 _SHARE = ", a share of the bin's length"
 
 
@@ -135,7 +135,7 @@ class Excavation(Scene):
 
 @settings
 class Body(Scene):
-    """A box, a cylinder or a mesh moves through the bed along a path of its centre of mass."""
+    """A box, a cylinder or a mesh moves through the bed along a path of its centre of mass, or of its `origin`."""
 
     name: str = "body"
     kind: str = "body"
@@ -257,7 +257,9 @@ class Wheel(Scene):
     @cached_property
     def body(self) -> Cylinder:
         """The wheel; its axis is y and its centre of mass the middle of the axle."""
-        return Cylinder(**{f.name: getattr(self, f.name) for f in fields(Cylinder) if f.name != "shape"})
+        return Cylinder(
+            **{f.name: getattr(self, f.name) for f in fields(Cylinder) if f.name not in ("shape", "origin")}
+        )
 
     @property
     def axle(self) -> Axle:

@@ -46,7 +46,7 @@ def wall_thickness(body: MeshBody, most: float) -> np.ndarray:
     def on_device(points: np.ndarray) -> wp.array:
         return wp.array(points, dtype=wp.vec3, device=device)
 
-    vertices, triangles, _ = body.mesh
+    vertices, triangles = body.mesh
     mesh = wp.Mesh(on_device(vertices), wp.array(triangles.ravel(), dtype=int, device=device))
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
@@ -84,7 +84,7 @@ def thickening(body: Tool, contact_distance: float, spacing: float) -> np.ndarra
     least = least_thickness(contact_distance, spacing)
     if least == 0.0:
         return None
-    vertices, triangles, _ = body.mesh
+    vertices, triangles = body.mesh
     missing = 0.5 * np.maximum(least - wall_thickness(body, least), 0.0)
     if not missing.any():
         return None

@@ -51,7 +51,7 @@ def shape_data(
         # A bar can be thinner than twice the depth at which contact begins; it then begins half-way to its middle.
         data.grouser_offset = min(0.0, margin + 0.25 * body.grouser_thickness)
     elif body.surface == "mesh":
-        vertices, triangles, _ = body.mesh
+        vertices, triangles = body.mesh
         mesh = wp.Mesh(
             points=wp.array(vertices, dtype=wp.vec3, device=device),
             indices=wp.array(triangles.ravel(), dtype=int, device=device),

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mpm_warp import Box, Cylinder, MeshBody, SceneError
-from mpm_warp.bodies import closed_mesh
+from mpm_warp import Body, Box, Cylinder, MeshBody, Scene, SceneError
+from mpm_warp.preview import Preview
 from sgns_testing.meshes import BOX_FACES, box_corners, box_triangles, write_obj, write_stl, write_text_stl
 
 SIZE = (0.1, 0.2, 0.3)
@@ -18,25 +18,12 @@ def test_a_mesh_is_about_its_centre_of_mass(tmp_path, form):
         "stl": lambda: write_stl(tmp_path / "a.stl", CORNERS, box_triangles()),
         "text stl": lambda: write_text_stl(tmp_path / "a.STL", CORNERS, box_triangles()),
     }
-    vertices, triangles, turned = MeshBody(file=str(writers[form]())).mesh
+    body = MeshBody(file=str(writers[form]()))
+    vertices, triangles = body.mesh
     assert vertices.shape == (8, 3)
     assert triangles.shape == (12, 3)
-    assert not turned
+    assert not body.warnings()
     np.testing.assert_allclose(np.abs(vertices), np.tile(np.array(SIZE) / 2, (8, 1)), atol=1e-6)
-
-
-def test_an_uneven_mesh_has_its_volumes_centre():
-    """A pyramid's centre of mass lies a quarter of its height above its base."""
-    vertices = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 2]]) + 7.0
-    faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
-    about, _, turned = closed_mesh(vertices, faces, "pyramid")
-    assert not turned
-    np.testing.assert_allclose(about[4], [0, 0, 1.5], atol=1e-12)
-    # Inside out: turned, and everything else the same.
-    again, outwards, turned = closed_mesh(vertices, faces[:, ::-1], "pyramid")
-    assert turned
-    np.testing.assert_allclose(again, about, atol=1e-12)
-    np.testing.assert_array_equal(outwards, faces)
 
 
 def test_a_mesh_that_was_turned_says_so(tmp_path):
@@ -48,7 +35,6 @@ def test_a_mesh_that_was_turned_says_so(tmp_path):
     ("faces", "words"),
     [
         (BOX_FACES[1:], "not closed: 4 of 17 edges"),
-        ([BOX_FACES[0][::-1], *BOX_FACES[1:]], "do not all face the same way"),
         ([], "holds no triangles"),
         ([(0, 1, 9)], "not a good OBJ file: a face names a vertex that is not there"),
     ],
@@ -64,9 +50,9 @@ def test_bad_mesh_files(tmp_path):
     cut_short.write_bytes(b"\0" * 80 + cut_short.read_bytes()[80:-7])
     with pytest.raises(SceneError, match="cut short"):
         MeshBody(file=str(cut_short))
-    with pytest.raises(SceneError, match=r"allowed: \*.stl, \*.obj"):
-        (tmp_path / "a.ply").write_text("ply")
-        MeshBody(file=str(tmp_path / "a.ply"))
+    with pytest.raises(SceneError, match=r"allowed: \*.stl, \*.obj, \*.ply, \*.off, \*.glb, \*.3mf"):
+        (tmp_path / "a.step").write_text("ISO-10303-21;")
+        MeshBody(file=str(tmp_path / "a.step"))
     with pytest.raises(SceneError, match="cannot read"):
         MeshBody(file=str(tmp_path / "none.stl"))
     with pytest.raises(SceneError, match=r"tool\.file is missing"):
@@ -117,3 +103,41 @@ def test_a_known_mesh_is_checked(tmp_path, change, words):
     body = MeshBody(file=str(write_obj(tmp_path / "box.obj", CORNERS, BOX_FACES)))
     with pytest.raises(SceneError, match=words):
         MeshBody.of_mesh(*change(*body.mesh[:2]), file="box.obj")
+
+
+TURN = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))  # a quarter about z: x becomes y
+
+
+@pytest.mark.parametrize(
+    ("origin", "place"), [("com", (0, 0, 0)), ("tip", (0, 0, -0.15)), ("file", (-0.05, -0.1, -0.15))]
+)
+def test_a_path_may_be_that_of_another_point(tmp_path, origin, place):
+    """In millimetres; the corner of the box is the file's origin."""
+    file = write_obj(tmp_path / "box.obj", 1e3 * box_corners(SIZE), BOX_FACES)
+    tool = MeshBody(file=str(file), unit="mm", origin=origin)
+    np.testing.assert_allclose(tool.path_point, place, atol=1e-12)
+    path = ((0.0, 0.4, 0.3, 0.4, *TURN), (1.0, 0.5, 0.3, 0.4, *TURN))
+    scene = Body(tool=tool, path=path, duration=1.0)
+    x, y, z = place
+    np.testing.assert_allclose(scene.body_poses()[0, :3], np.array([0.4, 0.3, 0.4]) - [-y, x, z], atol=1e-12)
+    file.unlink()  # what a run holds is enough
+    again = Scene.from_dict(scene.to_dict(), scene.mesh)
+    np.testing.assert_array_equal(again.body_poses(), scene.body_poses())
+    assert again.to_dict() == scene.to_dict()
+    assert any("centre of mass" in line and "mm" in line for line in Preview.of(scene).lines)
+
+
+def test_a_box_and_a_cylinder_have_a_tip():
+    assert Box(origin="tip").path_point.tolist() == [0.0, 0.0, -0.05]
+    assert Cylinder(origin="tip").path_point.tolist() == [0.0, 0.0, -0.075]
+    assert not Box().path_point.any()
+
+
+def test_old_runs_keep_their_tool(tmp_path):
+    """Those from before `unit`, `origin` and `centre`."""
+    body = MeshBody(file=str(write_obj(tmp_path / "box.obj", CORNERS, BOX_FACES)))
+    old = {"shape": "mesh", "file": "gone.obj", "scale": 1.0, "friction": 0.3, "digest": body.digest}
+    data = {"kind": "body", "tool": old, "path": [[0.0, 0.4, 0.3, 0.4, 0, 0, 0, 1]]}
+    scene = Scene.from_dict(data, body.mesh)
+    assert not scene.body.path_point.any()
+    np.testing.assert_array_equal(scene.mesh[0], body.mesh[0])

@@ -28,7 +28,7 @@ import torch
 import yaml
 
 from mpm_warp import SceneError
-from mpm_warp.bodies import read_mesh
+from mpm_warp.mesh_files import read_mesh
 from sgns.config import UserError, parse_yaml
 from sgns.data.check import check_run
 from sgns.data.dataset import Dataset
@@ -569,6 +569,10 @@ def test_names_of_runs_do_not_leave_the_dataset(tmp_path) -> None:
 READERS = {
     "a.stl": (read_mesh, SceneError, None),
     "a.obj": (read_mesh, SceneError, None),
+    "a.ply": (read_mesh, SceneError, None),
+    "a.off": (read_mesh, SceneError, None),
+    "a.glb": (read_mesh, SceneError, None),
+    "a.3mf": (read_mesh, SceneError, None),
     "a.csv": (read_path, UserError, "cannot read"),
     "a.ckpt": (load_surrogate, UserError, None),
     "a.h5": (Run, UserError, None),
@@ -597,7 +601,10 @@ def read(path: Path, name: str) -> None:
         reader(path)
 
 
-@pytest.mark.parametrize("name", ["a.ckpt", "a.h5", "basis.h5", "a.csv", "a.stl", "a.obj", "valid.tfrecord"])
+MESHES = ["a.stl", "a.obj", "a.ply", "a.off", "a.glb", "a.3mf"]
+
+
+@pytest.mark.parametrize("name", ["a.ckpt", "a.h5", "basis.h5", "a.csv", *MESHES, "valid.tfrecord"])
 def test_numpy_archives_with_objects_are_nothing_that_is_read(tmp_path, canary, name) -> None:
     with (tmp_path / name).open("wb") as file:
         np.savez(file, x=np.array([Touch(canary)], dtype=object))

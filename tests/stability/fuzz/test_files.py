@@ -20,7 +20,8 @@ from kills import as_bytes
 from scipy.spatial.transform import Rotation, Slerp
 
 from mpm_warp import Scene
-from mpm_warp.bodies import closed_mesh, read_mesh
+from mpm_warp.mesh_files import read_mesh
+from mpm_warp.solids import Solid, closed_mesh
 from sgns.config import parse_yaml
 from sgns.data.check import check_run
 from sgns.data.dataset import Dataset
@@ -250,9 +251,10 @@ def tetrahedra(draw: Any, folder: Path) -> tuple[np.ndarray, str, bytes]:
     return corners, file.name, file.read_bytes()
 
 
-def read_closed(file: Path) -> tuple[np.ndarray, np.ndarray, bool]:
+def read_closed(file: Path) -> Solid:
     """A mesh as a tool takes it."""
-    return closed_mesh(*read_mesh(file), file.name)
+    vertices, triangles, _ = read_mesh(file)
+    return closed_mesh(vertices, triangles, file.name)
 
 
 def test_good_meshes_keep_their_volume(tmp_path) -> None:
@@ -260,7 +262,7 @@ def test_good_meshes_keep_their_volume(tmp_path) -> None:
     @given(tetrahedra(tmp_path))
     def check(made: tuple[np.ndarray, str, bytes]) -> None:
         corners, name, _ = made
-        vertices, triangles, _ = read_closed(tmp_path / name)
+        vertices, triangles, *_ = read_closed(tmp_path / name)
         a, b, c = (vertices[triangles[:, k]] for k in range(3))
         volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0
         true = abs(np.linalg.det(corners[1:] - corners[0])) / 6.0
