@@ -10,10 +10,12 @@ import numpy as np
 import warp as wp
 
 from .bed import PADDING
+from .bodies import MeshBody
 from .kernels.ghost_nodes import mirror_layers, periodic_layers
 from .kernels.grid import grid_struct
 from .scene import Scene
 from .state import SceneError
+from .tool_geometry import mesh_asymmetry
 
 # --- Where the grid lies: its nodes, walls and ghost layers for a scene ---------------------------------
 
@@ -78,6 +80,7 @@ def _part_in_bin(distance: float) -> float:
 # plane are their own images: they come first and count half.
 
 _SAME = 1e-6  # positions closer than this are the same [grid spacings]
+_ALIKE = 0.01  # sides of a mesh that differ by less feel the same forces [grid spacings]
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,11 @@ def asymmetry(scene: Scene) -> str | None:
         turned = np.abs(poses[:, [3, 5]]).max(axis=1) > 1e-9
         if turned.any():
             return f"at {times[int(np.argmax(turned))]:.3f} s the body is turned about another axis than y"
+        if (
+            isinstance(scene.body, MeshBody)
+            and (off_by := mesh_asymmetry(scene.body)) > _ALIKE * scene.bed.spacing
+        ):
+            return f"the tool's two sides differ by {1e3 * off_by:.3g} mm"
     if half(scene) is None:
         return (
             "the particles are not mirror images of each other (bed.arrangement); use bed.arrangement=lattice or "

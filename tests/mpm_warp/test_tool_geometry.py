@@ -4,9 +4,22 @@ import numpy as np
 import pytest
 from thin_walls import measure, pushed_sheet
 
-from mpm_warp import Bed, Body, Box, Cylinder, MeshBody, Scene, Solver, Wheel, effects_for
+from mpm_warp import (
+    Bed,
+    Body,
+    Box,
+    Cylinder,
+    Effects,
+    MeshBody,
+    Scene,
+    SceneError,
+    Solver,
+    Wheel,
+    asymmetry,
+    effects_for,
+)
 from mpm_warp.poses import about_y
-from mpm_warp.tool_geometry import distances, thickening, thinnest, wall_thickness
+from mpm_warp.tool_geometry import distances, mesh_asymmetry, thickening, thinnest, wall_thickness
 from sgns_testing.meshes import box_corners, box_triangles
 from sgns_testing.scenes import cut
 
@@ -84,6 +97,22 @@ def test_stress_around_a_buried_tool_is_that_of_the_whole_bed():
     whole, part = Solver(cut(bed=BED)).particles, Solver(buried()).particles
     kept = np.delete(np.arange(whole.position.size), buried().displaced)
     np.testing.assert_array_equal(part.stress.numpy(), whole.stress.numpy()[kept])
+
+
+def test_a_mesh_with_two_different_sides_is_no_mirror_image():
+    """Of a share with one wing the half says nothing about the whole."""
+    vertices, triangles = box_corners(SIZE, -0.5 * np.array(SIZE)), box_triangles()
+    even = MeshBody.of_mesh(vertices, triangles)
+    assert mesh_asymmetry(even) < 1e-6
+    assert effects_for(buried(even, height=0.1))[0].symmetry
+    assert mesh_asymmetry(BENT) < 1e-6 and mesh_asymmetry(HOLLOW) < 1e-6
+    corner = np.array([[0, 0, 0], [0.09, 0, 0], [0, 0.09, 0], [0, 0, 0.09]])
+    winged = MeshBody.of_mesh(corner - corner.mean(axis=0), [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)])
+    scene = buried(winged, height=0.1)
+    assert asymmetry(scene).startswith("the tool's two sides differ by 22")
+    assert not effects_for(scene)[0].symmetry
+    with pytest.raises(SceneError, match=r"the tool's two sides differ .*effects\.symmetry=false"):
+        Solver(scene, Effects(symmetry=True))
 
 
 # --- Thin walls of meshes -------------------------------------------------------------------------------
