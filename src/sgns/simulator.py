@@ -123,7 +123,8 @@ class Simulator:
 
     Copies go on from where this one is, to the bit as it does, and on their own: `copy.copy`, which shares the weights,
     `copy.deepcopy`, and pickled ones, in other processes too. `reset` and `step` are for one thread at a time: give
-    each thread a copy. `rollout` and `rollouts` change nothing and may run in several threads.
+    each thread a copy. `rollout` and `rollouts` change nothing and may run in several threads. Processes made by `fork`
+    need `torch.set_num_threads(1)` first, else torch may wait for threads that stayed with their parent.
 
     Args:
         surrogate: Network, basis and start.

@@ -15,6 +15,7 @@ import torch
 from sgns.config import UserError
 from sgns.data.surface import soil_surface
 from sgns.simulator import Simulator
+from sgns_testing.commands import python
 from sgns_testing.tiny import MODEL, POLYNOMIAL
 from sgns_testing.trained import TrainedKinds
 
@@ -481,3 +482,20 @@ def test_what_a_simulator_is_made_of_is_looked_at(trained) -> None:
             Simulator(surrogate, rate_independent=rate_independent)
     # None of this has harmed what was given.
     assert Simulator(surrogate, num_modes=np.int64(3), rate_independent=np.True_).num_modes == 3
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="has no fork")
+def test_a_forked_pool_works_with_one_thread_each() -> None:
+    """As docs/faq.md says; without the initializer it hangs, since the parent has used several threads."""
+    code = """
+import multiprocessing, torch
+
+def work(size):
+    return float((torch.ones(size, size) @ torch.ones(size, size))[0, 0])
+
+torch.set_num_threads(2)
+work(2000)
+with multiprocessing.get_context("fork").Pool(2, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    print(pool.map(work, [1500, 1500]))
+"""
+    assert python(code).stdout == "[1500.0, 1500.0]\n"
