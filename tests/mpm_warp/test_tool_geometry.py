@@ -109,7 +109,7 @@ def test_a_mesh_with_two_different_sides_is_no_mirror_image():
     corner = np.array([[0, 0, 0], [0.09, 0, 0], [0, 0.09, 0], [0, 0, 0.09]])
     winged = MeshBody.of_mesh(corner - corner.mean(axis=0), [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)])
     scene = buried(winged, height=0.1)
-    assert asymmetry(scene).startswith("the tool's two sides differ by 22")
+    assert asymmetry(scene).startswith("the tool's two sides differ by 45 mm")
     assert not effects_for(scene)[0].symmetry
     with pytest.raises(SceneError, match=r"the tool's two sides differ .*effects\.symmetry=false"):
         Solver(scene, Effects(symmetry=True))
