@@ -38,7 +38,7 @@ def distances(
 def mesh_asymmetry(body: MeshBody) -> float:
     """How far a mesh is from being its own mirror image about its plane y = 0 [m]: the farthest that the image of a
     corner, or of the middle of a triangle, is from its surface."""
-    vertices, triangles, _ = body.mesh
+    vertices, triangles = body.mesh
     points = np.concatenate([vertices, vertices[triangles].mean(axis=1)])
     return float(np.abs(distances(body, points * [1.0, -1.0, 1.0], margin=body.reach)).max())
 
