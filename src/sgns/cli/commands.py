@@ -377,7 +377,11 @@ def _line_of(error: Exception) -> str | None:
     if isinstance(error, OSError) and error.errno in _FULL:
         where = "" if error.filename is None else f"{error.filename}: "
         return f"{where}{error.strerror}; free some space; what is complete is kept, and the same command goes on"
-    if isinstance(error, OSError) and error.errno in _UNWRITABLE and error.filename is not None:
+    if (
+        isinstance(error, OSError)
+        and error.filename is not None
+        and (error.errno in _UNWRITABLE or _of_mkdir(error))
+    ):
         return f"{error.filename}: {error.strerror}; choose another output"
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "can't allocate" in str(error)):
         reason = _one_line(str(error)) or "no reason given"
@@ -392,6 +396,14 @@ def _line_of(error: Exception) -> str | None:
     from sgns.cli.setting_errors import describe
 
     return describe(error)
+
+
+def _of_mkdir(error: BaseException) -> bool:
+    """Whether a folder could not be made, such as one in /proc: the system then says that it is not there."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return trace is not None and trace.tb_frame.f_code.co_name in ("mkdir", "makedirs")
 
 
 def _one_line(text: str) -> str:

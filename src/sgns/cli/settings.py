@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
@@ -301,6 +302,7 @@ class CheckedLoader(ConfigLoader):
                 f"the settings cannot be put together: {type(error).__name__}: {error}"
             ) from error
         require_own_objects(cfg, self._typed)
+        _expand_home(cfg)
         return cfg
 
     def get_search_path(self) -> ConfigSearchPath:
@@ -324,6 +326,14 @@ class CheckedLoader(ConfigLoader):
     def compute_defaults_list(self, config_name: str | None, overrides: list[str], run_mode: RunMode) -> Any:
         require_plain_overrides(overrides)
         return self._loader.compute_defaults_list(config_name, overrides, run_mode)
+
+
+def _expand_home(cfg: DictConfig) -> None:
+    """Put the home folder in place of `~/` at the beginning of values, as a shell does of words without quotes."""
+    plain: Any = OmegaConf.to_container(cfg, resolve=False)
+    for path, value in _leaves({key: value for key, value in plain.items() if key != "hydra"}):
+        if isinstance(value, str) and value.startswith("~/"):
+            OmegaConf.update(cfg, ".".join(path), os.path.expanduser(value))
 
 
 # --- A rollout that names no scene plays the one of its checkpoint --------------------------------------

@@ -133,6 +133,7 @@ def test_every_option_of_every_group_composes(command: str) -> None:
         (["train", "output=größe"], ["'ö' needs quotes, as in 'output=\"größe\"'"]),
         (["train", "output=a~b"], ["'~' needs quotes, as in 'output=\"a~b\"'"]),
         (["train", "output=[a&b]"], ["'&' needs quotes, as in 'output=[\"&\"]'"]),
+        (["simulate", "-m", "seed=1,2", "hydra.sweep.dir=/proc/x"], ["/proc/x: ", "choose another output"]),
         (["rollout"], ["missing for checkpoint", "checkpoint=..."]),
         (["rollout", "checkpoint=null"], ["checkpoint is null"]),
         (["rollout", "checkpoint=best.ckpt", "scene=quick_excavation"], ["no checkpoint at best.ckpt"]),
@@ -299,3 +300,15 @@ def test_settings_that_nobody_reads(empty_folder: Path) -> None:
     command = f"{sys.executable} -m sgns train --cfg all | true; exit ${{PIPESTATUS[0]}}"
     result = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=100)
     assert (result.returncode, result.stderr) == (0, "")
+
+
+def test_a_home_folder_in_quotes_is_the_home_folder(
+    empty_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(empty_folder / "home"))
+    shown = call("train", 'output="~/first"', "checkpoint='~/a.ckpt'", "--cfg", "job").stdout
+    assert (
+        f"output: {empty_folder}/home/first" in shown and f"checkpoint: {empty_folder}/home/a.ckpt" in shown
+    )
+    done = call("train", 'output="~/first"', "training.max_steps=-1")
+    assert done.returncode == 2 and not (empty_folder / "~").exists()
