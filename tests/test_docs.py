@@ -86,6 +86,8 @@ def assert_composes(command: str) -> None:
     if name.startswith("-"):
         return
     assert name in COMMANDS, command
+    if name == "simulate" and "dataset=own" in overrides:  # as the command does: the dataset's scene
+        overrides = ["scene=body", *overrides]
     try:
         composed(*overrides, command=name)
     except Exception as error:

@@ -272,7 +272,7 @@ class CheckedLoader(ConfigLoader):
         from_shell: bool = True,
         validate_sweep_overrides: bool = True,
     ) -> DictConfig:
-        overrides = [*known_scene(config_name, overrides), *overrides]
+        overrides = self._with_scene(overrides, config_name)
         return self._checked(
             overrides,
             lambda: self._loader.load_configuration(
@@ -281,14 +281,24 @@ class CheckedLoader(ConfigLoader):
         )
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
-        sweep_overrides = [
-            *known_scene(master_config.hydra.job.config_name, sweep_overrides),
-            *sweep_overrides,
-        ]
+        sweep_overrides = self._with_scene(sweep_overrides, master_config.hydra.job.config_name)
         overrides = [*master_config.hydra.overrides.hydra, *sweep_overrides]
         return self._checked(
             overrides, lambda: self._loader.load_sweep_config(master_config, sweep_overrides)
         )
+
+    def _with_scene(self, overrides: list[str], config_name: str | None) -> list[str]:
+        """The scene of a dataset or of a checkpoint before the overrides, so that they can be of its keys and groups."""
+        overrides = [*known_scene(config_name, overrides), *overrides]
+        datasets = [one for one in overrides if one.startswith("dataset=")]
+        if config_name != "simulate" or not datasets or any(one.startswith("scene=") for one in overrides):
+            return overrides
+        try:
+            alone = self._loader.load_configuration("simulate", datasets[-1:], RunMode.RUN)
+            scene = alone.dataset.get("scene")
+        except Exception:  # said where everything is composed
+            return overrides
+        return [f"scene={scene}", *overrides] if isinstance(scene, str) else overrides
 
     def _checked(self, overrides: Sequence[str], compose: Callable[[], DictConfig]) -> DictConfig:
         require_plain_overrides(overrides)
@@ -394,7 +404,10 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
     Raises:
         UserError: The line names the key.
     """
-    missing = sorted(OmegaConf.missing_keys(cfg))
+    campaign = command == "simulate" and cfg.get("dataset") is not None  # may draw what its scene lacks
+    missing = sorted(
+        key for key in OmegaConf.missing_keys(cfg) if not (campaign and key.startswith("scene."))
+    )
     if missing:
         keys = " ".join(f"{key}=..." for key in missing)
         what = "a value is" if len(missing) == 1 else "values are"

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import glob
 import heapq
+import io
 import itertools
 import shutil
 from collections.abc import Mapping, Sequence
@@ -19,7 +22,7 @@ from sgns.config import UserError, flattened
 from sgns.data.dataset import SPLITS, read_description
 from sgns.data.files import file_lock, write_whole
 from sgns.settings import DatasetSettings
-from sgns.simulate.scene import decided, replaced
+from sgns.simulate.scene import decided, replaced, scene_from_data
 
 # --- What runs cost in work, time and disk, before and while they are made ------------------------------
 
@@ -117,8 +120,11 @@ def size_words(size: float) -> str:
     return f"{size:.1f} {units[0]}" if size < 9.95 else f"{size:.0f} {units[0]}"
 
 
+_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # long paths are many numbers
+
 # --- A dataset: a folder of runs that share a bed, drawn from a grid of scenes and split by run ---------
 # <folder>/dataset.yaml      what the runs are: base scene, draws, seed, split; written before the first run
+# <folder>/runs.csv          the same for people: a line for each run with its part and what was drawn
 # <folder>/runs/<name>.h5    one run each; a run that is there is complete
 
 
@@ -132,6 +138,8 @@ class Campaign:
     """Run name → scene."""
     split: dict[str, str]
     """Run name → train, validation or test."""
+    drawn: dict[str, dict[str, Any]]
+    """Run name → dotted key of the scene → value, as dataset.draw gives it; files by name."""
     effects: dict[str, Any]
     """What was asked for; scenes decide about what is `auto`, each for itself."""
     precision: str
@@ -157,15 +165,26 @@ class Campaign:
         """Where a run goes."""
         return self.path / "runs" / f"{name}.h5"
 
+    def table(self) -> str:
+        """The contents of runs.csv: a line for each run."""
+        text = io.StringIO()
+        keys = list(dict.fromkeys(key for values in self.drawn.values() for key in values))
+        rows = csv.writer(text, lineterminator="\n")
+        rows.writerow(["run", "split", *keys])
+        for name, values in self.drawn.items():
+            rows.writerow([name, self.split[name], *(values.get(key, "") for key in keys)])
+        return text.getvalue()
+
     def record(self) -> None:
-        """Write dataset.yaml, or check that the folder's own says the same."""
+        """Write dataset.yaml and runs.csv, or check that the folder's own says the same."""
         file = self.path / "dataset.yaml"
         try:
             if not file.exists():
                 # Of two campaigns that begin at once the second finds the first's.
                 with file_lock(file, wait=True):
                     if not file.exists():
-                        write_whole(file, yaml.safe_dump(self.describe(), sort_keys=False))
+                        write_whole(self.path / "runs.csv", self.table())
+                        write_whole(file, yaml.dump(self.describe(), Dumper=_DUMPER, sort_keys=False))
                         return
         except OSError as error:
             raise UserError(f"cannot write {file}: {error.strerror}") from None
@@ -219,6 +238,8 @@ def plan(
             raise UserError(f"dataset.{key} is missing; a campaign needs name, path and draw")
     combinations = _combinations(asked.draw)
     count = asked.runs or len(combinations)
+    if len(combinations) < 3:
+        raise UserError(f"dataset.draw gives {len(combinations)} runs; a campaign needs 3 or more")
     if not 3 <= count <= len(combinations):
         raise UserError(
             f"dataset.runs is {count}; allowed: 3 to {len(combinations)}, the combinations of dataset.draw"
@@ -226,24 +247,47 @@ def plan(
     rng = np.random.default_rng(seed)
     chosen = sorted(rng.choice(len(combinations), size=count, replace=False).tolist())
     scenes: dict[str, Scene] = {}
+    drawn: dict[str, dict[str, Any]] = {}
     grids: dict[int, list[str]] = {}
     for index in chosen:
         grid, values = combinations[index]
         data = replaced(base, values)
         if isinstance(data.get("tool"), dict):
             data["tool"].pop("digest", None)  # `draw` may name another file; these are the person's settings
-        name = f"{index:04d}_" + "_".join(f"{key.split('.')[-1]}-{value}" for key, value in values.items())
-        scenes[name] = Scene.from_dict(data)
+        if missing := sorted(key for key, value in flattened(data).items() if value == "???"):
+            raise UserError(
+                f"scene.{missing[0]} is missing; give it, or its values in dataset.draw, such as {_EXAMPLE}"
+            )
+        name = _run_name(index, values)
+        scenes[name], drawn[name] = scene_from_data(data), values
         grids.setdefault(grid, []).append(name)
     return Campaign(
         name=asked.name,
         path=Path(asked.path),
         scenes=scenes,
+        drawn=drawn,
         split=_split(list(grids.values()), asked.split, rng),
         effects=effects,
         precision=precision,
         seed=seed,
     )
+
+
+_FILES = ("path", "tool.file")
+"""Keys of a scene whose values are files; draws may give them by pattern."""
+_EXAMPLE = "{path: paths/*.csv}"
+_LONGEST_NAME = 100
+
+
+def _run_name(index: int, values: Mapping[str, Any]) -> str:
+    """A run's name: its number among all combinations, and what it is if that is short."""
+    words = [
+        f"{key.split('.')[-1]}-{Path(value).stem if key in _FILES and isinstance(value, str) else value}"
+        for key, value in values.items()
+    ]
+    name = "_".join([f"{index:04d}", *words])
+    plain = name.isprintable() and not set(name) & set("/\\")
+    return name if plain and len(name.encode()) <= _LONGEST_NAME else f"{index:04d}"
 
 
 def _combinations(draw: Any) -> list[tuple[int, dict[str, Any]]]:
@@ -254,12 +298,30 @@ def _combinations(draw: Any) -> list[tuple[int, dict[str, Any]]]:
             raise UserError(
                 f"dataset.draw holds {grid!r}; it must be a grid, key: [values], or a list of such grids"
             )
-        for key, values in grid.items():
-            if not isinstance(values, list) or not values:
-                raise UserError(f"dataset.draw.{key} is {values!r}; it must be a list of at least one value")
-        products = itertools.product(*grid.values())
-        combinations += [(number, dict(zip(grid, values, strict=True))) for values in products]
+        drawn = {str(key).removeprefix("scene."): _drawn(key, values) for key, values in grid.items()}
+        products = itertools.product(*drawn.values())
+        combinations += [(number, dict(zip(drawn, values, strict=True))) for values in products]
     return combinations
+
+
+def _drawn(key: Any, values: Any) -> list[Any]:
+    """The values of a key of a grid; patterns of files as the files that fit them, in the order of their names."""
+    of_files = str(key).removeprefix("scene.") in _FILES
+    if of_files and isinstance(values, str):
+        values = [values]
+    if not isinstance(values, list) or not values:
+        raise UserError(f"dataset.draw.{key} is {values!r}; it must be a list of at least one value")
+    if not of_files:
+        return values
+    found: list[Any] = []
+    for value in values:
+        if not isinstance(value, str) or Path(value).exists() or not glob.has_magic(value):
+            found.append(value)
+        elif files := sorted(glob.glob(value, recursive=True)):
+            found += files
+        else:
+            raise UserError(f"dataset.draw.{key} is {value}; no file in {Path.cwd()} fits this pattern")
+    return found
 
 
 def _split(grids: list[list[str]], shares: tuple[float, ...], rng: np.random.Generator) -> dict[str, str]:

@@ -42,12 +42,12 @@ def base_scene(settings: dict[str, Any]) -> dict[str, Any]:
             f"dataset={settings['name']} has no scene: its runs come from elsewhere and are not simulated"
         )
     overrides = HydraConfig.get().overrides.task
-    if any(o.startswith("scene=") for o in overrides):
+    if any(o.startswith("scene=") and o != f"scene={settings['scene']}" for o in overrides):
         raise UserError(f"dataset={settings['name']} brings its own scene; leave out scene=")
-    kept = [o for o in overrides if not o.lstrip("+~").startswith("dataset")]
+    kept = [o for o in overrides if not o.lstrip("+~").startswith(("dataset", "scene="))]
     change = [f"scene.{key}={json.dumps(value)}" for key, value in (settings.get("change") or {}).items()]
     cfg = compose("simulate", [f"scene={settings['scene']}", *change, *kept])
-    return scene_from_config(cfg).to_dict()
+    return plain(cfg.scene) | {"material": plain(cfg.material)}
 
 
 def main(cfg: DictConfig) -> float | None:

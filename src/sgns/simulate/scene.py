@@ -25,9 +25,13 @@ _MOST_BYTES = 1 << 26
 
 def scene_from_config(cfg: DictConfig) -> Scene:
     """The scene in `cfg.scene` with the soil in `cfg.material`; a path file is read into the scene."""
-    data = plain(cfg.scene) | {"material": plain(cfg.material)}
+    return scene_from_data(plain(cfg.scene) | {"material": plain(cfg.material)})
+
+
+def scene_from_data(data: dict[str, Any]) -> Scene:
+    """A scene from nested data, in which `path` may be the name of a file."""
     if isinstance(data.get("path"), str):
-        data["path"] = read_path(Path(data["path"]))
+        data = {**data, "path": read_path(Path(data["path"]))}
     return Scene.from_dict(data)
 
 
@@ -51,29 +55,56 @@ def replaced(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 
 
 def read_path(file: Path) -> list[list[float]]:
-    """Rows t, x, y, z, qx, qy, qz, qw of a CSV file with a header line."""
+    """Rows t, x, y, z, qx, qy, qz, qw of a CSV file.
+
+    A first line with these names may be there or not. Blank lines, commas at the end of a line and what stands behind
+    a # are left out.
+    """
     wanted = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
+    values: list[list[float]] = []
+    number, first = 0, True
     try:
         rows = csv.reader(io.StringIO(read_text(file, _MOST_BYTES), newline=""))
-        first = next(rows, [])
-    except (OSError, ValueError, csv.Error) as error:
-        raise UserError(f"scene.path: cannot read {file}: {error}") from None
-    if [name.strip() for name in first] != wanted:
-        raise UserError(f"scene.path: the first line of {file} must be {','.join(wanted)}")
-    values: list[list[float]] = []
-    number = 1
-    try:
-        for number, row in enumerate(rows, start=2):
-            if len(row) != len(wanted):
-                raise UserError(
-                    f"scene.path: line {number} of {file} has {len(row)} values instead of {len(wanted)}"
-                )
-            values.append([float(v) for v in row])
+        for number, cells in enumerate(rows, start=1):
+            row = _without_comment(cells)
+            if not row:
+                continue
+            if not first or _is_number(row[0]):
+                if len(row) != len(wanted):
+                    raise UserError(
+                        f"scene.path: line {number} of {file} has {len(row)} values instead of {len(wanted)}"
+                    )
+                if not all(map(_is_number, row)):
+                    raise UserError(
+                        f"scene.path: line {number} of {file} holds something that is not a number"
+                    )
+                values.append([float(v) for v in row])
+            elif [name.lower() for name in row] != wanted:
+                raise UserError(f"scene.path: the first line of {file} must be {','.join(wanted)}")
+            first = False
     except csv.Error as error:
         raise UserError(f"scene.path: cannot read {file} after line {number}: {error}") from None
-    except ValueError:
-        raise UserError(f"scene.path: line {number} of {file} holds something that is not a number") from None
+    except (OSError, ValueError) as error:
+        raise UserError(f"scene.path: cannot read {file}: {error}") from None
+    if first:
+        raise UserError(f"scene.path: {file} is empty; it needs rows {','.join(wanted)}")
     return values
+
+
+def _without_comment(cells: list[str]) -> list[str]:
+    """What a line of a table says: nothing from a # on, and no empty cells at the end."""
+    row = [cell.strip() for cell in ",".join(cells).partition("#")[0].split(",")]
+    while row and not row[-1]:
+        row.pop()
+    return row
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def warning_summary(scenes: Mapping[str, Scene]) -> list[str]:

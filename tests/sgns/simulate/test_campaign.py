@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -11,7 +13,7 @@ from omegaconf import OmegaConf
 from mpm_warp import Effects, Scene, effects_for
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
-from sgns.simulate.campaign import duration_words, finishing_time, plan, run_cost, size_words
+from sgns.simulate.campaign import Campaign, duration_words, finishing_time, plan, run_cost, size_words
 from sgns.simulate.run import simulate_scene
 from sgns_testing.campaigns import BASE, EFFECTS, campaign
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
@@ -213,3 +215,76 @@ def test_every_scene_reads_the_mesh_that_the_settings_name(tmp_path):
     assert {scene.tool.digest for scene in c.scenes.values()} > {base.tool.digest}
     c.record()
     c.record()  # the same settings go on
+
+
+# --- Runs drawn from files ------------------------------------------------------------------------------
+
+ROWS = "t,x,y,z,qx,qy,qz,qw\n0,0.1,0.1,{z},0,0,0,1\n0.05,0.1,0.1,{z},0,0,0,1\n"
+BODY = {key: value for key, value in BASE.items() if key != "blade"} | {"kind": "body", "path": "???"}
+
+
+def of_files(folder: Path, **change: Any) -> Campaign:
+    settings = {"name": "own", "path": str(folder / "own"), "draw": {"path": "paths/*.csv"}}
+    return plan(settings | change, BODY, EFFECTS, "float32", 0)
+
+
+@pytest.fixture
+def paths(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "paths").mkdir()
+    for name, z in (("a", 0.07), ("b", 0.08), ("c d", 0.09)):
+        (tmp_path / "paths" / f"{name}.csv").write_text(ROWS.format(z=z))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        {"path": "paths/*.csv"},
+        {"scene.path": ["paths/*.csv"]},
+        {"path": ["paths/a.csv", "paths/b.csv", "paths/c d.csv"]},
+    ],
+)
+def test_paths_are_drawn_by_name_or_pattern(paths, draw):
+    c = of_files(paths, draw=draw)
+    assert {name: scene.path[0][3] for name, scene in c.scenes.items()} == {
+        "0000_path-a": 0.07, "0001_path-b": 0.08, "0002_path-c d": 0.09
+    }  # fmt: skip
+
+
+def test_meshes_are_drawn(paths):
+    for name, size in (("small", 0.09), ("large", 0.12)):
+        write_obj(paths / f"{name}.obj", box_corners((size, size, size)), BOX_FACES)
+    base = BODY | {"tool": {"shape": "mesh", "file": "???"}}
+    draw = {"tool.file": "*.obj", "path": "paths/*.csv"}
+    c = plan({"name": "own", "path": "own", "draw": draw}, base, EFFECTS, "float32", 0)
+    assert len(c.scenes) == 6
+    assert c.scenes["0000_file-large_path-a"].tool.half_size[0] == pytest.approx(0.06)
+    assert c.scenes["0005_file-small_path-c d"].tool.half_size[0] == pytest.approx(0.045)
+
+
+def test_long_values_give_short_names_and_a_table(paths):
+    rows = [[[t, 0.1, 0.1, z, 0, 0, 0, 1] for t in (0.0, 0.01, 0.02, 0.05)] for z in (0.07, 0.08, 0.09)]
+    c = of_files(paths, draw={"path": rows})
+    assert list(c.scenes) == ["0000", "0001", "0002"]
+    c = of_files(paths)
+    c.record()
+    c.record()  # is the same dataset
+    table = (paths / "own" / "runs.csv").read_text().splitlines()
+    assert table[0] == "run,split,path" and table[1] == f"0000_path-a,{c.split['0000_path-a']},paths/a.csv"
+    assert len(table) == 4
+    assert yaml.safe_load((paths / "own" / "dataset.yaml").read_text())["scenes"]["0001_path-b"]["path"]
+
+
+@pytest.mark.parametrize(
+    ("draw", "words"),
+    [
+        ({"path": "paths/*.txt"}, "no file in .* fits this pattern"),
+        ({"path": "paths/a.csv"}, "gives 1 runs; a campaign needs 3 or more"),
+        ({"path": ["paths/a.csv", "x.csv", "y.csv"]}, "cannot read x.csv"),
+        ({"contact_margin": [0.0, 0.1, 0.2]}, "scene.path is missing"),
+    ],
+)
+def test_draws_of_files_it_refuses(paths, draw, words):
+    with pytest.raises(UserError, match=words):
+        of_files(paths, draw=draw)

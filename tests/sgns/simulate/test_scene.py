@@ -15,7 +15,7 @@ from sgns.data.run import Run
 from sgns.rollout import require_same_freedom
 from sgns.simulate.campaign import plan
 from sgns.simulate.command import simulate_campaign
-from sgns.simulate.scene import asked_effects, decided, scene_from_config, warning_summary
+from sgns.simulate.scene import asked_effects, decided, read_path, scene_from_config, warning_summary
 from sgns_testing.commands import composed, sgns
 
 # --- Effects --------------------------------------------------------------------------------------------
@@ -193,3 +193,38 @@ def test_a_datasets_warnings_come_once_for_each_kind():
     assert still.startswith("1 of 4 runs, such as deep: the tool does not move")
     assert buried.startswith("1 of 4 runs, such as deep: the tool is in the soil at the start")
     assert mixed.startswith("the runs do not start from the same particles")
+
+
+# --- Path files as people have them ---------------------------------------------------------------------
+
+ROW = "0.5,1,2,3,0,0,0,1"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"t,x,y,z,qx,qy,qz,qw\n{ROW}\n",
+        f"{ROW}\n",
+        f"\ufeffT, X, Y, Z, qx, qy, qz, qw,\r\n\r\n{ROW},\r\n,,,,,,,\r\n",
+        f"# of a survey, 3 May\n# t,x,y,z,qx,qy,qz,qw\n{ROW} # start\n\n",
+    ],
+)
+def test_path_files_with_blank_lines_commas_and_comments(tmp_path, text):
+    (tmp_path / "path.csv").write_text(text, encoding="utf-8", newline="")
+    assert read_path(tmp_path / "path.csv") == [[0.5, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is empty"),
+        ("# nothing\n", "is empty"),
+        (f"time,x,y,z,qx,qy,qz,qw\n{ROW}\n", "the first line of .* must be t,x,y"),
+        (f"{ROW}\n\n0.5,1\n", "line 3 of .* has 2 values instead of 8"),
+        (f"{ROW}\n{ROW[:-1]}x\n", "line 2 of .* not a number"),
+    ],
+)
+def test_path_files_it_refuses(tmp_path, text, words):
+    (tmp_path / "path.csv").write_text(text)
+    with pytest.raises(UserError, match=words):
+        read_path(tmp_path / "path.csv")
