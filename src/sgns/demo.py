@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -62,4 +63,7 @@ def _newer(file: Path, than: Path) -> bool:
 
 
 if __name__ == "__main__":
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        # Ctrl-C reaches the command, too; it says what is kept, and the demo ends with its status.
+        signal.signal(signal.SIGINT, lambda *_: None)
     sys.exit(main())

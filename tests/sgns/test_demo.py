@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -12,7 +15,7 @@ from sgns import demo
 from sgns.cli.commands import COMMANDS
 from sgns.simulate.campaign import plan
 from sgns.simulate.scene import scene_from_config
-from sgns_testing.commands import composed
+from sgns_testing.commands import composed, environment
 
 
 @pytest.fixture
@@ -54,6 +57,25 @@ def test_it_stops_at_the_first_failure(calls):
     calls.status["train"] = 2
     assert demo.main() == 2
     assert calls.commands == ["simulate", "train"]
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="has no groups of processes")
+def test_ctrl_c_ends_the_command_and_the_demo_in_one_line(tmp_path):
+    command, heed = (
+        [sys.executable, "-m", "sgns.demo"],
+        "import signal; signal.signal(2, signal.default_int_handler)",
+    )
+    command = [sys.executable, "-c", f"{heed}; import os; os.execv({sys.executable!r}, {command!r})"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    process = subprocess.Popen(command, cwd=tmp_path, env=environment(), **pipes)
+    assert process.stdout is not None
+    while not process.stdout.readline().startswith("dataset quick in"):
+        assert process.poll() is None, process.communicate()
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=100)
+    assert process.returncode == 130
+    kept = "what is complete is kept, and the same command goes on from there"
+    assert said == f"sgns simulate: interrupted; {kept}\n"
 
 
 def test_the_new_path_is_in_no_run():

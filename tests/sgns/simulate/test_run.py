@@ -23,6 +23,7 @@ from mpm_warp import (
     SolverStopped,
     Wheel,
     effects_for,
+    mesh_files,
 )
 from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
