@@ -70,6 +70,8 @@ def parse(command: str) -> tuple[str, list[str]]:
     overrides = [word for word in rest if not word.startswith("-") and "=" in word]
     if name == "check":
         overrides.append("files=[run.h5]")
+    if name in ("plot", "render"):
+        overrides.append("run=run.h5")
     plain = []
     for override, text in zip(OverridesParser.create().parse_overrides(overrides), overrides, strict=True):
         if text.startswith("hydra/"):  # a launcher that is a package of its own

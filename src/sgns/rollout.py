@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -246,4 +247,5 @@ def main(cfg: DictConfig) -> float:
     log.info(
         "wall seconds per simulated second: %.3g with decoding and writing every frame", timing.complete_rate
     )
+    log.info("to look at it: sgns plot %s", shlex.quote(str(output)))
     return timing.inference_rate

@@ -405,6 +405,28 @@ class Check(_Command):
     )
 
 
+def _overwrite() -> bool:
+    return setting(False, "replace a picture that is there")
+
+
+@settings
+class Plot(_Command):
+    """`sgns plot`."""
+
+    run: str = setting("", "run file to show")
+    output: str | None = setting(None, "PNG file to write; null: beside the run, with its name")
+    overwrite: bool = _overwrite()
+
+
+@settings
+class Render(_Command):
+    """`sgns render`."""
+
+    run: str = setting("", "run file to show")
+    output: str | None = setting(None, "GIF file to write; null: beside the run, with its name")
+    overwrite: bool = _overwrite()
+
+
 # --- All of them, by the place where `conf` has them ----------------------------------------------------
 
 COMMANDS: dict[str, type[Group]] = {
@@ -416,6 +438,8 @@ COMMANDS: dict[str, type[Group]] = {
     "frontier": Frontier,
     "advise": Advise,
     "check": Check,
+    "plot": Plot,
+    "render": Render,
 }
 MAIN_KEYS: dict[str, list[tuple[str, type[Group], tuple[str, ...]]]] = {
     "reduce": [("reduction", ReductionSettings, ("num_modes", "tolerance"))],

@@ -36,6 +36,7 @@ class Command(NamedTuple):
         needs: dotted keys of paths that it cannot do without.
         result: the file in a folder of output that shows that the work is finished. It is not replaced without
             `overwrite=true`, and neither is a file of output. None where finished work is kept and gone on from.
+        plain: keys that may be given as plain paths, in this order.
     """
 
     module: str
@@ -43,6 +44,7 @@ class Command(NamedTuple):
     output: str | None
     needs: tuple[str, ...] = ()
     result: str | None = None
+    plain: tuple[str, ...] = ()
 
 
 COMMANDS = {
@@ -76,6 +78,10 @@ COMMANDS = {
     ),
     "advise": Command("sgns.advise", "name the setting that is good and fast enough", None),
     "check": Command("sgns.data.check", "read run files through and list what is wrong with them", None),
+    "plot": Command("sgns.plot.page", "one picture of a run", "file", ("run",), plain=("run", "output")),
+    "render": Command(
+        "sgns.plot.movie", "a moving picture of a run", "file", ("run",), plain=("run", "output")
+    ),
 }
 
 
@@ -255,7 +261,7 @@ Examples:
 
 
 def _parsed(command: str, arguments: list[str]) -> argparse.Namespace:
-    """Flags and `settings` of a command; the paths of `sgns check` as its key `files`.
+    """Flags and `settings` of a command; plain paths as the keys that they are for.
 
     The flags are those of Hydra that read nothing but settings.
     """
@@ -284,12 +290,17 @@ def _parsed(command: str, arguments: list[str]) -> argparse.Namespace:
         refuse("--resolve and --package go with --cfg job")
     if sum((parsed.run, parsed.cfg is not None, parsed.multirun, parsed.info is not None)) > 1:
         refuse("only one of --run, --multirun (-m), --cfg, --info can be given")
-    if command == "check":
+    plain = COMMANDS[command].plain
+    if command == "check" or plain:
         settings = parsed.settings
         paths = [setting for setting in settings if "=" not in setting or os.path.exists(setting)]
-        if paths:
-            parsed.settings = [setting for setting in settings if setting not in paths]
+        parsed.settings = [setting for setting in settings if setting not in paths]
+        if command == "check" and paths:
             parsed.settings.append(f"files=[{','.join(map(_quoted, paths))}]")
+        elif len(paths) > len(plain) > 0:
+            refuse(f"{paths[len(plain)]!r} is one path too many: sgns {command} takes {' and '.join(plain)}")
+        else:
+            parsed.settings += [f"{key}={_quoted(path)}" for key, path in zip(plain, paths, strict=False)]
     return parsed
 
 

@@ -411,7 +411,8 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
     if missing:
         keys = " ".join(f"{key}=..." for key in missing)
         what = "a value is" if len(missing) == 1 else "values are"
-        give = "run files, as in sgns check run.h5" if command == "check" else keys
+        takes = {"check": "run files", "plot": "a run file", "render": "a run file"}.get(command)
+        give = keys if takes is None else f"{takes}, as in sgns {command} run.h5"
         raise UserError(f"{what} missing for {', '.join(missing)}; give {give}; see sgns {command} --help")
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     for group, default in groups_of(command).items():

@@ -58,7 +58,10 @@ styled = matplotlib.rc_context(STYLE)
 
 
 def new_figure(
-    width: float, height: float, layout: Literal["constrained", "compressed"] = "constrained", dpi: int = DPI
+    width: float,
+    height: float,
+    layout: Literal["constrained", "compressed"] | None = "constrained",
+    dpi: int = DPI,
 ) -> Figure:
     """An empty figure of a size in inches, drawn without a display."""
     figure = Figure(figsize=(width, height), dpi=dpi, layout=layout)

@@ -11,16 +11,15 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Polygon
 from matplotlib.ticker import MaxNLocator
-from scipy.spatial import ConvexHull, QhullError
 
-from mpm_warp.poses import in_world_frame
 from sgns.data.run import Run, frame_chunks
 from sgns.data.surface import particle_spacing
+from sgns.evaluate.body_shape import CUBE, body_silhouette, body_triangles
 from sgns.evaluate.depth_buffer import DepthBuffer, project
 from sgns.evaluate.figures import (
     BASELINE,
@@ -32,7 +31,7 @@ from sgns.evaluate.figures import (
     new_figure,
     styled,
 )
-from sgns.model.features import distance, is_wheel, markers
+from sgns.model.features import distance, markers
 from sgns.reduction.basis import Basis
 
 STEEL = "#4d5a66"
@@ -43,68 +42,8 @@ ERROR = LinearSegmentedColormap.from_list("error", ["#f2f2ee", "#9cc3dd", "#3d7f
 COLOUR_BAR: dict[str, Any] = {"location": "bottom", "aspect": 40, "pad": 0.02}
 # A tool is shown up to so much above the bed [m]: the soil is the subject.
 TOOL_ABOVE = 0.22
-CUBE = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
-"""Corners, shape (8, 3)."""
 
-# --- The body of a recorded scene, its hull, and round scales -------------------------------------------
-
-
-def body_corners(run: Any, frame: int) -> np.ndarray:
-    """Points [m] whose convex hull is the body at a frame, shape (k, 3), world frame.
-
-    The corners of the scene's blade, points along the rims of its wheel, the vertices of the mesh that the run holds,
-    else the recorded body points.
-    """
-    scene = run.scene
-    blade = scene.get("blade")
-    if is_wheel(scene) and "width" in scene:
-        rim = np.insert(circle(float(scene["diameter"]), 24), 1, 0.5 * float(scene["width"]), axis=1)
-        corners = np.concatenate([rim, rim * [1.0, -1.0, 1.0]])
-    elif isinstance(blade, Mapping):
-        corners = (CUBE - 0.5) * np.array([blade["thickness"], blade["width"], blade["length"]], float)
-    elif run.mesh is not None:
-        corners = run.mesh[0]
-    else:
-        return np.asarray(run.body_points[frame])
-    return in_world_frame(run.pose[[frame]], corners)[0]
-
-
-def body_outline(run: Any, frame: int) -> np.ndarray:
-    """Outline of the body seen from the side [m], shape (k, 2) in x and z.
-
-    The circle of the scene's wheel, else the hull of the body's corners.
-    """
-    if is_wheel(run.scene):
-        return run.pose[frame, [0, 2]] + circle(float(run.scene["diameter"]), 64)
-    return hull(body_corners(run, frame)[:, [0, 2]])
-
-
-def circle(diameter: float, count: int) -> np.ndarray:
-    """Points along a circle [m], shape (count, 2)."""
-    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-    return 0.5 * diameter * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-
-def hull(points: np.ndarray) -> np.ndarray:
-    """Corners of the convex hull of points (k, 2), counter-clockwise; the two ends if they lie on a line."""
-    try:
-        return points[ConvexHull(points).vertices]
-    except QhullError:
-        return np.unique(np.round(points, 9), axis=0)[[0, -1]]
-
-
-def hull_triangles(points: np.ndarray) -> np.ndarray:
-    """Triangles that make up the convex hull of points (k, 3), shape (t, 3, 3).
-
-    Of points in a plane they make up one face, of points on a line there are none.
-    """
-    try:
-        return points[ConvexHull(points).simplices]
-    except QhullError:
-        middle = points.mean(axis=0)
-        plane = np.linalg.svd(points - middle, full_matrices=False)[2][:2]
-        ring = middle + hull((points - middle) @ plane.T) @ plane
-        return np.stack([np.broadcast_to(ring[0], ring[2:].shape), ring[1:-1], ring[2:]], axis=1)
+# --- Round scales, force and body ---------------------------------------------------------------------
 
 
 def nice(value: float) -> float:
@@ -140,6 +79,17 @@ def draw_force(
     )
 
 
+def draw_body(axis: Axes, silhouette: Sequence[np.ndarray]) -> None:
+    """The union of polygons as one shape: their black edges below, their faces above."""
+    faces: dict[str, Any] = {"facecolors": STEEL, "edgecolors": STEEL, "linewidths": 0.8}
+    if all(len(polygon) < 3 for polygon in silhouette):  # seen edge-on
+        faces = {"edgecolors": STEEL, "linewidths": 3.0}
+    axis.add_collection(
+        PolyCollection(silhouette, edgecolors="black", linewidths=2.2, zorder=3), autolim=False
+    )
+    axis.add_collection(PolyCollection(silhouette, zorder=3.1, **faces), autolim=False)
+
+
 # --- A slice near mid-width at some moments of one or more runs -----------------------------------------
 
 # A force arrow of the largest force shown is this share of the picture's width long.
@@ -148,10 +98,20 @@ SIDE_ARROW = 0.22
 SHORTEST_ARROW = 0.02
 
 
+# A view shows at most so many particles: more of them would lie on top of each other.
+MOST_PARTICLES = 20_000
+
+
 def middle_slice(start: np.ndarray) -> np.ndarray:
-    """Which particles (n,) of a bed at rest (n, 3) lie near mid-width."""
+    """Which particles (n,) of a bed at rest (n, 3) lie near mid-width; `MOST_PARTICLES` of them, drawn at random, if
+    there are more."""
     y = start[:, 1]
-    return np.abs(y - 0.5 * (y.min() + y.max())) <= 1.5 * particle_spacing(start)
+    chosen = np.abs(y - 0.5 * (y.min() + y.max())) <= 1.5 * particle_spacing(start)
+    near = np.flatnonzero(chosen)
+    if len(near) > MOST_PARTICLES:
+        chosen[near] = False
+        chosen[np.random.default_rng(0).choice(near, MOST_PARTICLES, replace=False)] = True
+    return chosen
 
 
 def view_times(run: Any, history: int, count: int = 3) -> list[int]:
@@ -172,7 +132,7 @@ class Scales(NamedTuple):
     arrow: float  # length of a force arrow [m/N]
     x_limits: tuple[float, float]  # of the picture [m]
     z_limits: tuple[float, float]  # of the picture [m]
-    spacing: float  # between particles [m]
+    disc: float  # diameter of a particle as drawn [m]
 
 
 def common_scales(runs: Sequence[Any], frames: Sequence[int], start: np.ndarray) -> Scales:
@@ -181,16 +141,27 @@ def common_scales(runs: Sequence[Any], frames: Sequence[int], start: np.ndarray)
     `start` are the particles at rest [m], shape (n, 3).
     """
     chosen, spacing = middle_slice(start), particle_spacing(start)
-    low, high = start.min(axis=0), start.max(axis=0)
-    x_limits = (low[0] - 1.5 * spacing, high[0] + 1.5 * spacing)
     shown = list(itertools.product(runs, frames))
-    reach = max(float(run.positions(frame)[0, chosen, 2].max()) for run, frame in shown)
-    tool = max(float(body_outline(run, frame)[:, 1].max()) for run, frame in shown)
-    top = max(min(tool + spacing, high[2] + TOOL_ABOVE), reach + 2.0 * spacing)
+    low, high = start.min(axis=0), start.max(axis=0)
+    reach = [
+        run.positions(frame)[0, chosen] for run, frame in shown
+    ]  # a column flows beyond its place at rest
+    left = min(low[0], *(float(soil[:, 0].min()) for soil in reach))
+    right = max(high[0], *(float(soil[:, 0].max()) for soil in reach))
+    x_limits = (left - 1.5 * spacing, right + 1.5 * spacing)
+    tool = max(
+        (float(part[:, 1].max()) for run, frame in shown for part in body_silhouette(run, frame)),
+        default=-np.inf,
+    )
+    highest = max(float(soil[:, 2].max()) for soil in reach)
+    top = max(min(tool + spacing, high[2] + TOOL_ABOVE), highest + 2.0 * spacing)
     strongest = max(float(np.linalg.norm(run.force[frame, [0, 2]])) for run, frame in shown)
     arrow = SIDE_ARROW * (x_limits[1] - x_limits[0]) / strongest if strongest > 0.0 else 0.0
     speed = upper_scale(*(speeds(runs[0], frame, chosen) for frame in frames))
-    return Scales(chosen, speed, arrow, x_limits, (low[2] - 1.5 * spacing, top), spacing)
+    disc = spacing
+    if chosen.sum() == MOST_PARTICLES:  # they take the room of those left out
+        disc = max(disc, math.sqrt(3.0 * (high[0] - low[0]) * (high[2] - low[2]) / MOST_PARTICLES))
+    return Scales(chosen, speed, arrow, x_limits, (low[2] - 1.5 * spacing, top), disc)
 
 
 def speeds(run: Any, frame: int, chosen: np.ndarray) -> np.ndarray:
@@ -233,20 +204,18 @@ def side_views(
 def draw_view(axis: Axes, title: str, run: Any, frame: int, scales: Scales, width: float) -> None:
     """One run at one frame in a view so many inches wide."""
     inches = width / np.ptp(scales.x_limits)  # per metre
-    # Diameter of a particle [points]: the room that it has.
-    disc = max(1.4, 0.98 * scales.spacing * 72.0 * inches)
+    # Diameter of a particle [points].
+    disc = max(1.4, 0.98 * scales.disc * 72.0 * inches)
     speed = speeds(run, frame, scales.chosen)
     order = np.argsort(speed)  # the fast ones on top
     x, _, z = run.positions(frame)[0, scales.chosen][order].T
     axis.scatter(x, z, c=speed[order], s=disc**2, cmap=SPEED, norm=scales.speed, linewidths=0.0)
-    outline = body_outline(run, frame)
-    if len(outline) >= 3:
-        axis.add_patch(Polygon(outline, facecolor=STEEL, edgecolor="black", linewidth=0.8, zorder=3))
-    else:  # seen edge-on
-        axis.plot(*outline.T, color=STEEL, linewidth=3.0, zorder=3)
+    silhouette = body_silhouette(run, frame)
+    draw_body(axis, silhouette)
     force = run.force[frame, [0, 2]]
     size = float(np.linalg.norm(force)) * scales.arrow
-    if size > 0.0:
+    if size > 0.0 and silhouette:
+        outline = np.concatenate(silhouette)
         head = "-|>,head_width=0.25,head_length=0.5" if size > SHORTEST_ARROW else "-"
         foot = outline[np.argmin(outline[:, 1])]
         draw_force(axis, run, force, foot, foot + force * scales.arrow, head=head)
@@ -299,14 +268,15 @@ def solid_figure(
 
     The particles at rest, `start`, set the frame of the picture; the force `strongest` [N] has the longest arrow.
     """
-    spacing, corners = particle_spacing(start), body_corners(run, frame)
+    spacing, triangles = particle_spacing(start), body_triangles(run, frame)
     low, high = start.min(axis=0) - spacing, start.max(axis=0) + spacing
-    high[2] = np.clip(corners[:, 2].max() + spacing, high[2], high[2] + TOOL_ABOVE)
+    tool = triangles[..., 2].max(initial=-np.inf) + spacing
+    high[2] = np.clip(tool, high[2], high[2] + TOOL_ABOVE)
     box = project(np.where(CUBE > 0.0, high, low))[:, :2]
     left_bottom, right_top = box.min(axis=0), box.max(axis=0)
     buffer = DepthBuffer(left_bottom, right_top, width=round(DPI * (PICTURE_WIDTH - 0.2)))
     buffer.spheres(project(positions), 0.55 * spacing, colours.to_rgba(values)[:, :3])
-    buffer.triangles(project(hull_triangles(corners)), np.array(to_rgb(STEEL)))
+    buffer.triangles(project(triangles), np.array(to_rgb(STEEL)))
 
     height, width = buffer.nearness.shape
     figure = new_figure(PICTURE_WIDTH, PICTURE_WIDTH * height / width + 0.95)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -132,4 +133,5 @@ def simulate_one(scene: Scene, cfg: DictConfig, restart: Restart | None = None, 
         timing.rate / 1e6,
         cfg.device,
     )
+    log.info("to look at it: sgns plot %s", shlex.quote(str(output)))
     return timing.per_simulated_second

@@ -9,13 +9,19 @@ import pytest
 from mpm_warp.scenes import Wheel, sinkage
 from sgns.data.run import Run
 from sgns.evaluate import figures
-from sgns.evaluate.depth_buffer import CAMERA, DepthBuffer, project
-from sgns.evaluate.views import (
+from sgns.evaluate.body_shape import (
+    MOST_TRIANGLES,
     body_corners,
-    body_outline,
-    common_scales,
+    body_silhouette,
+    body_triangles,
     hull,
     hull_triangles,
+    simpler,
+)
+from sgns.evaluate.depth_buffer import CAMERA, DepthBuffer, project
+from sgns.evaluate.views import (
+    MOST_PARTICLES,
+    common_scales,
     latent_path,
     middle_slice,
     nice,
@@ -197,6 +203,17 @@ def test_hull_of_a_cube_of_flat_points_and_of_points_on_a_line():
     assert hull_triangles(np.outer(np.arange(4.0), [1.0, 2.0, 3.0])).shape == (0, 3, 3)
 
 
+def u_profile():
+    """Vertices (16, 3) and outward triangles of a U, open towards +x, 3 × 3 from the side, walls 1, 1 wide."""
+    side = np.array([(0, 0), (3, 0), (3, 1), (1, 1), (1, 2), (3, 2), (3, 3), (0, 3)], float)
+    vertices = np.concatenate([np.insert(side, 1, y, axis=1) for y in (0.0, 1.0)])
+    caps = [(0, 1, 3), (1, 2, 3), (0, 3, 4), (0, 4, 7), (4, 5, 7), (5, 6, 7)]
+    walls = [(i, i + 8, (i + 1) % 8) for i in range(8)] + [
+        ((i + 1) % 8, i + 8, (i + 1) % 8 + 8) for i in range(8)
+    ]
+    return vertices, np.array([*caps, *[(c + 8, b + 8, a + 8) for a, b, c in caps], *walls])
+
+
 # --- The body of a recorded scene ------------------------------------------------------------------------
 
 REST = np.array([[0.3, 0.2, 0.1, 0.0, 0.0, 0.0, 1.0]])
@@ -216,7 +233,7 @@ def test_a_wheel_is_its_rims_and_from_the_side_a_circle():
     assert np.hypot(corners[:, 0], corners[:, 2]) == pytest.approx(0.075)
     assert np.abs(corners[:, 1]) == pytest.approx(0.04)
     assert area(hull_triangles(corners)) == pytest.approx(np.pi * 0.15 * (0.08 + 0.075), rel=0.01)
-    assert np.linalg.norm(body_outline(run, 0) - REST[0, [0, 2]], axis=1) == pytest.approx(0.075)
+    assert np.linalg.norm(body_silhouette(run, 0)[0] - REST[0, [0, 2]], axis=1) == pytest.approx(0.075)
 
 
 def test_a_blade_is_its_box(pair):
@@ -225,7 +242,7 @@ def test_a_blade_is_its_box(pair):
     assert corners.mean(axis=0) == pytest.approx(run.pose[3, :3])
     distance = np.linalg.norm(corners - run.pose[3, :3], axis=1)
     assert distance == pytest.approx(0.5 * np.linalg.norm(PLATE))
-    outline = body_outline(run, 0)
+    (outline,) = body_silhouette(run, 0)
     sides = np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1)
     assert np.sort(sides) == pytest.approx([PLATE[0]] * 2 + [PLATE[2]] * 2, rel=1e-6)
     assert outline.mean(axis=0) == pytest.approx(run.pose[0, [0, 2]])
@@ -237,3 +254,33 @@ def test_other_bodies_are_the_vertices_of_their_mesh_or_their_recorded_points():
     assert np.array_equal(body_corners(run, 1), points[1])
     run.mesh = (points[0], None)
     assert body_corners(run, 0) == pytest.approx(points[0] + REST[0, :3])
+
+
+def shape_area(polygons):
+    x, y = np.moveaxis(np.array(polygons), -1, 0)
+    return 0.5 * np.abs((x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)).sum()
+
+
+def test_a_mesh_that_is_not_convex_is_drawn_as_it_is():
+    vertices, triangles = u_profile()
+    run = SimpleNamespace(scene={"kind": "body"}, pose=REST, mesh=(vertices, triangles))
+    assert body_triangles(run, 0) == pytest.approx(vertices[triangles] + REST[0, :3])
+    assert shape_area(body_silhouette(run, 0)) == pytest.approx(7.0)  # its hull: 9
+    assert shape_area(body_silhouette(run, 0, (0, 1))) >= 3.0 - 1e-9
+
+
+def test_a_mesh_of_very_many_triangles_is_made_simpler_and_looks_the_same():
+    vertices, triangles = u_profile()
+    fine = vertices[triangles]
+    while len(fine) <= 4 * MOST_TRIANGLES:
+        a, b, c = np.moveaxis(fine, 1, 0)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        fine = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3, 3)
+    coarse = simpler(fine)
+    assert len(coarse) < 2 * MOST_TRIANGLES < len(fine)
+    assert area(coarse) == pytest.approx(area(fine), rel=0.05)
+
+
+def test_a_view_shows_a_bounded_number_of_particles():
+    bed = np.random.default_rng(0).uniform(size=(3 * MOST_PARTICLES, 3)) * [1.0, 0.01, 1.0]
+    assert middle_slice(bed).sum() == MOST_PARTICLES

@@ -1,0 +1,103 @@
+"""`sgns plot` and `sgns render`: pictures of a run."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from PIL import Image
+
+from sgns.config import UserError
+from sgns.data.run import Run
+from sgns.evaluate.figures import DPI, PICTURE_WIDTH
+from sgns.plot import movie, page
+from sgns_testing.commands import sgns
+from sgns_testing.runs import make_run
+
+WHEEL = {"blade": None, "kind": "wheel", "diameter": 0.15, "width": 0.08}
+
+
+@pytest.fixture
+def run_file(tmp_path):
+    return make_run(tmp_path / "run.h5", frames=14, n=300)
+
+
+def settings(file, **values):
+    return OmegaConf.create({"run": str(file), "output": None, "overwrite": False} | values)
+
+
+@pytest.mark.parametrize(
+    "scene", [{}, WHEEL, {"blade": None, "kind": "body"}], ids=["plate", "wheel", "body"]
+)
+@pytest.mark.parametrize("frames", [1, 2, 14])
+def test_a_page_of_every_kind_of_run(tmp_path, scene, frames):
+    file = make_run(tmp_path / "run.h5", frames=frames, n=300, scene=scene, producer="rollout")
+    page.main(settings(file))
+    with Image.open(tmp_path / "run.png") as picture:
+        assert picture.width == round(2 * PICTURE_WIDTH * DPI) and picture.height < 2 * picture.width
+        assert np.asarray(picture).std() > 20.0
+
+
+def test_panels_show_units_and_the_sinkage_of_a_wheel(tmp_path):
+    with Run(make_run(tmp_path / "run.h5", n=100, scene=WHEEL)) as run:
+        labels = [panel.label for panel in page.curves(run)]
+    assert labels[0] == "drawbar pull Fx [N]" and labels[-1] == "sinkage [mm]"
+    assert all(label.endswith("]") for label in labels)
+
+
+def test_a_moving_picture_plays_in_real_time(run_file, tmp_path):
+    movie.main(settings(run_file, output=str(tmp_path / "new.gif")))
+    with Image.open(tmp_path / "new.gif") as picture:
+        assert picture.n_frames == 5 and picture.info["duration"] == 50  # every third frame of 1/60 s
+
+
+def test_a_long_run_gives_a_bounded_number_of_pictures(run_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(movie, "MOST_PICTURES", 4)
+    monkeypatch.setattr(movie, "LONGEST", 0.02)
+    with Run(run_file) as run:
+        assert movie.moving_picture({"run": run}, tmp_path / "a.gif") == pytest.approx(4 / 60 / 0.02)
+    with Image.open(tmp_path / "a.gif") as picture:
+        assert picture.n_frames == 4
+
+
+def test_a_moving_picture_leaves_out_pictures_to_be_small(tmp_path, monkeypatch):
+    noise = [Image.effect_noise((60, 40), 90.0) for _ in range(16)]
+    movie.write_gif(noise, tmp_path / "all.gif", 50)
+    monkeypatch.setattr(movie, "MOST_BYTES", (tmp_path / "all.gif").stat().st_size // 3)
+    movie.write_gif(noise, tmp_path / "some.gif", 50)
+    with Image.open(tmp_path / "some.gif") as picture:
+        assert picture.n_frames == 4 and picture.info["duration"] == 200
+    assert (tmp_path / "some.gif").stat().st_size <= movie.MOST_BYTES
+
+
+@pytest.mark.parametrize(("command", "suffix"), [(page, "png"), (movie, "gif")])
+def test_a_picture_is_replaced_only_if_asked(run_file, command, suffix):
+    picture = run_file.with_suffix(f".{suffix}")
+    picture.write_text("mine")
+    with pytest.raises(UserError, match=r"there already; .* overwrite=true"):
+        command.main(settings(run_file))
+    assert picture.read_text() == "mine"
+    command.main(settings(run_file, overwrite=True))
+    with pytest.raises(UserError, match=rf"a \.{suffix} file: output=x\.{suffix}"):
+        command.main(settings(run_file, output="x.jpg"))
+
+
+@pytest.mark.parametrize("command", [page, movie])
+def test_a_run_that_is_not_finite_is_refused(tmp_path, command):
+    import h5py
+
+    file = make_run(tmp_path / "run.h5", n=100)
+    with h5py.File(file, "r+") as content:
+        content["particles/soil/position/value"][0, 3] = np.nan
+    with pytest.raises(UserError, match=r"frame 0 is not finite; `sgns check"):
+        command.main(settings(file))
+
+
+def test_the_commands_take_plain_paths(run_file, tmp_path):
+    done: subprocess.CompletedProcess = sgns(tmp_path, "plot", "run.h5", "a b.png")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "a b.png").is_file()
+    done = sgns(tmp_path, "render", "run.h5", "a.gif", "c")
+    assert (
+        done.returncode == 2 and "'c' is one path too many: sgns render takes run and output" in done.stderr
+    )
