@@ -288,7 +288,7 @@ class CheckedLoader(ConfigLoader):
         )
 
     def _with_scene(self, overrides: list[str], config_name: str | None) -> list[str]:
-        """The scene of a dataset or of a checkpoint before the overrides, so that they can be of its keys and groups."""
+        """The scene of a dataset or a checkpoint put before the overrides, so that they can be of its keys."""
         overrides = [*known_scene(config_name, overrides), *overrides]
         datasets = [one for one in overrides if one.startswith("dataset=")]
         if config_name != "simulate" or not datasets or any(one.startswith("scene=") for one in overrides):
