@@ -22,8 +22,8 @@ from mpm_warp import (
     Solver,
     SolverStopped,
     Wheel,
-    bodies,
     effects_for,
+    mesh_files,
 )
 from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
@@ -330,7 +330,7 @@ def test_a_run_brings_its_mesh(stopped_mesh, tmp_path, monkeypatch):
     def never(*_):
         raise AssertionError("a file is read because a run names it")
 
-    monkeypatch.setattr(bodies, "read_bytes", never)
+    monkeypatch.setattr(mesh_files, "read_bytes", never)
     with pytest.raises(UserError, match=r"brings its own tool; leave out scene\.tool\.file"):
         restarted(kept, "+scene.tool.file=box.obj")
     restart = restarted(kept, "scene.courant=0.3")
