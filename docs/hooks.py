@@ -54,7 +54,11 @@ def reference_page() -> str:
         typed.SolverSettings,
     ]
     groups = [typed.DatasetSettings, typed.PublishedSettings, typed.ReductionSettings]
-    groups += [one for kind in typed.MODELS.values() for one in kind] + [typed.LossWeights, typed.Errors]
+    groups += [one for kind in typed.MODELS.values() for one in kind] + [
+        typed.LossWeights,
+        typed.Errors,
+        typed.Limits,
+    ]
     return reference([*soil, *groups, *typed.COMMANDS.values()])
 
 

@@ -82,7 +82,7 @@ class Tool(ABC):
 
 
 def _length(default: float, words: str) -> Any:
-    return setting(default, words, "m", gt=0, words="; it must be above 0 m")
+    return setting(default, words, "m", gt=0, le=1e3, words="; it must be above 0 m and at most 1000 m")
 
 
 def _upright_edges(half_size: np.ndarray, count: int) -> np.ndarray:

@@ -21,6 +21,7 @@ from .poses import (
     rotation_vectors,
     sampled_poses,
 )
+from .reprs import short
 from .settings import Settings, build, setting, settings
 from .state import SceneError
 from .tool_geometry import HOLDS, distances, thickening
@@ -35,6 +36,27 @@ _ROUNDING = 1e-9
 """Lengths that differ by less are the same [m]."""
 _MOST_POSES, _MOST_POINTS = 100_000, 1_000_000
 """That are looked at for walls in a way, and at a time."""
+
+
+_FARTHEST = 1e12
+"""Number in a path, which may hold epoch seconds in milliseconds [s or m]."""
+
+
+def _as_path(rows: Any) -> tuple[tuple[float, ...], ...]:
+    """The rows of a path as numbers; whether they are poses is looked at where they are used."""
+    for number, row in enumerate(rows, 1):
+        if not isinstance(row, (list, tuple, np.ndarray)) or len(row) != 8:
+            raise SceneError(
+                f"row {number} of the path is {short(row)}; it needs 8 numbers: t, x, y, z, qx, qy, qz, qw"
+            )
+        for value in row:
+            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+                raise SceneError(f"row {number} of the path holds {short(value)}; allowed: numbers")
+            if _FARTHEST < abs(float(value)) < math.inf:
+                raise SceneError(
+                    f"row {number} of the path holds {value:.3g}; allowed: {-_FARTHEST:g} to {_FARTHEST:g}"
+                )
+    return tuple(tuple(float(v) for v in row) for row in rows)
 
 
 @settings
@@ -96,7 +118,7 @@ class Scene(Settings):
                 f"at most {MOST_FRAMES:g} are allowed: lower one of them"
             )
         if self._path is not None:
-            object.__setattr__(self, "path", tuple(tuple(float(v) for v in row) for row in self._path))
+            object.__setattr__(self, "path", _as_path(self._path))
 
     @property
     def _path(self) -> tuple[tuple[float, ...], ...] | None:

@@ -69,12 +69,16 @@ class Excavation(Scene):
     kind: str = "excavation"
     bed: Bed = field(default_factory=lambda: Bed(spacing=0.02, particles_per_cell=4.0))
     blade: Plate = setting(Plate, "the plate")
-    depth: float = setting(0.05, "the motion reaches this far below the tip's starting height", "m", ge=0)
-    speed: float = setting(0.10, "forward speed", "m/s", gt=0)
+    depth: float = setting(
+        0.05, "the motion reaches this far below the tip's starting height", "m", ge=0, le=1e3
+    )
+    speed: float = setting(0.10, "forward speed", "m/s", gt=0, le=1e4)
     rake: float = setting(10.0, "angle of the plate from vertical, tip leading", "degrees", ge=-60, le=60)
     motion: Literal["curved", "ramp", "rest", "path"] = setting("curved", "of the tip")
     start: float = setting(0.10, "where the tip starts" + _SHARE, ge=0, le=1, note=_SHARE)
-    clearance: float = setting(0.00665, "height of the tip above the surface at the start", "m")
+    clearance: float = setting(
+        0.00665, "height of the tip above the surface at the start", "m", ge=-1e3, le=1e3
+    )
     path: tuple[Any, ...] | None = setting(None, "for motion=path: " + _PATH)
     body_grid: tuple[int, int] = setting(
         (3, 5),
@@ -229,7 +233,9 @@ class Wheel(Scene):
         False, "soil in contact may not leave the wheel along its normal"
     )
     start: float = setting(0.30, "where the axle starts" + _SHARE, ge=0, le=1, note=_SHARE)
-    clearance: float = setting(0.0, "of the wheel's lowest point above the surface at the start", "m")
+    clearance: float = setting(
+        0.0, "of the wheel's lowest point above the surface at the start", "m", ge=-1e3, le=1e3
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -90,7 +90,9 @@ def same(cls: type, name: str, **default: Any) -> Any:
 
 def lengths(default: tuple[float, float, float], words: str) -> Any:
     """A field of three lengths."""
-    return setting(default, words, "m", gt=0, words="; it needs three lengths above 0 m")
+    return setting(
+        default, words, "m", gt=0, le=1e6, words="; it needs three lengths above 0 m, at most 1e6 m"
+    )
 
 
 class _Field(NamedTuple):

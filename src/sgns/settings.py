@@ -107,6 +107,10 @@ def _context(words: str) -> Any:
     return setting(lambda: list(_CONTEXT), words, words="; it must be a list of keys of the scene")
 
 
+MOST_WEIGHTS = 1e8
+"""Of a model: 1.6 GB with their gradients and what the optimiser keeps."""
+
+
 @settings
 class ModelSettings(Group):
     """The graph network on modes and body."""
@@ -140,6 +144,15 @@ class ModelSettings(Group):
     force: Literal["sum", "mean"] = setting("sum", "of what the nodes contribute")
     torque: bool = setting(True, "predict the torque, too")
     kind: Literal["network"] = setting("network", "of the model")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        weights = (2 * self.message_passing_steps + 4) * self.hidden_layers * self.hidden_width**2
+        if weights > MOST_WEIGHTS:
+            raise UserError(
+                f"the model would have about {weights:.2g} weights; at most {MOST_WEIGHTS:g} are allowed: lower "
+                "model.hidden_width, hidden_layers or message_passing_steps"
+            )
 
 
 @settings
@@ -180,11 +193,11 @@ class TrainingSettings(Group):
     """How the network is trained."""
 
     group: ClassVar[str] = "training"
-    max_steps: int = setting(6000, "optimiser steps", ge=1)
-    batch_size: int = setting(32, "windows of one step", ge=1)
+    max_steps: int = setting(6000, "optimiser steps", ge=1, le=10**9)
+    batch_size: int = setting(32, "windows of one step", ge=1, le=10**9)
     learning_rate: float = setting(2e-3, "highest, after the warm-up", gt=0)
     final_learning_rate: float = setting(1e-6, "at max_steps", gt=0)
-    warmup_steps: int = setting(200, "steps of linear rise", ge=0)
+    warmup_steps: int = setting(200, "steps of linear rise", ge=0, le=10**9)
     schedule: Literal["cosine", "exponential"] = setting("cosine", "fall to final_learning_rate")
     decades: float = setting(2.0, "of the exponential fall: powers of ten until max_steps", ge=0, le=300)
     weight_decay: float = setting(0.0, "AdamW's", ge=0)
@@ -197,8 +210,8 @@ class TrainingSettings(Group):
     fewer_modes: float = setting(0.0, "share of the steps that use the first few modes only", ge=0, le=1)
     change_of: Literal["free", "all"] = setting("free", "nodes whose change counts")
     loss: LossWeights = setting(LossWeights, "weights of the parts of the loss")
-    validate_every: int = setting(500, "steps between rollouts of the validation runs", ge=1)
-    log_every: int = setting(50, "steps between points in TensorBoard", ge=1)
+    validate_every: int = setting(500, "steps between rollouts of the validation runs", ge=1, le=10**9)
+    log_every: int = setting(50, "steps between points in TensorBoard", ge=1, le=10**9)
     resume: Literal["auto", False] = setting(
         "auto", "go on from last.ckpt in `output`; false: start anew and overwrite"
     )
@@ -254,6 +267,11 @@ class FitSettings(Group):
 class _Command(Group):
     group: ClassVar[str] = ""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if getattr(self, "device", None) == "meta":
+            raise UserError("device is 'meta', which holds no numbers; allowed: cpu, cuda")
+
 
 def _seed(words: str) -> Any:
     return setting(0, words, ge=0, le=10**18, words="; it must be a whole number, 0 or more")
@@ -282,6 +300,15 @@ class SolverSettings(Group):
 
 
 @settings
+class Limits(Group):
+    """What is refused before it begins; raise a limit to begin all the same."""
+
+    group: ClassVar[str] = "limits"
+    time: float = setting(30.0, "longest time of a run on one core, estimated", "days", gt=0, le=1e6)
+    disk: float = setting(1000.0, "largest size of a command's run files", "GB", gt=0, le=1e9)
+
+
+@settings
 class Simulate(_Command):
     """`sgns simulate`."""
 
@@ -292,6 +319,7 @@ class Simulate(_Command):
     device: str = _device()
     shard: int = setting(0, "with a dataset: which share of its runs this command makes", ge=0)
     shards: int = setting(1, "into how many shares the runs are divided", ge=1)
+    limits: Limits = setting(Limits, "what is refused before it begins")
 
 
 @settings

@@ -103,7 +103,7 @@ REFUSED = {
     cut: [
         ({"depth": 0.3}, r"leaves the bin at .* z = .*; change scene.depth"),
         ({"speed": 3.0, "duration": 1.0}, "leaves the bin"),
-        ({"speed": 0.0}, "scene.speed is 0.0 m/s; it must be above 0"),
+        ({"speed": 0.0}, "scene.speed is 0.0 m/s; allowed: above 0, at most 10000"),
         ({"motion": "path"}, "needs scene.path"),
         ({"path": ((0.0,) * 8,)}, "use scene.motion=path"),
         ({"gravity": 1e300}, r"scene.gravity is 1e\+300 m/s\^2; allowed: 0 to 100000"),
@@ -160,7 +160,7 @@ REFUSED = {
         ({"floor": "periodic"}, "bed.walls.floor is 'periodic'; allowed: no_slip, slip or a friction"),
         ({"y": True}, "bed.walls.y is True; allowed"),
     ],
-    Plate: [({"width": float("nan")}, "blade.width is nan; it must be above 0 m")],
+    Plate: [({"width": float("nan")}, "blade.width is nan; it must be above 0 m and at most 1000 m")],
     Cylinder: [
         ({"grousers": 3}, "tool.grouser_height"),
         ({"grouser_height": 0.01}, "need tool.grousers above 0"),

@@ -162,6 +162,7 @@ CLASSES = [
         typed.SolverSettings,
         typed.LossWeights,
         typed.Errors,
+        typed.Limits,
         DatasetSettings,
         PublishedSettings,
         ReductionSettings,

@@ -108,7 +108,7 @@ def command_help(command: str) -> str:
 def key_lines(command: str) -> list[str]:
     """A line for each key of a command, and for the main keys of its groups, from their definitions."""
     from mpm_warp.settings import described  # loads Warp: a second
-    from sgns.settings import COMMANDS, MAIN_KEYS, Errors
+    from sgns.settings import COMMANDS, MAIN_KEYS, Errors, Limits
 
     rows = [
         (f"{group}.{name}", *rest)
@@ -116,10 +116,11 @@ def key_lines(command: str) -> list[str]:
         for name, *rest in described(cls)
         if name in names
     ]
+    groups = {"error": Errors, "limits": Limits}
     for name, *rest in described(COMMANDS[command]):
         rows += (
-            [(f"error.{part}", *more) for part, *more in described(Errors)]
-            if name == "error"
+            [(f"{name}.{part}", *more) for part, *more in described(groups[name])]
+            if name in groups
             else [(name, *rest)]
         )
     return [f"  {name:<22} {words}{allowed and f' ({allowed})'}" for name, _, allowed, words in rows]

@@ -21,7 +21,7 @@ from mpm_warp import Decision, Effects, Scene, SceneError, substeps_per_frame
 from sgns.config import UserError, flattened
 from sgns.data.dataset import SPLITS, read_description
 from sgns.data.files import file_lock, write_whole
-from sgns.settings import DatasetSettings
+from sgns.settings import DatasetSettings, Limits
 from sgns.simulate.scene import decided, replaced, scene_from_data
 
 # --- What runs cost in work, time and disk, before and while they are made ------------------------------
@@ -32,6 +32,8 @@ _BYTES_PER_PARTICLE = 24
 _BYTES_PER_FRAME = 240
 _BYTES_PER_BODY_POINT = 24
 _BYTES_PER_FILE = 30_000
+CORE_RATE = 1.0e7
+"""Particle-steps per second on one core of a good CPU, which estimates assume (experiments/throughput)."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,11 @@ class RunCost:
         """Particle-steps of the run."""
         return self.steps_per_frame * (self.frames - 1)
 
+    @property
+    def steps(self) -> int:
+        """Of the run."""
+        return self.substeps * (self.frames - 1)
+
 
 def run_cost(scene: Scene) -> RunCost:
     """The cost of a scene's run.
@@ -71,6 +78,34 @@ def run_cost(scene: Scene) -> RunCost:
     )
     frames = scene.frame_count
     return RunCost(particles, substeps, frames, size=frames * per_frame + _BYTES_PER_FILE)
+
+
+def cost_line(costs: Sequence[RunCost]) -> str:
+    """What runs take in all, in words."""
+    steps = sum(one.particle_steps for one in costs)
+    work = "" if len(costs) > 1 else f"{costs[0].particles:.3g} particles in {costs[0].steps:.3g} steps: "
+    size = size_words(sum(one.size for one in costs))
+    return f"{work}about {duration_words(steps / CORE_RATE)} of one core and {size} of disk"
+
+
+def require_limits(costs: Mapping[str, RunCost], limits: Limits) -> None:
+    """Refuses to begin what takes longer, or more disk, than `limits` allow.
+
+    Raises:
+        UserError: the line names the limit.
+    """
+    longest = max(costs, key=lambda name: costs[name].particle_steps)
+    size, run = sum(one.size for one in costs.values()), costs[longest]
+    if run.particle_steps / CORE_RATE > limits.time * 86_400:
+        raise UserError(
+            f"{longest} takes {cost_line([run])}; limits.time is {limits.time:g} days: raise it, or use a larger "
+            "scene.bed.spacing or a lower scene.duration"
+        )
+    if size > limits.disk * 1e9:
+        raise UserError(
+            f"the run files take about {size_words(size)}; limits.disk is {limits.disk:g} GB: raise it, or record "
+            "fewer particles: scene.bed.store_every=5"
+        )
 
 
 def finishing_time(waiting: Sequence[float], running: Sequence[float], workers: int) -> float:

@@ -20,7 +20,8 @@ from sgns.data.files import only_here
 from sgns.data.run import Run
 from sgns.data.writer import require_run_place, stopped_path
 from sgns.interrupts import Interrupted
-from sgns.simulate.campaign import plan, require_space, run_cost
+from sgns.settings import Limits
+from sgns.simulate.campaign import cost_line, plan, require_limits, require_space, run_cost
 from sgns.simulate.run import Restart, restart_from, simulate_scene, unfinished
 from sgns.simulate.scene import (
     asked_effects,
@@ -74,7 +75,9 @@ def main(cfg: DictConfig) -> float | None:
         for line in warning_summary(campaign.scenes):
             log.warning("%s", line)
         batch = 1 if cfg.device == "cpu" else cfg.solver.batch
-        simulate_campaign(campaign, device=cfg.device, batch=batch, shard=cfg.shard, shards=cfg.shards)
+        limits = Limits.from_dict(plain(cfg.limits))
+        share = {"shard": cfg.shard, "shards": cfg.shards}
+        simulate_campaign(campaign, device=cfg.device, batch=batch, limits=limits, **share)
         return None
     if (cfg.shard, cfg.shards) != (0, 1):
         raise UserError("shard and shards divide the runs of a dataset; give dataset=... or leave them out")
@@ -109,7 +112,10 @@ def simulate_one(scene: Scene, cfg: DictConfig, restart: Restart | None = None, 
             restart = unfinished(output, scene, **same)
         if restart is not None:
             log.info("going on from frame %d of %s", restart.state.frame, restart.path)
-        require_space(output.parent, run_cost(scene).size)
+        cost = run_cost(scene)
+        log.info("%s", cost_line([cost]))
+        require_limits({scene.name: cost}, Limits.from_dict(plain(cfg.limits)))
+        require_space(output.parent, cost.size)
         settings |= {"device": cfg.device, "restart": restart}
         try:
             with tqdm(total=scene.frame_count, unit="frame", desc=scene.name, disable=None) as bar:

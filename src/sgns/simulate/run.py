@@ -35,7 +35,7 @@ CHANGES = (
 )
 """Keys of the scene that may change half-way: how it is computed, not what it is."""
 _FILE = "scene.tool.file"
-_OTHERS = ("continue_from", "output", "device", "solver.precision", "hydra")
+_OTHERS = ("continue_from", "output", "device", "solver.precision", "limits.time", "limits.disk", "hydra")
 
 
 @dataclass(frozen=True)

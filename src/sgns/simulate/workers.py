@@ -29,11 +29,14 @@ from sgns.data.files import file_lock, remove_abandoned
 from sgns.data.run import Run
 from sgns.interrupts import Interrupted, heeded_signals
 from sgns.numbers import elapsed
+from sgns.settings import Limits
 from sgns.simulate.campaign import (
     Campaign,
     RunCost,
+    cost_line,
     duration_words,
     finishing_time,
+    require_limits,
     require_space,
     run_cost,
     size_words,
@@ -57,6 +60,7 @@ def simulate_campaign(
     batch: int = 1,
     shard: int = 0,
     shards: int = 1,
+    limits: Limits | None = None,
 ) -> None:
     """Make every run of a campaign that is not there yet, one process per core, the longest first.
 
@@ -69,6 +73,7 @@ def simulate_campaign(
         batch: runs that a process has under way at once; more than one pays on a GPU only.
         shard: which share of the runs to make, 0 to `shards` - 1.
         shards: into how many shares of like work the runs are divided.
+        limits: what is refused before it begins; by default as on the command line.
 
     Raises:
         UserError: before anything is made, when the disk is too full; after all other runs are done, when some could
@@ -94,11 +99,14 @@ def simulate_campaign(
     for line in decision_summary(physics[name][1] for name in missing):
         log.info("%s", line)
     size = sum(costs[name].size for name in missing)
+    waiting = {name: costs[name] for name in missing}
+    log.info("%s", cost_line(list(waiting.values())))
+    require_limits(waiting, limits or Limits())
     require_space(campaign.path, size)
     compile_kernels(campaign, missing, device)
     workers = min(workers or (1 if device != "cpu" else usable_cores()), len(missing))
     batch = min(batch, math.ceil(len(missing) / workers))
-    pool = Workers(campaign, {name: costs[name] for name in missing}, device, workers, batch)
+    pool = Workers(campaign, waiting, device, workers, batch)
     failed = pool.make_all(f"about {size_words(size)} of disk")
     if failed:
         name, message = next(iter(failed.items()))

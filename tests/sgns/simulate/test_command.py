@@ -63,3 +63,15 @@ def test_an_output_that_is_a_pipe_or_taken_is_refused_before_anything_is_compute
     os.mkfifo(tmp_path / "run.h5")
     with pytest.raises(UserError, match=r"run\.h5: it is a pipe"):
         simulate.simulate_one(scene, cfg)
+
+
+@pytest.mark.parametrize("what", [[*SHORT, "output=run.h5"], ["dataset=quick", "dataset.path=data"]])
+def test_what_takes_longer_or_more_disk_than_the_limits_is_refused_before_it_begins(tmp_path, what):
+    for limit, words in (
+        ("time=1e-9", "limits.time is 1e-09 days"),
+        ("disk=1e-9", "limits.disk is 1e-09 GB"),
+    ):
+        done = sgns(tmp_path, "simulate", *what, f"limits.{limit}")
+        assert done.returncode == 2 and words in done.stderr.splitlines()[-1], done.stderr
+        assert " of one core and " in done.stdout + done.stderr
+        assert not list(tmp_path.rglob("*.h5"))

@@ -119,6 +119,12 @@ def test_yaml_of_settings(empty_folder, good, nothing_long) -> None:
             ["simulate", "scene=body", "scene.path=path.csv", "scene.tool.shape={}"],
             "tool.shape is {}; allowed",
         ),
+        (["simulate", "scene=body", "scene.path=[1,2,3]"], "row 1 of the path is 1; it needs 8 numbers"),
+        (["simulate", "scene=body", "scene.path=[[0,0,0,0,0,0,0,a]]"], "row 1 of the path holds 'a'"),
+        (["simulate", "scene=body", "scene.path=[[0,1e300,0,0,0,0,0,1]]"], "row 1 of the path holds 1e+300"),
+        (["simulate", "scene.depth=1e300"], "scene.depth is 1e+300 m; allowed: 0 to 1000"),
+        (["train", "model.hidden_width=10000", "model.hidden_layers=100"], "about 6e+10 weights; at most"),
+        (["train", "device=meta"], "device is 'meta', which holds no numbers"),
         (
             ["rollout", "checkpoint=a.ckpt", "rate_independent=nope"],
             "rate_independent is 'nope'; allowed: true, false",
