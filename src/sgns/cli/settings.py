@@ -338,12 +338,16 @@ class CheckedLoader(ConfigLoader):
         return self._loader.compute_defaults_list(config_name, overrides, run_mode)
 
 
-def _expand_home(cfg: DictConfig) -> None:
-    """Put the home folder in place of `~/` at the beginning of values, as a shell does of words without quotes."""
-    plain: Any = OmegaConf.to_container(cfg, resolve=False)
-    for path, value in _leaves({key: value for key, value in plain.items() if key != "hydra"}):
-        if isinstance(value, str) and value.startswith("~/"):
-            OmegaConf.update(cfg, ".".join(path), os.path.expanduser(value))
+def _expand_home(node: Any) -> None:
+    """Put the home folder in place of `~` at the beginning of values, as a shell does of words without quotes."""
+    for key in list(node) if isinstance(node, DictConfig) else range(len(node)):
+        if OmegaConf.is_missing(node, key) or OmegaConf.is_interpolation(node, key) or key == "hydra":
+            continue
+        value = node[key]
+        if OmegaConf.is_config(value):
+            _expand_home(value)
+        elif isinstance(value, str) and value.startswith("~"):
+            node[key] = os.path.expanduser(value)
 
 
 # --- A rollout that names no scene plays the one of its checkpoint --------------------------------------
@@ -370,7 +374,10 @@ def known_scene(command: str | None, overrides: Sequence[str]) -> list[str]:
     checkpoint = given.get("checkpoint")
     if checkpoint is None or checkpoint.is_sweep_override() or {"scene", "experiment"} & set(given):
         return []
-    if not isinstance(file := checkpoint.value(), str) or not Path(file).is_file():
+    if (
+        not isinstance(value := checkpoint.value(), str)
+        or not Path(file := os.path.expanduser(value)).is_file()
+    ):
         return []  # the command says so
     from sgns.model.checkpoint import read_checkpoint
 

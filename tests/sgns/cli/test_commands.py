@@ -310,5 +310,7 @@ def test_a_home_folder_in_quotes_is_the_home_folder(
     assert (
         f"output: {empty_folder}/home/first" in shown and f"checkpoint: {empty_folder}/home/a.ckpt" in shown
     )
+    shown = call("evaluate", 'new_rollouts=["~/a.h5","b~.h5"]', "checkpoint=a.ckpt", "--cfg", "job").stdout
+    assert f"- {empty_folder}/home/a.h5\n- b~.h5\n" in shown
     done = call("train", 'output="~/first"', "training.max_steps=-1")
     assert done.returncode == 2 and not (empty_folder / "~").exists()

@@ -107,6 +107,10 @@ def test_a_rollout_plays_the_scene_of_its_checkpoint(folder: Path) -> None:
     os.chdir(folder)
     try:
         assert "scene.slip: no such key" in refused("rollout", checkpoint, "scene.slip=0.2")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("HOME", str(folder))
+            at_home = 'checkpoint="~/outputs/first/best.ckpt"'
+            assert call("rollout", at_home, "output=home.h5").returncode == 0
         assert "bed is not the one" in refused("rollout", checkpoint, "scene=excavation", "output=other.h5")
     finally:
         os.chdir(before)
