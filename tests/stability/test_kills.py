@@ -124,7 +124,7 @@ def test_of_two_campaigns_with_other_settings_the_second_is_refused(tmp_path) ->
         winner = [process.returncode for process in processes].index(0)
         recorded = yaml.safe_load((folder / "tiny" / "dataset.yaml").read_text())
         assert recorded == campaign(folder, seed=winner, runs=4).describe()
-        assert [path.name for path in (folder / "tiny").iterdir()] == ["dataset.yaml"]
+        assert sorted(path.name for path in (folder / "tiny").iterdir()) == ["dataset.yaml", "runs.csv"]
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])
