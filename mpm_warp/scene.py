@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import asdict
 from functools import cached_property, partial
+from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,6 +22,7 @@ from .poses import (
     rotation_vectors,
     sampled_poses,
 )
+from .reprs import short
 from .settings import Settings, build, setting, settings
 from .state import SceneError
 from .tool_geometry import HOLDS, distances, thickening
@@ -31,10 +33,27 @@ MOST_COURANT = 0.8
 """Largest `courant`. From 0.86 on a cut's forces come out too small, with nothing else to see
 (experiments/stability/step.csv)."""
 
+_FARTHEST = 1e20
+"""Largest number in a path [s, m]."""
 _ROUNDING = 1e-9
 """Lengths that differ by less are the same [m]."""
 _MOST_POSES, _MOST_POINTS = 100_000, 1_000_000
 """That are looked at for walls in a way, and at a time."""
+
+
+def _rows(path: tuple[Any, ...]) -> tuple[tuple[float, ...], ...]:
+    """Rows of eight numbers, or a SceneError."""
+    for number, row in enumerate(path, start=1):
+        known = isinstance(row, (list, tuple, np.ndarray)) and len(row) == 8
+        if not known or not all(
+            isinstance(v, Real) and not isinstance(v, bool) and not _FARTHEST < abs(float(v)) < math.inf
+            for v in row
+        ):
+            raise SceneError(
+                f"scene.path: row {number} is {short(row)}; it needs rows of 8 numbers of at most {_FARTHEST:g}: "
+                "t, x, y, z, qx, qy, qz, qw"
+            )
+    return tuple(tuple(float(v) for v in row) for row in path)
 
 
 @settings
@@ -96,7 +115,7 @@ class Scene(Settings):
                 f"at most {MOST_FRAMES:g} are allowed: lower one of them"
             )
         if self._path is not None:
-            object.__setattr__(self, "path", tuple(tuple(float(v) for v in row) for row in self._path))
+            object.__setattr__(self, "path", _rows(self._path))
 
     @property
     def _path(self) -> tuple[tuple[float, ...], ...] | None:
