@@ -59,7 +59,12 @@ class Preview:
                 "that would lie inside it are left out; soil closes in on it in the first 0.2 s: let it rest so long"
             )
         lines = [] if scene.axle is not None else _way(scene, low, times, touch)
-        if scene.path_times().size:
+        given = scene.path_times()
+        if len(given) > 1 and given[-1] < scene.duration - 1.0 / scene.frame_rate:
+            lines.append(
+                f"the path ends at {given[-1]:.4g} s; the tool rests there until {scene.duration:g} s"
+            )
+        if given.size:
             sides = ", ".join(
                 f"{1e3 * a:.0f} to {1e3 * b:.0f} mm along {axis}"
                 for axis, a, b in zip("xyz", *reach, strict=True)
@@ -105,10 +110,20 @@ def _way(scene: Scene, low: np.ndarray, times: np.ndarray, touch: float | None) 
 
 
 def _of_path(scene: Scene, low: np.ndarray, touch: float | None) -> list[str]:
-    """One line at most: a wrong unit explains what else is odd."""
+    """One line at most on what is odd: a wrong unit explains the rest; and one where path and run end apart."""
     times = scene.path_times()
     if len(times) and (odd := time_warning(times, scene.duration)):
         return [odd]
+    ends = []
+    if len(times) > 1 and times[-1] > scene.duration + 1.0 / scene.frame_rate:
+        ends = [
+            f"the run ends at {scene.duration:g} s and the path goes on to {times[-1]:.4g} s: the rest is left out; "
+            f"scene.duration={times[-1]:.4g} takes it all"
+        ]
+    return ends + _of_poses(scene, times, low, touch)
+
+
+def _of_poses(scene: Scene, times: np.ndarray, low: np.ndarray, touch: float | None) -> list[str]:
     if len(times) > 1 and not scene.largest_displacement(scene.times()).any():
         return ["the tool does not move: the path's rows in the time of the run hold the same pose"]
     if touch is not None or scene.axle is not None:

@@ -184,7 +184,9 @@ def bed_differences(known: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
 
 
 # What changes soil and force beside the path: named when it differs and the network is not told.
-_FIXED = "blade material gravity friction load diameter width friction_angle grousers damping".split()
+_FIXED = "blade tool material gravity friction load diameter width friction_angle grousers damping".split()
+# Where a tool's mesh was read from; `digest` says which mesh it is.
+_ORIGIN_OF_MESH = ("tool.file", "tool.scale", "tool.unit", "tool.centre")
 # What follows from a number that a network may be told.
 _FOLLOWING = {"friction_angle": ("static_friction", "limit_friction")}
 
@@ -196,7 +198,10 @@ def unlearned(known: Mapping[str, Any], asked: Mapping[str, Any], told: Sequence
     return [
         f"{key} {b} (trained with {a})"
         for key, (a, b) in differences(known, asked).items()
-        if key.split(".")[0] in _FIXED and key.split(".")[-1] not in covered and None not in (a, b)
+        if key.split(".")[0] in _FIXED
+        and key not in _ORIGIN_OF_MESH
+        and key.split(".")[-1] not in covered
+        and None not in (a, b)
     ]
 
 
@@ -227,10 +232,11 @@ def main(cfg: DictConfig) -> float:
 
     output = Path(cfg.output)
     require_run_place(output)
-    scene = scene_from_config(cfg)
+    # First: without a checkpoint the scene is not the one that the settings were written for.
     simulator = Simulator.load(
         cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes, rate_independent=cfg.rate_independent
     )
+    scene = scene_from_config(cfg)
     require_same_freedom(simulator, scene, cfg.checkpoint)
     require_known_bed(simulator, scene, cfg.checkpoint)
     for warning in Preview.of(scene).warnings:

@@ -37,6 +37,13 @@ def test_where_a_tool_is_and_gets_to():
     assert way == "its lowest point gets 20 mm deep (at 0.50 s); it first touches soil at 0.40 s"
 
 
+def test_a_path_that_does_not_end_with_the_run_is_told():
+    (cut_off,) = Preview.of(body(duration=1.0)).warnings
+    assert "the run ends at 1 s and the path goes on to 2 s" in cut_off and "scene.duration=2" in cut_off
+    longer = Preview.of(body(duration=3.0))
+    assert longer.warnings == () and "the path ends at 2 s; the tool rests there until 3 s" in longer.lines
+
+
 def test_scenes_that_come_to_something_say_no_more_than_before():
     for scene in (cut(), Excavation(), Wheel(), Column(), body(tool=mesh(1.0))):
         assert list(Preview.of(scene).warnings) == scene.warnings()

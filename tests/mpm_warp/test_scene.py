@@ -261,3 +261,11 @@ def test_a_scene_that_memory_does_not_hold_is_refused(monkeypatch):
         SceneError, match=r"needs about .* GB of memory and cpu has 0.005 GB: 2.97e\+04 particles"
     ):
         Solver(Scene())
+
+
+@pytest.mark.parametrize(
+    "row", [1, None, [], [1, 2], [0, 0, 0, 0, 0, 0, 0, None], list("abcdefgh"), [1e300] * 8]
+)
+def test_a_path_that_is_no_table_of_eight_numbers(row) -> None:
+    with pytest.raises(SceneError, match=r"row 1 is .*rows of 8 numbers"):
+        Scene.from_dict({"kind": "excavation", "motion": "path", "path": [row]})

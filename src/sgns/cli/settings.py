@@ -426,6 +426,8 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
         if default is not None and cfg.get(group) is None:
             allowed = ", ".join(options_of(group))
             raise UserError(f"{group} is missing; sgns {command} needs one; allowed: {allowed}")
+        if default is not None and not OmegaConf.is_config(cfg[group]):
+            raise UserError(f"{group} is {_shown(cfg[group])}; it must be a group of settings")
     for key in needed:
         value = OmegaConf.select(cfg, key)
         if not isinstance(value, str) or not value:

@@ -43,7 +43,8 @@ class Dataset:
         file = path / "dataset.yaml"
         if not file.exists():
             raise UserError(
-                f"no dataset in {path}: dataset.yaml is missing; make one: sgns simulate dataset=<name>"
+                f"no dataset in {path}: dataset.yaml is missing; make one (sgns simulate dataset=<name>), or name "
+                "another: dataset=<name> or dataset.path=<folder>"
             )
         content = read_description(file)
         split = content.get("split") if isinstance(content, dict) else None

@@ -247,7 +247,7 @@ def own_dataset(file: h5py.Group, path: str, by_frame: bool = False) -> h5py.Dat
         raise ValueError(
             f"dataset /{path} claims {max(whole, chunk):.3g} bytes, but the file holds less of it"
         )
-    at_once = max(whole / found.shape[0] if by_frame and found.size else whole, chunk)
+    at_once = max(whole / found.shape[0] if by_frame and found.shape and found.size else whole, chunk)
     if packed and at_once > max(_MOST_UNPACKED, _LIKELY * stored):
         raise ValueError(
             f"dataset /{path} would unfold from {stored:.3g} to {at_once:.3g} bytes; store it without compression"

@@ -28,6 +28,7 @@ def picture_place(cfg: DictConfig, suffix: str) -> Path:
     if path.is_file() and not cfg.overwrite:
         raise UserError(f"{path} is there already; choose another output, or replace it with overwrite=true")
     require_replaceable(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
 

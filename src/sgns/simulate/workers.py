@@ -113,6 +113,7 @@ def simulate_campaign(
         raise UserError(
             f"{len(failed)} of {len(missing)} runs could not be made (the others are); the first is {name}: {message}"
         )
+    log.info("the %d runs are in %s, what each is in runs.csv; next: sgns train", len(missing), campaign.path)
 
 
 def compile_kernels(campaign: Campaign, names: list[str], device: str) -> None:

@@ -196,8 +196,8 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
         named = [f"{key} is {old!r} there and {new!r} here" for key, (old, new) in different.items()]
         more = f" and {len(named) - 4} more" if len(named) > 4 else ""
         raise UserError(
-            f"{output} holds a training with other settings: {', '.join(named[:4])}{more}; use another output, remove "
-            "it, or training.resume=false to overwrite it"
+            f"{output} holds a training with other settings: {', '.join(named[:4])}{more}; use another output (and "
+            f"checkpoint={found[-1]} to begin from its weights), remove it, or training.resume=false to overwrite it"
         )
     if (output / "best.ckpt").exists() and (output / SUMMARY).exists():
         return "complete"
