@@ -6,7 +6,6 @@ import json
 import math
 from dataclasses import asdict
 from functools import cached_property, partial
-from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
@@ -41,7 +40,7 @@ _MOST_POSES, _MOST_POINTS = 100_000, 1_000_000
 """That are looked at for walls in a way, and at a time."""
 
 
-_FARTHEST = 1e12
+_FARTHEST = 1e13
 """Number in a path, which may hold epoch seconds in milliseconds [s or m]."""
 
 
