@@ -90,6 +90,8 @@ def assert_composes(command: str) -> None:
     assert name in COMMANDS, command
     if name == "simulate" and "dataset=own" in overrides:  # as the command does: the dataset's scene
         overrides = ["scene=body", *overrides]
+    if name == "rollout" and "checkpoint=outputs/own/best.ckpt" in overrides:  # and the checkpoint's
+        overrides = ["scene=body", "scene/tool=mesh", *overrides]
     try:
         composed(*overrides, command=name)
     except Exception as error:
@@ -131,7 +133,12 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.timeout(300)  # kernels may have to be compiled
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name_of)
+@pytest.mark.parametrize(
+    # sgns/test_own_bucket.py runs that guide: its Python needs what its commands make
+    "page",
+    [page for page in PAGES if blocks(page, "python") and page.stem != "own_bucket"],
+    ids=name_of,
+)
 def test_python_on_the_pages_runs(page: Path, workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(workplace)
     names: dict[str, Any] = {"__name__": "page"}

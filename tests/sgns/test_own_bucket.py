@@ -20,6 +20,7 @@ SMALL = {
         *("training.validate_every=4", "training.warmup_steps=0"),
     ],
     "rollout": [COARSE, "scene.duration=0.2"],
+    "plot": [],
     "evaluate": [],
 }
 
@@ -28,15 +29,16 @@ SMALL = {
 def test_the_guide_from_mesh_to_report(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = PAGE.read_text(encoding="utf-8")
-    for block in re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S):
-        small = block.replace("random_paths(60,", "random_paths(6,")
-        exec(compile(small, PAGE.name, "exec"), {})
     done = []
-    for line in re.findall(r"^ {4}sgns (.*)$", text, re.M):
+    for block, line in re.findall(r"^```python\n(.*?)^```$|^ {4}sgns (.*?)$", text, re.M | re.S):
+        if block:
+            small = block.replace("random_paths(60,", "random_paths(6,")
+            exec(compile(small, PAGE.name, "exec"), {})
+            continue
         command, *rest = shlex.split(line)
         result = sgns(tmp_path, command, *rest, *SMALL[command])
         assert result.returncode == 0, (line, result.stdout, result.stderr)
         done.append(command)
-    assert done == ["simulate", "train", "rollout", "evaluate"]
+    assert done == ["simulate", "train", "rollout", "plot", "evaluate"]
     assert len((tmp_path / "data" / "own" / "runs.csv").read_text().splitlines()) == 7
     assert (tmp_path / "new.h5").exists() and list((tmp_path / "outputs" / "own_report").glob("*.html"))

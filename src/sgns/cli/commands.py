@@ -193,7 +193,7 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
     from hydra.core.plugins import Plugins
     from hydra.types import RunMode
 
-    from sgns.cli.settings import CheckedLoader, ConfigDir
+    from sgns.cli.settings import CheckedLoader, ConfigDir, require_few_jobs
 
     if arguments.config_dir is not None and not os.path.isdir(arguments.config_dir):
         raise UserError(f"--config-dir: folder '{arguments.config_dir}' not found")
@@ -212,6 +212,7 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
         else:
             mode = hydra.get_mode(config_name=command, overrides=settings)
             sweep = arguments.multirun or (mode == RunMode.MULTIRUN and not arguments.run)
+            require_few_jobs(settings if sweep else [])
             run, mode = (hydra.multirun, RunMode.MULTIRUN) if sweep else (hydra.run, RunMode.RUN)
             run(command, task_function=run_command, overrides=[*settings, f"hydra.mode={mode.name}"])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +16,7 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
 from hydra.errors import HydraException
 from hydra.plugins.config_source import ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
@@ -63,6 +64,31 @@ def require_plain_overrides(overrides: Sequence[str]) -> None:
     for override in overrides:
         if "hydra.searchpath" in override.partition("=")[0]:
             raise UserError(f"{override}: cannot be set; --config-dir adds a folder of your own")
+
+
+MOST_JOBS = 10_000
+"""Of a sweep."""
+
+
+def require_few_jobs(overrides: Sequence[str]) -> None:
+    """Refuse a sweep of more jobs than anybody waits for, before its values are listed.
+
+    Raises:
+        UserError: It names the range, or the number of jobs.
+    """
+    jobs = 1.0
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        sweep = override.value() if override.is_sweep_override() else None
+        if isinstance(sweep, RangeSweep):
+            start, stop, step = (float(x or 0.0) for x in (sweep.start, sweep.stop, sweep.step))
+            count = (stop - start) / step if step else math.nan
+            if math.isnan(count):
+                raise UserError(f"{override.input_line}: a range needs numbers and a step that is not 0")
+            jobs *= max(1.0, math.ceil(count) if math.isfinite(count) else count)
+        elif isinstance(sweep, ChoiceSweep):
+            jobs *= max(1, len(sweep.list))
+    if jobs > MOST_JOBS:
+        raise UserError(f"the sweep has {jobs:.3g} jobs; at most {MOST_JOBS} are allowed: give fewer values")
 
 
 def require_own_objects(cfg: DictConfig, typed: Sequence[str]) -> None:
