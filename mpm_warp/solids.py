@@ -35,6 +35,8 @@ def closed_mesh(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Solid
         SceneError: the mesh is open or encloses no volume.
     """
     notes: list[str] = []
+    if not len(triangles):
+        raise SceneError(f"tool.file: no triangle of the mesh in {name} has an area")
     vertices, triangles = _joined(vertices, triangles, name, notes)
     triangles, shell = _shells(vertices, triangles, name, notes)
     count = int(shell.max()) + 1

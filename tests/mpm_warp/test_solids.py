@@ -143,3 +143,8 @@ def test_what_is_no_solid_is_refused():
     many = [((1.0, 1.0, 1.0), (2.0 * k, 0.0, 0.0), OUT) for k in range(1001)]
     with pytest.raises(SceneError, match="1001 separate parts"):
         closed_mesh(*boxes(*many), "a.stl")
+
+
+def test_a_mesh_without_any_area_is_refused():
+    with pytest.raises(SceneError, match="no triangle of the mesh in a an area"):
+        closed_mesh(np.zeros((4, 3)), np.zeros((0, 3), dtype=int), "a.obj")
