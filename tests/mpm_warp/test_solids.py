@@ -146,5 +146,5 @@ def test_what_is_no_solid_is_refused():
 
 
 def test_a_mesh_without_any_area_is_refused():
-    with pytest.raises(SceneError, match="no triangle of the mesh in a an area"):
+    with pytest.raises(SceneError, match="no triangle of the mesh in"):
         closed_mesh(np.zeros((4, 3)), np.zeros((0, 3), dtype=int), "a.obj")

@@ -65,7 +65,7 @@ def test_a_scene_prints_what_differs_from_its_defaults() -> None:
 def test_the_help_of_a_scene_lists_settings_with_units_defaults_and_ranges() -> None:
     text = pydoc.plain(pydoc.render_doc(Excavation))
     for line in (
-        "depth = 0.05 m: the motion reaches this far below the tip's starting height (0 or more)",
+        "depth = 0.05 m: the motion reaches this far below the tip's starting height (0 to 1000)",
         "rake = 10.0 degrees: angle of the plate from vertical, tip leading (-60 to 60)",
         "motion = 'curved': of the tip (curved, ramp, rest, path)",
     ):

@@ -185,7 +185,7 @@ def test_bad_input_gives_one_line_and_leaves_nothing(
 def test_a_bad_blade_path_gives_one_line_and_leaves_nothing(rows: str, part: str, empty_folder: Path) -> None:
     Path("path.csv").write_text(f"t,x,y,z,qx,qy,qz,qw\n0,0.15,0.3,0.1925,0,0,0,1\n{rows}\n")
     path_keys = ["scene=quick_excavation", "scene.motion=path", "scene.path=path.csv"]
-    assert_one_line(call("rollout", "checkpoint=best.ckpt", *path_keys, "output=new.h5"), part)
+    assert_one_line(call("simulate", *path_keys, "output=new.h5"), part)
     assert [found.name for found in empty_folder.iterdir()] == ["path.csv"]
 
 
