@@ -32,8 +32,6 @@ MOST_COURANT = 0.8
 """Largest `courant`. From 0.86 on a cut's forces come out too small, with nothing else to see
 (experiments/stability/step.csv)."""
 
-_FARTHEST = 1e20
-"""Largest number in a path [s, m]."""
 _ROUNDING = 1e-9
 """Lengths that differ by less are the same [m]."""
 _MOST_POSES, _MOST_POINTS = 100_000, 1_000_000

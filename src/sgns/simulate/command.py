@@ -107,7 +107,7 @@ def simulate_one(scene: Scene, cfg: DictConfig, restart: Restart | None = None, 
     output = Path(cfg.output)
     with only_here(output):
         require_run_place(output)
-        if restart is None:
+        if restart is None and not cfg.get("overwrite"):
             same = {name: settings[name] for name in ("effects", "seed", "precision")}
             restart = unfinished(output, scene, **same)
         if restart is not None:

@@ -108,7 +108,7 @@ def unfinished(output: Path, scene: Scene, effects: Effects, seed: int, precisio
     path = stopped_path(output)
     if not path.exists():
         return None
-    anew = f"remove {path} to begin anew, or choose another output"
+    anew = "overwrite=true begins anew, or choose another output"
     try:
         there = _read_stopped(path)
     except UserError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 from typing import Any
 
@@ -265,7 +266,10 @@ def test_the_same_command_goes_on_and_another_is_refused_by_key(interrupted, tmp
     ):
         line = refusal(tmp_path, "simulate", *SMALL, "output=run.h5", change)
         assert "run.stopped.h5 is an unfinished run of other settings: " in line and words in line, line
-        assert "remove run.stopped.h5 to begin anew" in line
+        assert "overwrite=true begins anew" in line
+    shutil.copy(tmp_path / "run.stopped.h5", tmp_path / "anew.stopped.h5")
+    anew = sgns(tmp_path, "simulate", *SMALL, "output=anew.h5", "seed=4", "overwrite=true")
+    assert anew.returncode == 0 and "going on" not in anew.stdout
     again = sgns(tmp_path, "simulate", *SMALL, "output=run.h5")
     assert again.returncode == 0, again.stderr
     assert f"going on from frame {LAST} of run.stopped.h5" in again.stdout
@@ -302,7 +306,7 @@ def test_a_damaged_unfinished_run_is_refused(interrupted, tmp_path):
     with h5py.File(tmp_path / "run.stopped.h5", "r+") as file:
         del file["state"]
     line = refusal(tmp_path, "simulate", *SMALL, "output=run.h5")
-    assert "holds no state to go on from" in line and "remove run.stopped.h5 to begin anew" in line
+    assert "holds no state to go on from" in line and "overwrite=true begins anew" in line
 
 
 def pushed(file) -> Body:
