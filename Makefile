@@ -36,7 +36,7 @@ $(READY): pyproject.toml $(LOCK)
 	@touch $@
 
 demo: setup ## from scenes to a report with pictures: simulate, train, roll out, evaluate
-	$(BIN)/python -m sgns.demo
+	$(BIN)/python examples/demo.py
 
 # The solver's points on one core, reductions and surrogates on another; the last command gathers.
 frontier: setup ## what accuracy costs in time: the quick study, 9 minutes on two cores

@@ -3,11 +3,10 @@
 Usable alone; needs warp, numpy, scipy, manifold3d and pydantic.
 """
 
-from .auto_effects import Decision, Tolerances, effects_for
 from .bed import Bed, Walls, arrange
 from .bodies import Box, Cylinder, MeshBody, Plate
 from .discretisation import asymmetry
-from .effects import Effects
+from .effects import Decision, Effects, Tolerances, effects_for
 from .limits import substeps_per_frame
 from .material import Material
 from .preview import Preview

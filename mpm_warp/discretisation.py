@@ -11,8 +11,7 @@ import warp as wp
 
 from .bed import PADDING
 from .bodies import MeshBody
-from .kernels.ghost_nodes import mirror_layers, periodic_layers
-from .kernels.grid import grid_struct
+from .kernels.grid import grid_struct, mirror_layers, periodic_layers
 from .scene import Scene
 from .state import SceneError
 from .tool_geometry import mesh_asymmetry

@@ -8,7 +8,7 @@ import numpy as np
 
 from .poses import rotation_matrices
 from .scene import Scene
-from .units import place_unit, size_warning, time_warning
+from .tool_geometry import place_unit, size_warning, time_warning
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ sinks slower than one such step per substep would hang in the air.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
-from .effects import Effects
 from .kernels.contact import HOLDING_LAYER, ContactLaw, axle_step, body_struct
 from .kernels.signed_distance import shape_data
 from .launch import Launch
@@ -21,6 +21,9 @@ from .poses import rotation_vectors
 from .scene import Scene
 from .state import SolverStopped
 from .tool_geometry import thickening
+
+if TYPE_CHECKING:
+    from .effects import Effects
 
 LONGEST_WAY = 0.5
 """Of any point of a body in one substep [grid spacings]."""

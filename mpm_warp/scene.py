@@ -21,11 +21,9 @@ from .poses import (
     rotation_vectors,
     sampled_poses,
 )
-from .reprs import short
-from .settings import Settings, build, setting, settings
+from .settings import Settings, build, setting, settings, short
 from .state import SceneError
-from .tool_geometry import HOLDS, distances, thickening
-from .units import place_unit, size_warning
+from .tool_geometry import HOLDS, distances, place_unit, size_warning, thickening
 
 MOST_FRAMES = 1_000_000
 MOST_COURANT = 0.8

@@ -17,8 +17,7 @@ from .poses import about_y, rotate
 from .scene import Scene
 from .settings import same, setting, settings
 from .state import SceneError
-from .tool_geometry import least_thickness, thickening, thinnest
-from .units import size_warning
+from .tool_geometry import least_thickness, size_warning, thickening, thinnest
 
 CUT_LENGTH = 0.4
 """Horizontal travel of the published cuts [m]."""

@@ -16,16 +16,15 @@ from .discretisation import half, initial_stress, lay_grid, require_symmetry
 from .effects import Effects
 from .kernels.contact import body_struct
 from .kernels.fluidity import soil_parameters
-from .kernels.ghost_nodes import GhostNodes, ghost_kernels
-from .kernels.grid import grid_step, particle_struct
+from .kernels.grid import GhostNodes, ghost_kernels, grid_step, particle_struct
 from .kernels.nonlocal_fluidity import nonlocal_launches, wall_sink
 from .kernels.transfer import transfer
 from .launch import Executor, Job, Launch, Program, SceneKernel, find_device
 from .limits import PhysicalLimits, require_memory, steps_to_remap, substeps_per_frame, top_body_speed
 from .poses import rotate
-from .reprs import short_repr
 from .rigid_body import RigidBody
 from .scene import Scene
+from .settings import short_repr
 from .state import Memory, SceneError, SolverStopped, State
 
 PRECISIONS = {"float32": wp.float32, "float64": wp.float64}

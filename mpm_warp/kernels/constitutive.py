@@ -16,11 +16,16 @@ hot path. There are three ranges, by the size s of e and A (Frobenius norm of bo
 
 from functools import cache
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import warp as wp
 
-from ..effects import Effects
 from .fluidity import fluidity, soil_struct
+from .grid import grid_struct
+from .node_rows import splines
+
+if TYPE_CHECKING:
+    from ..effects import Effects
 
 SECOND_ORDER_LIMIT = 0.01
 """Size of strain and step up to which the second-order expansion is used: it misses at most 1e-4 of the step."""
@@ -29,7 +34,7 @@ SERIES_LIMIT = 0.05
 
 
 @cache
-def constitutive(real: type, effects: Effects) -> SimpleNamespace:
+def constitutive(real: type, effects: "Effects") -> SimpleNamespace:
     """Warp functions in precision `real`, with only the physics in `effects`.
 
     Returns a namespace of
@@ -254,3 +259,55 @@ def constitutive(real: type, effects: Effects) -> SimpleNamespace:
         vec6=vec6,
         mat33=mat33,
     )
+
+
+# --- Soil below its critical density --------------------------------------------------------------------
+
+
+LOOSE, DENSE = 0.9, 0.98
+"""Shares of an undisturbed bed's density between which a node comes to count as dense: at rest it does, whatever
+the round-off, and nothing jumps where soil comes apart."""
+APART = 0.005
+"""ln J from which on soil has no say at all in the mean volume change."""
+
+
+@cache
+def loose_soil(real: type) -> SimpleNamespace:
+    """Warp functions in precision `real` for particles with ln J > 0, which bear no stress:
+
+    - `apart(ln_j)`: 0 for dense soil to 1 for soil that is loose for good,
+    - `volume(ln_j, first, f, nodes, grid)`: its ln J.
+
+    `first` is the lowest of its 27 nodes, `f` its offset from there [cells], and the fourth number of `nodes` is the
+    density over that of an undisturbed bed. With a dense node among them the particle is at a surface, or next to a
+    body, where the mean density says how much soil is missing around it and nothing about the particle: its own ln J
+    holds.
+    """
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    Grid, weights = grid_struct(real), splines(real).weights
+
+    @wp.func
+    def ramp(x: real, low: real, high: real):
+        return wp.clamp((x - low) / (high - low), real(0.0), real(1.0))
+
+    @wp.func
+    def apart(ln_j: real):
+        return ramp(ln_j, real(0.0), real(APART))
+
+    @wp.func
+    def volume(ln_j: real, first: int, f: vec3, nodes: wp.array(dtype=vec4), grid: Grid):
+        wx = weights(f[0])
+        wy = weights(f[1])
+        wz = weights(f[2])
+        mean = real(0.0)
+        densest = real(0.0)
+        for i in range(3):
+            for j in range(3):
+                for k in range(3):
+                    density = nodes[first + (i * grid.ny + j) * grid.nz + k][3]
+                    densest = wp.max(densest, density)
+                    mean += wx[i] * wy[j] * wz[k] * density
+        own = ramp(densest, real(LOOSE), real(DENSE))
+        return own * ln_j - (real(1.0) - own) * wp.log(wp.max(mean, real(1.0e-6)))
+
+    return SimpleNamespace(apart=apart, volume=volume)

@@ -29,17 +29,18 @@ import math
 from collections.abc import Sequence
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from ..effects import Effects
 from ..launch import Launch, SceneKernel
 from .fluidity import fluidity, soil_struct
-from .ghost_nodes import GhostNodes
-from .grid import grid_struct, particle_struct
+from .grid import GhostNodes, grid_struct, particle_struct
 from .node_rows import splines
+
+if TYPE_CHECKING:
+    from ..effects import Effects
 
 WALL_CONDUCTANCE = 32.0
 """Of the layer between a wall's node and g = 0, in units of that between two nodes. It puts g = 0 a sixteenth of a
@@ -75,7 +76,7 @@ def wall_sink(shape: tuple[int, int, int], low: Sequence[int], high: Sequence[in
 
 
 @cache
-def nonlocal_kernels(real: type, effects: Effects) -> SimpleNamespace:
+def nonlocal_kernels(real: type, effects: "Effects") -> SimpleNamespace:
     """Kernels in precision `real`:
 
     - `project`: volume, fluidity and s from the particles to `sums`,
@@ -208,7 +209,7 @@ def nonlocal_kernels(real: type, effects: Effects) -> SimpleNamespace:
 
 def nonlocal_launches(
     real: type,
-    effects: Effects,
+    effects: "Effects",
     sink: np.ndarray,
     particles: Any,
     grid: Any,

@@ -12,21 +12,23 @@ its mean.
 
 from functools import cache, partial
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import warp as wp
 
-from ..effects import Effects
 from ..launch import SceneKernel
-from .constitutive import constitutive
+from .constitutive import constitutive, loose_soil
 from .contact import ContactLaw, body_struct, contact
 from .fluidity import fluidity, soil_struct
 from .grid import grid_struct, particle_struct
-from .loose_soil import loose_soil
 from .node_rows import row_operations, splines
+
+if TYPE_CHECKING:
+    from ..effects import Effects
 
 
 @cache
-def transfer(real: type, effects: Effects, contact_law: ContactLaw | None, atomic: bool) -> SimpleNamespace:
+def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, atomic: bool) -> SimpleNamespace:
     """Kernels in precision `real` with only the physics in `effects`: `to_grid` and `from_grid` at a remap;
     `scatter`, `gather` and `material` in every step.
 

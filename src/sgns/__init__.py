@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sgns.config import UserError
     from sgns.data.run import Run
-    from sgns.paths import random_paths
     from sgns.reduction.basis import Basis
     from sgns.reduction.pca import IncrementalPCA
+    from sgns.simulate.scene import random_paths
     from sgns.simulator import Simulator
 
 __all__ = ["Basis", "IncrementalPCA", "Run", "Simulator", "UserError", "__version__", "random_paths"]
@@ -26,7 +26,7 @@ _HOME = {
     "Run": "sgns.data.run",
     "Simulator": "sgns.simulator",
     "UserError": "sgns.config",
-    "random_paths": "sgns.paths",
+    "random_paths": "sgns.simulate.scene",
 }
 
 

@@ -5,8 +5,8 @@ import os
 
 import pytest
 
-from mpm_warp import Bed, Scene, SceneError, Solver, machine
-from mpm_warp.machine import usable_cores, usable_memory
+from mpm_warp import Bed, Scene, SceneError, Solver, limits
+from mpm_warp.limits import usable_cores, usable_memory
 
 GB = 10**9
 
@@ -14,7 +14,7 @@ GB = 10**9
 @pytest.fixture
 def in_container(tmp_path, monkeypatch):
     """Lets control groups be what is given: the lines of /proc/self/cgroup, and files below /sys/fs/cgroup."""
-    monkeypatch.setattr(machine, "ROOT", tmp_path)
+    monkeypatch.setattr(limits, "ROOT", tmp_path)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     monkeypatch.setattr(os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 4_000_000}[name])
 

@@ -19,7 +19,7 @@ from mpm_warp import (
     Wheel,
     substeps_per_frame,
 )
-from mpm_warp.auto_effects import expected_flow
+from mpm_warp.effects import expected_flow
 from mpm_warp.limits import PhysicalLimits, top_body_speed
 from mpm_warp.poses import about_y, rotate, sampled_poses
 from mpm_warp.rigid_body import stable_step

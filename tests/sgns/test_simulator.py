@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from sgns.config import UserError
-from sgns.data.surface import soil_surface
+from sgns.data.run import soil_surface
 from sgns.simulator import Simulator
 from sgns_testing.commands import python
 from sgns_testing.tiny import MODEL, POLYNOMIAL

@@ -162,7 +162,7 @@ def test_a_clock_that_is_set(days, tmp_path, monkeypatch) -> None:
 
     run(tmp_path / "whole")
     with monkeypatch.context() as patch, pytest.raises(Interrupted):
-        patch.setattr("sgns.train.callbacks.StepProgress.on_train_batch_end", stop)
+        patch.setattr("sgns.train.validation.StepProgress.on_train_batch_end", stop)
         run(tmp_path / "parts")
     now = time.time
     monkeypatch.setattr(time, "time", lambda: now() + 86400.0 * days)

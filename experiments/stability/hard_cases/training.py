@@ -18,8 +18,8 @@ from torch import nn
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.settings import TrainingSettings
 from sgns.simulator import Simulator
-from sgns.train.callbacks import StepProgress
 from sgns.train.lightning_module import SurrogateTraining
+from sgns.train.validation import StepProgress
 from sgns.train.windows import TrainingWindows
 
 from .measures import unsaid

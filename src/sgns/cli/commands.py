@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 from sgns import __version__
 from sgns.cli.help import open_closed_streams, write_error, write_output
 from sgns.config import UserError
-from sgns.interrupts import Interrupted, heeded_signals
+from sgns.data.files import Interrupted, heeded_signals
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -56,7 +56,7 @@ COMMANDS = {
         "",
     ),
     "reduce": Command(
-        "sgns.reduction.command",
+        "sgns.reduction.reduce",
         "fit the basis (PCA) on a dataset and reduce its runs",
         "folder",
         ("dataset.path",),
@@ -78,10 +78,8 @@ COMMANDS = {
     ),
     "advise": Command("sgns.advise", "name the setting that is good and fast enough", None),
     "check": Command("sgns.data.check", "read run files through and list what is wrong with them", None),
-    "plot": Command("sgns.plot.page", "one picture of a run", "file", ("run",), plain=("run", "output")),
-    "render": Command(
-        "sgns.plot.movie", "a moving picture of a run", "file", ("run",), plain=("run", "output")
-    ),
+    "plot": Command("sgns.plot", "one picture of a run", "file", ("run",), plain=("run", "output")),
+    "render": Command("sgns.render", "a moving picture of a run", "file", ("run",), plain=("run", "output")),
 }
 
 
@@ -405,7 +403,7 @@ def _line_of(error: Exception) -> str | None:
     taken_out = [argument for argument in sys.argv if argument.startswith("~")]
     if taken_out and isinstance(error, (AttributeError, KeyError)):
         return f"{' '.join(taken_out)}: what is taken out here is needed; leave this out"
-    from sgns.cli.setting_errors import describe
+    from sgns.cli.help import describe
 
     return describe(error)
 

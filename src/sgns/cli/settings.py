@@ -24,8 +24,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from sgns import settings as typed
-from sgns.cli.help import groups_of, options_of
-from sgns.cli.setting_errors import describe
+from sgns.cli.help import describe, groups_of, options_of
 from sgns.config import UserError
 
 # --- Settings run nothing and open no file: what Hydra's own settings may hold --------------------------

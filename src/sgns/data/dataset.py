@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mpm_warp.reprs import short_repr
+from mpm_warp.settings import short_repr
 from sgns.config import UserError, flattened, parse_yaml
 from sgns.data.files import read_text
 

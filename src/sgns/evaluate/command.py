@@ -28,8 +28,7 @@ from sgns.config import UserError
 from sgns.data.check import scene_problems
 from sgns.data.dataset import Dataset
 from sgns.data.files import only_here, require_replaceable
-from sgns.data.run import Run
-from sgns.data.surface import surface_grid
+from sgns.data.run import Run, surface_grid
 from sgns.evaluate.costs import (
     forget_peak,
     full_space_cost,

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from mpm_warp import Effects, Scene, SceneError, Solver, SolverStopped
-from mpm_warp.machine import usable_cores
+from mpm_warp.limits import usable_cores
 from sgns import __version__
 from sgns.data.run import Run
 from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses

@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
 
 from mpm_warp.scenes import sinkage
-from sgns.data.surface import SurfaceGrid, height_map
+from sgns.data.run import SurfaceGrid, height_map
 from sgns.evaluate.metrics import (
     NEGLIGIBLE_SHARE,
     ParticleErrors,

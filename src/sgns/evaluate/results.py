@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mpm_warp.reprs import short_repr
+from mpm_warp.settings import short_repr
 from sgns.data.files import whole_file, write_whole
 from sgns.evaluate.metrics import (
     FORCE_COMPONENTS,

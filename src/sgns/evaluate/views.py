@@ -17,10 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from sgns.data.run import Run, frame_chunks
-from sgns.data.surface import particle_spacing
-from sgns.evaluate.body_shape import CUBE, body_silhouette, body_triangles
-from sgns.evaluate.depth_buffer import DepthBuffer, project
+from sgns.data.run import Run, frame_chunks, particle_spacing
+from sgns.evaluate.body_shape import CUBE, DepthBuffer, body_silhouette, body_triangles, project
 from sgns.evaluate.figures import (
     BASELINE,
     DPI,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mpm_warp.poses import in_world_frame
-from mpm_warp.reprs import short_repr
+from mpm_warp.settings import short_repr
 from sgns.model.features import body_track, context_of
 from sgns.reduction.reduce import ReducedRun
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mpm_warp.reprs import short_repr
+from mpm_warp.settings import short_repr
 from sgns.config import UserError
 from sgns.data.files import one_line, parse_json
 from sgns.data.hdf5 import BROKEN, new_hdf5, open_hdf5, own_attribute, own_dataset

@@ -16,10 +16,9 @@ from tqdm import tqdm
 
 from mpm_warp import Preview, Scene
 from sgns.config import UserError
-from sgns.data.files import only_here
+from sgns.data.files import Interrupted, only_here
 from sgns.data.run import Run
 from sgns.data.writer import require_run_place, stopped_path
-from sgns.interrupts import Interrupted
 from sgns.settings import Limits
 from sgns.simulate.campaign import cost_line, plan, require_limits, require_space, run_cost
 from sgns.simulate.run import Restart, restart_from, simulate_scene, unfinished

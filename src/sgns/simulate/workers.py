@@ -22,12 +22,11 @@ from tqdm import tqdm
 
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
 from mpm_warp.launch import Job
-from mpm_warp.machine import usable_cores
+from mpm_warp.limits import usable_cores
 from mpm_warp.solver import run_concurrently
 from sgns.config import UserError, flattened
-from sgns.data.files import file_lock, remove_abandoned
+from sgns.data.files import Interrupted, file_lock, heeded_signals, remove_abandoned
 from sgns.data.run import Run
-from sgns.interrupts import Interrupted, heeded_signals
 from sgns.numbers import elapsed
 from sgns.settings import Limits
 from sgns.simulate.campaign import (

@@ -26,9 +26,9 @@ from sgns.model.checkpoint import SUMMARY, read_checkpoint, read_summary
 from sgns.reduction.reduce import ReducedDataset, reduce_dataset
 from sgns.settings import model_settings, training_settings
 from sgns.train import Fit, Task
-from sgns.train.callbacks import quiet_writer
 from sgns.train.lightning_module import NETWORK
 from sgns.train.polynomial import POLYNOMIAL
+from sgns.train.validation import quiet_writer
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

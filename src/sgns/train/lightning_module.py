@@ -32,8 +32,7 @@ from sgns.model.network_dynamics import LatentDynamics
 from sgns.numbers import elapsed
 from sgns.settings import ModelSettings, TrainingSettings
 from sgns.train import Fit, Fitted, Task
-from sgns.train.callbacks import RolloutValidation, StepProgress
-from sgns.train.validation import ValidationRollouts
+from sgns.train.validation import RolloutValidation, StepProgress, ValidationRollouts
 from sgns.train.windows import Batch, TrainingWindows, WindowLoader, fit_normalisation
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ import pytest
 
 from mpm_warp import Effects
 from sgns.cli.commands import COMMANDS
+from sgns.data.files import Interrupted, heeded_signals
 from sgns.data.run import Run
-from sgns.interrupts import Interrupted, heeded_signals
 from sgns.simulate.run import simulate_scene
 from sgns.simulate.scene import scene_from_config
 from sgns_testing.commands import SMALL, TRAIN, call, composed, refused, sgns, small_dataset

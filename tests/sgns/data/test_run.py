@@ -11,8 +11,7 @@ import pytest
 
 from sgns.config import UserError
 from sgns.data.check import check_run
-from sgns.data.run import Run
-from sgns.data.surface import soil_surface
+from sgns.data.run import Run, soil_surface
 from sgns_testing.runs import make_run
 
 

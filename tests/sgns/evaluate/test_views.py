@@ -10,15 +10,17 @@ from mpm_warp.scenes import Wheel, sinkage
 from sgns.data.run import Run
 from sgns.evaluate import figures
 from sgns.evaluate.body_shape import (
+    CAMERA,
     MOST_TRIANGLES,
+    DepthBuffer,
     body_corners,
     body_silhouette,
     body_triangles,
     hull,
     hull_triangles,
+    project,
     simpler,
 )
-from sgns.evaluate.depth_buffer import CAMERA, DepthBuffer, project
 from sgns.evaluate.views import (
     MOST_PARTICLES,
     common_scales,

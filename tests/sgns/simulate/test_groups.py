@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 import mpm_warp
 import sgns.conf
 from mpm_warp import Box, Cylinder, Effects, Material, MeshBody, Scene
-from mpm_warp.auto_effects import EFFECTS
+from mpm_warp.effects import EFFECTS
 from sgns.simulate.scene import scene_from_config
 from sgns_testing.commands import composed
 

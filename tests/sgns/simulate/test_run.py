@@ -29,9 +29,9 @@ from mpm_warp import (
 from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
 from sgns.data.check import check_run
+from sgns.data.files import Interrupted, heeded_signals
 from sgns.data.run import Run
 from sgns.data.writer import stopped_path
-from sgns.interrupts import Interrupted, heeded_signals
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.run import restart_from, scene_stages, simulate_scene, unfinished
 from sgns.simulate.scene import recorded

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
 
-from sgns import demo
 from sgns.cli.commands import COMMANDS
 from sgns.simulate.campaign import plan
 from sgns.simulate.scene import scene_from_config
 from sgns_testing.commands import composed, environment
+
+SCRIPT = Path(__file__).resolve().parent.parent / "examples" / "demo.py"
+SPEC = importlib.util.spec_from_file_location("demo", SCRIPT)
+demo = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(demo)
 
 
 @pytest.fixture
@@ -62,7 +68,7 @@ def test_it_stops_at_the_first_failure(calls):
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="has no groups of processes")
 def test_ctrl_c_ends_the_command_and_the_demo_in_one_line(tmp_path):
     command, heed = (
-        [sys.executable, "-m", "sgns.demo"],
+        [sys.executable, str(SCRIPT)],
         "import signal; signal.signal(2, signal.default_int_handler)",
     )
     command = [sys.executable, "-c", f"{heed}; import os; os.execv({sys.executable!r}, {command!r})"]

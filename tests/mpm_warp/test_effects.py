@@ -21,7 +21,7 @@ from mpm_warp import (
     Wheel,
     effects_for,
 )
-from mpm_warp.auto_effects import EFFECTS, expected_flow
+from mpm_warp.effects import EFFECTS, expected_flow
 from mpm_warp.poses import rotate
 from sgns_testing.scenes import UNDAMPED, cut
 from sgns_testing.solvers import compiled_source, launches

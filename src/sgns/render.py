@@ -21,7 +21,7 @@ from sgns.data.run import Run
 from sgns.evaluate.figures import NETWORK, STYLE, TRUTH, new_figure
 from sgns.evaluate.metrics import forward_force
 from sgns.evaluate.views import Scales, common_scales, draw_view
-from sgns.plot.inputs import picture_place, require_finite
+from sgns.plot import picture_place, require_finite
 
 log = logging.getLogger(__name__)
 

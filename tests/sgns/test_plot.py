@@ -7,10 +7,10 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
+from sgns import plot, render
 from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.evaluate.figures import DPI, PICTURE_WIDTH
-from sgns.plot import movie, page
 from sgns_testing.commands import sgns
 from sgns_testing.runs import make_run
 
@@ -32,7 +32,7 @@ def settings(file, **values):
 @pytest.mark.parametrize("frames", [1, 2, 14])
 def test_a_page_of_every_kind_of_run(tmp_path, scene, frames):
     file = make_run(tmp_path / "run.h5", frames=frames, n=300, scene=scene, producer="rollout")
-    page.main(settings(file))
+    plot.main(settings(file))
     with Image.open(tmp_path / "run.png") as picture:
         assert picture.width == round(2 * PICTURE_WIDTH * DPI) and picture.height < 2 * picture.width
         assert np.asarray(picture).std() > 20.0
@@ -40,37 +40,37 @@ def test_a_page_of_every_kind_of_run(tmp_path, scene, frames):
 
 def test_panels_show_units_and_the_sinkage_of_a_wheel(tmp_path):
     with Run(make_run(tmp_path / "run.h5", n=100, scene=WHEEL)) as run:
-        labels = [panel.label for panel in page.curves(run)]
+        labels = [panel.label for panel in plot.curves(run)]
     assert labels[0] == "drawbar pull Fx [N]" and labels[-1] == "sinkage [mm]"
     assert all(label.endswith("]") for label in labels)
 
 
 def test_a_moving_picture_plays_in_real_time(run_file, tmp_path):
-    movie.main(settings(run_file, output=str(tmp_path / "new.gif")))
+    render.main(settings(run_file, output=str(tmp_path / "new.gif")))
     with Image.open(tmp_path / "new.gif") as picture:
         assert picture.n_frames == 5 and picture.info["duration"] == 50  # every third frame of 1/60 s
 
 
 def test_a_long_run_gives_a_bounded_number_of_pictures(run_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(movie, "MOST_PICTURES", 4)
-    monkeypatch.setattr(movie, "LONGEST", 0.02)
+    monkeypatch.setattr(render, "MOST_PICTURES", 4)
+    monkeypatch.setattr(render, "LONGEST", 0.02)
     with Run(run_file) as run:
-        assert movie.moving_picture({"run": run}, tmp_path / "a.gif") == pytest.approx(4 / 60 / 0.02)
+        assert render.moving_picture({"run": run}, tmp_path / "a.gif") == pytest.approx(4 / 60 / 0.02)
     with Image.open(tmp_path / "a.gif") as picture:
         assert picture.n_frames == 4
 
 
 def test_a_moving_picture_leaves_out_pictures_to_be_small(tmp_path, monkeypatch):
     noise = [Image.effect_noise((60, 40), 90.0) for _ in range(16)]
-    movie.write_gif(noise, tmp_path / "all.gif", 50)
-    monkeypatch.setattr(movie, "MOST_BYTES", (tmp_path / "all.gif").stat().st_size // 3)
-    movie.write_gif(noise, tmp_path / "some.gif", 50)
+    render.write_gif(noise, tmp_path / "all.gif", 50)
+    monkeypatch.setattr(render, "MOST_BYTES", (tmp_path / "all.gif").stat().st_size // 3)
+    render.write_gif(noise, tmp_path / "some.gif", 50)
     with Image.open(tmp_path / "some.gif") as picture:
         assert picture.n_frames == 4 and picture.info["duration"] == 200
-    assert (tmp_path / "some.gif").stat().st_size <= movie.MOST_BYTES
+    assert (tmp_path / "some.gif").stat().st_size <= render.MOST_BYTES
 
 
-@pytest.mark.parametrize(("command", "suffix"), [(page, "png"), (movie, "gif")])
+@pytest.mark.parametrize(("command", "suffix"), [(plot, "png"), (render, "gif")])
 def test_a_picture_is_replaced_only_if_asked(run_file, command, suffix):
     picture = run_file.with_suffix(f".{suffix}")
     picture.write_text("mine")
@@ -82,7 +82,7 @@ def test_a_picture_is_replaced_only_if_asked(run_file, command, suffix):
         command.main(settings(run_file, output="x.jpg"))
 
 
-@pytest.mark.parametrize("command", [page, movie])
+@pytest.mark.parametrize("command", [plot, render])
 def test_a_run_that_is_not_finite_is_refused(tmp_path, command):
     import h5py
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import logging
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +16,9 @@ from omegaconf import DictConfig
 from PIL import Image
 
 from mpm_warp.scenes import sinkage
-from sgns.data.files import whole_file
-from sgns.data.run import Run
-from sgns.data.surface import columns, height_map, particle_spacing
+from sgns.config import UserError
+from sgns.data.files import require_replaceable, whole_file
+from sgns.data.run import Run, columns, height_map, particle_spacing
 from sgns.evaluate.body_shape import body_silhouette
 from sgns.evaluate.figures import (
     NETWORK,
@@ -30,9 +32,8 @@ from sgns.evaluate.figures import (
     styled,
 )
 from sgns.evaluate.metrics import NEGLIGIBLE_SHARE, forward_force
-from sgns.evaluate.views import COLOUR_BAR, common_scales, draw_body, nice, side_views
+from sgns.evaluate.views import COLOUR_BAR, common_scales, draw_body, nice, side_views, view_times
 from sgns.model.features import is_wheel
-from sgns.plot.inputs import picture_place, require_finite, shown_times
 
 log = logging.getLogger(__name__)
 
@@ -154,3 +155,44 @@ def joined(pictures: list[Image.Image], down: bool) -> Image.Image:
         page.paste(picture, (place[0], place[1]))
         place[along] += picture.size[along]
     return page
+
+
+# --- For `render`, too: a run that can be drawn, the name of its picture --------------------------------
+
+
+def picture_place(cfg: DictConfig, suffix: str) -> Path:
+    """Where the picture goes: `cfg.output`, else beside the run with its name.
+
+    Raises:
+        UserError: it has another suffix, or is there and `cfg.overwrite` is false.
+    """
+    path = Path(cfg.run).with_suffix(suffix) if cfg.output is None else Path(cfg.output)
+    if path.suffix.lower() != suffix:
+        raise UserError(
+            f"output is {path}; the picture is a {suffix} file: output={path.with_suffix(suffix)}"
+        )
+    if path.is_file() and not cfg.overwrite:
+        raise UserError(f"{path} is there already; choose another output, or replace it with overwrite=true")
+    require_replaceable(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def shown_times(run: Run, count: int = 3) -> list[int]:
+    """Frames for side views: fewer than `count` of a run that has fewer."""
+    return sorted(set(view_times(run, min(int(run.extra.get("history") or 0), run.frame_count - 1), count)))
+
+
+def require_finite(run: Run, frames: Iterable[int]) -> None:
+    """Refuses a run whose body, or whose soil at some frames, has no place that could be drawn.
+
+    Raises:
+        UserError: it names the frame.
+    """
+    body = np.isfinite(np.hstack([run.pose, run.force, run.torque])).all(axis=1)
+    for frame in frames:
+        soil = run.positions(frame), run.velocities(frame)
+        if not (body[frame] and all(np.isfinite(part).all() for part in soil)):
+            raise UserError(
+                f"{run.path}: frame {frame} is not finite; `sgns check {run.path}` lists everything"
+            )
