@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from sgns.data.files import Interrupted, heed, heeded_signals, held_back
+from sgns.config import Interrupted, heed, heeded_signals, held_back
 from sgns_testing.commands import environment
 
 ENDINGS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2]
@@ -71,7 +71,7 @@ def test_a_second_ctrl_c_takes_effect_at_once():
 
 
 def test_nohup_is_respected():
-    code = "from sgns.data.files import heeded_signals as h; import signal\nwith h(): signal.raise_signal(1); print(1)"
+    code = "from sgns.config import heeded_signals as h; import signal\nwith h(): signal.raise_signal(1); print(1)"
     command = ["nohup", sys.executable, "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=60)
     assert done.stdout == "1\n", (done, os.environ)

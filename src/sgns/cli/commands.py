@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from sgns import __version__
 from sgns.cli.help import open_closed_streams, write_error, write_output
-from sgns.config import UserError
-from sgns.data.files import Interrupted, heeded_signals
+from sgns.config import Interrupted, UserError, heeded_signals
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

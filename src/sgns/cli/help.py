@@ -9,27 +9,16 @@ import re
 import sys
 from importlib.resources import files
 from string import Template
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 import yaml
-from hydra.errors import (
-    ConfigCompositionException,
-    HydraException,
-    MissingConfigException,
-    OverrideParseException,
-)
-from hydra.plugins.config_source import ConfigLoadError
-from omegaconf import Container, DictConfig, OmegaConf
-from omegaconf.errors import (
-    ConfigAttributeError,
-    ConfigKeyError,
-    GrammarParseError,
-    InterpolationResolutionError,
-    MissingMandatoryValue,
-    OmegaConfBaseException,
-)
 
 from sgns.config import UserError
+
+if TYPE_CHECKING:
+    from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
+    from omegaconf import Container
+    from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
 # --- The terminal: how log lines look, and what becomes of text that cannot be written ------------------
 
@@ -151,9 +140,6 @@ def _settings(command: str) -> dict:
 # --- Wrong settings: one line for what Hydra and OmegaConf say, with the key and what is allowed --------
 
 
-# OmegaConf's errors that come from what a person wrote, even when they appear inside a command; its other
-# errors there (an unknown attribute, a wrong type) are mistakes of the command.
-_WRITTEN = (MissingMandatoryValue, InterpolationResolutionError, GrammarParseError)
 # What a value holds without quotes; quotes, brackets and `${` have a meaning of their own.
 _UNQUOTED = re.compile(r"[\w \t\\/%+.$*@?|:,=()\[\]{}'\"-]", re.ASCII)
 # How Python's logging begins what it says of its settings.
@@ -162,11 +148,18 @@ _LOGGING = ("Unable to ", "Unsupported version", "dictionary doesn't specify a v
 
 def describe(error: Exception) -> str | None:
     """The line for an error about settings; None when the error is another one."""
-    if isinstance(error, OverrideParseException):
+    from hydra import errors  # here and below: Hydra takes longer to load than a help text may
+    from hydra.plugins.config_source import ConfigLoadError
+    from omegaconf.errors import GrammarParseError, InterpolationResolutionError, MissingMandatoryValue
+
+    # OmegaConf's errors that come from what a person wrote, even when they appear inside a command; its other
+    # errors there (an unknown attribute, a wrong type) are mistakes of the command.
+    written = (MissingMandatoryValue, InterpolationResolutionError, GrammarParseError)
+    if isinstance(error, errors.OverrideParseException):
         return _unreadable(error)
-    if isinstance(error, MissingConfigException):
+    if isinstance(error, errors.MissingConfigException):
         return _missing_option(error)
-    if isinstance(error, ConfigCompositionException):
+    if isinstance(error, errors.ConfigCompositionException):
         return _composition(error)
     if isinstance(error, ValueError) and str(error).startswith("Config group override must be a string"):
         return (
@@ -175,7 +168,7 @@ def describe(error: Exception) -> str | None:
     if isinstance(error, ValueError) and str(error).startswith(_LOGGING):
         cause = "" if error.__cause__ is None else f": {error.__cause__}"
         return _flat(f"the settings of the logging are wrong: {error}{cause}")
-    if isinstance(error, (HydraException, ConfigLoadError, yaml.YAMLError, *_WRITTEN)):
+    if isinstance(error, (errors.HydraException, ConfigLoadError, yaml.YAMLError, *written)):
         return _flat(str(error))
     return None
 
@@ -210,6 +203,8 @@ def _missing_option(error: MissingConfigException) -> str:
 
 
 def _composition(error: ConfigCompositionException) -> str:
+    from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
     text, cause = str(error), error.__cause__
     if isinstance(cause, (ConfigAttributeError, ConfigKeyError)) and cause.full_key:
         return _unknown_key(cause)
@@ -228,6 +223,8 @@ def _composition(error: ConfigCompositionException) -> str:
 
 
 def _unknown_key(cause: ConfigAttributeError | ConfigKeyError) -> str:
+    from omegaconf import DictConfig
+
     key = str(cause.full_key)
     parent = cause.parent_node
     if not isinstance(parent, DictConfig):
@@ -246,6 +243,8 @@ def _unknown_key(cause: ConfigAttributeError | ConfigKeyError) -> str:
 
 def _keys(cfg: Container) -> list[str]:
     """Dotted names of all settings, without Hydra's own."""
+    from omegaconf import OmegaConf
+
     plain = OmegaConf.to_container(cfg, resolve=False)
     names: list[str] = []
 

@@ -15,8 +15,8 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from mpm_warp import Preview, Scene
-from sgns.config import UserError
-from sgns.data.files import Interrupted, only_here
+from sgns.config import Interrupted, UserError
+from sgns.data.files import only_here
 from sgns.data.run import Run
 from sgns.data.writer import require_run_place, stopped_path
 from sgns.settings import Limits

@@ -15,8 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from mpm_warp import Effects, Scene, Solver, SolverStopped, State
 from mpm_warp.launch import Job
 from mpm_warp.solver import run_concurrently
-from sgns.config import UserError, differences
-from sgns.data.files import Interrupted, heed, held_back
+from sgns.config import Interrupted, UserError, differences, heed, held_back
 from sgns.data.run import Run
 from sgns.data.writer import RunWriter, stopped_path
 from sgns.numbers import elapsed
@@ -260,7 +259,7 @@ def scene_stages(
 
     Raises:
         SolverStopped: the line says where the frames before it are kept and how to go on.
-        Interrupted: a signal was heeded (`sgns.data.files`), or the generator is closed early; the line says where the
+        Interrupted: a signal was heeded (`sgns.config`), or the generator is closed early; the line says where the
             frames are kept.
     """
     computed, state, before = scene, None, 0.0

@@ -24,8 +24,8 @@ from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, f
 from mpm_warp.launch import Job
 from mpm_warp.limits import usable_cores
 from mpm_warp.solver import run_concurrently
-from sgns.config import UserError, flattened
-from sgns.data.files import Interrupted, file_lock, heeded_signals, remove_abandoned
+from sgns.config import Interrupted, UserError, flattened, heeded_signals
+from sgns.data.files import file_lock, remove_abandoned
 from sgns.data.run import Run
 from sgns.numbers import elapsed
 from sgns.settings import Limits

@@ -13,7 +13,7 @@ import pytest
 
 from mpm_warp import Effects
 from sgns.cli.commands import COMMANDS
-from sgns.data.files import Interrupted, heeded_signals
+from sgns.config import Interrupted, heeded_signals
 from sgns.data.run import Run
 from sgns.simulate.run import simulate_scene
 from sgns.simulate.scene import scene_from_config

@@ -27,9 +27,8 @@ from mpm_warp import (
     mesh_files,
 )
 from mpm_warp.solver import run_concurrently
-from sgns.config import UserError
+from sgns.config import Interrupted, UserError, heeded_signals
 from sgns.data.check import check_run
-from sgns.data.files import Interrupted, heeded_signals
 from sgns.data.run import Run
 from sgns.data.writer import stopped_path
 from sgns.simulate import workers as campaign_runs

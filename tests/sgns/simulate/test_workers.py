@@ -220,7 +220,7 @@ def test_two_processes_may_compile_into_an_empty_cache_at_once(tmp_path):
 LONG = {"depth": [0.02, 0.03, 0.04, 0.05], "duration": [10.0], "speed": [0.02]}
 MAKE = f"""
 import pathlib, sys
-from sgns.data.files import heeded_signals
+from sgns.config import heeded_signals
 from sgns.simulate.workers import simulate_campaign
 from sgns_testing.campaigns import campaign
 if __name__ == "__main__":
