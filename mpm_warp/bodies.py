@@ -26,6 +26,15 @@ class Axle:
     """[kg]; gravity acts on it."""
     damping: float = 0.0
     """Force against the vertical velocity per mass [1/s]."""
+    load: tuple[tuple[float, float], ...] = ()
+    """Rows of a time [s] and what it carries then [N]; none: its weight."""
+
+    def fall(self, times: np.ndarray, gravity: float) -> float:
+        """Mean acceleration without soil [m/s^2], downwards, over some times [s]."""
+        if not self.load:
+            return gravity
+        at, load = np.transpose(self.load)
+        return float(np.interp(times, at, load).mean()) / self.mass
 
 
 class Tool(ABC):

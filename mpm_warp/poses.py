@@ -17,6 +17,12 @@ def about_y(angle: float) -> np.ndarray:
     return np.array([0.0, np.sin(0.5 * angle), 0.0, np.cos(0.5 * angle)])
 
 
+def about_z_y(first: float, second: float) -> np.ndarray:
+    """Rotation by `second` [rad] about +y, then by `first` [rad] about +z, shape (4,)."""
+    (sz, sy), (cz, cy) = np.sin([0.5 * first, 0.5 * second]), np.cos([0.5 * first, 0.5 * second])
+    return np.array([0.0 - sz * sy, cz * sy, sz * cy, cz * cy])
+
+
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Vectors v (..., 3) turned by q (..., 4)."""
     t = 2.0 * np.cross(q[..., :3], v)

@@ -107,8 +107,9 @@ class RigidBody:
         if axle is not None:
             height = scene.poses_at(np.zeros(1))[0, 2]
             self._axle = data.axle = wp.array([height, 0.0, 0.0], dtype=wp.float64, device=device)
+            self._fall: wp.array = wp.array([scene.gravity], dtype=wp.float64, device=device)
             mass = axle.mass * (0.5 if effects.symmetry else 1.0)
-            values = [self._axle, data.impulse, time_step, mass, scene.gravity, axle.damping]
+            values = [self._axle, data.impulse, time_step, mass, self._fall, axle.damping]
             self.launches.append(Launch(axle_step(real), 1, values, device))
 
     def start_frame(self, frame: int) -> None:
@@ -118,9 +119,11 @@ class RigidBody:
             SolverStopped: the body jumps.
         """
         self.data.impulse.zero_()
-        if self._axle is not None:
-            self._axle[2:].zero_()
         times = (frame * self.substeps + np.arange(self.substeps + 1)) * self.time_step
+        if self._axle is not None and self.scene.axle is not None:
+            self._axle[2:].zero_()
+            if self.scene.axle.load:
+                self._fall.fill_(self.scene.axle.fall(times, self.scene.gravity))
         poses = self.scene.poses_at(times)
         self._require_steady(frame, times, poses[:, :3])
         self.data.position.assign(poses[:-1, :3])

@@ -13,9 +13,9 @@ import numpy as np
 from .bed import Bed, Walls, digest
 from .bodies import Axle, Box, Cylinder, MeshBody, Plate, Tool
 from .material import Material
-from .poses import about_y, rotate
+from .poses import about_y, about_z_y, rotate
 from .scene import Scene
-from .settings import same, setting, settings
+from .settings import same, setting, settings, short
 from .state import SceneError
 from .tool_geometry import least_thickness, size_warning, thickening, thinnest
 
@@ -193,16 +193,46 @@ def sinkage(scene: Mapping[str, Any], poses: np.ndarray) -> np.ndarray:
     return 0.5 * scene["diameter"] + scene.get("grouser_height", 0.0) - poses[:, 2]
 
 
-def _positive(default: float, words: str, unit: str) -> Any:
-    return setting(default, words, unit, gt=0, words=f" {unit}; a wheel needs more than 0")
+def along_and_across(scene: Mapping[str, Any], vectors: np.ndarray) -> np.ndarray:
+    """Parts of a wheel's forces or torques, world frame, shape (..., 3): along its heading, along its axle, and up.
+
+    Its `scene` is plain data, as for `sinkage`.
+    """
+    angle = math.radians(scene.get("slip_angle", 0.0))
+    c, s = math.cos(angle), math.sin(angle)
+    return vectors @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _as_loads(rows: Any) -> tuple[tuple[float, float], ...]:
+    """The rows of a load over time, checked."""
+    for number, row in enumerate(rows, 1):
+        numbers = isinstance(row, (list, tuple, np.ndarray)) and len(row) == 2
+        if not numbers or not all(
+            isinstance(v, (int, float, np.number)) and not isinstance(v, bool) and math.isfinite(v)
+            for v in row
+        ):
+            raise SceneError(
+                f"row {number} of scene.load is {short(row)}; it needs a time [s] and a load [N]"
+            )
+        if not row[1] > 0:
+            raise SceneError(f"row {number} of scene.load is {short(row)}; a wheel needs more than 0 N")
+        if number > 1 and not row[0] > rows[number - 2][0]:
+            raise SceneError(
+                f"row {number} of scene.load does not come after the row before it; times increase"
+            )
+    if len(rows) == 0:
+        raise SceneError(
+            "scene.load is empty; it must be a number above 0 N, or rows of a time [s] and a load [N]"
+        )
+    return tuple((float(time), float(load)) for time, load in rows)
 
 
 @settings
 class Wheel(Scene):
-    """A wheel settles under its load, then drives along x with a given slip.
+    """A wheel settles under its load, then travels along x and rolls, skids, or is pushed sideways.
 
-    Forward motion and rotation are prescribed: both are zero during the first `settle` seconds and constant
-    afterwards. The height is free. The mass is load / gravity, so that the weight is the load.
+    Travel and rotation are prescribed: both are zero during the first `settle` seconds and constant afterwards. The
+    height is free. The mass is load / gravity, so that the weight is the load; of a load over time, its largest.
     """
 
     name: str = "wheel"
@@ -214,7 +244,13 @@ class Wheel(Scene):
     )
     contact_margin: float = 0.0
     duration: float = 6.3333333333
-    load: float = _positive(100.0, "weight that the wheel carries, its own included", "N")
+    load: float | tuple[Any, ...] = setting(
+        100.0,
+        "weight that the wheel carries, its own included; or rows of a time [s] and the load then",
+        "N",
+        gt=0,
+        words=" N; a wheel needs more than 0, or rows of a time [s] and the load then [N]",
+    )
     diameter: float = same(Cylinder, "diameter")
     width: float = same(Cylinder, "width")
     friction: float = same(Cylinder, "friction", default=0.5)
@@ -222,9 +258,24 @@ class Wheel(Scene):
     grouser_height: float = same(Cylinder, "grouser_height")
     grouser_thickness: float = same(Cylinder, "grouser_thickness")
     slip: float = setting(
-        0.2, "1 - forward speed / rim speed", ge=-1, le=1, note=" (0: rolls freely, 1: turns on the spot)"
+        0.2,
+        "1 - travel / rim speed, if travel_speed is not given; then it follows: 1 - travel / rim where the rim is "
+        "faster, rim / travel - 1 where it is slower",
+        ge=-1,
+        le=1,
+        note=" (0: rolls freely, 1: turns on the spot)",
     )
-    rim_speed: float = _positive(0.0195, "angular speed times half the diameter", "m/s")
+    rim_speed: float = setting(
+        0.0195, "angular speed times half the diameter; 0, a locked wheel, needs travel_speed", "m/s", ge=0
+    )
+    travel_speed: float | None = setting(None, "along x; None: rim_speed (1 - slip)", "m/s", ge=0)
+    slip_angle: float = setting(
+        0.0,
+        "the wheel's plane is turned by it about z, out of the direction of travel; 90: pushed sideways",
+        "degrees",
+        ge=-90,
+        le=90,
+    )
     friction_angle: float | None = setting(37.0, "of the soil; None: material.friction_angle", "degrees")
     settle: float = setting(1.0, "time at rest under the load before driving; recorded like the rest", "s")
     damping: float = setting(5.0, "force against the vertical velocity per mass of the wheel", "1/s", ge=0)
@@ -240,10 +291,21 @@ class Wheel(Scene):
         super().__post_init__()
         if not self.gravity > 0:
             raise SceneError(f"scene.gravity is {self.gravity} m/s^2; a wheel needs more than 0")
-        if not LEAST_MASS <= self.load / self.gravity <= MOST_MASS:
+        if isinstance(self.load, tuple):
+            object.__setattr__(self, "load", _as_loads(self.load))
+        mass = self.axle.mass
+        if not LEAST_MASS <= mass <= MOST_MASS:
             raise SceneError(
-                f"scene.load is {self.load} N at scene.gravity {self.gravity} m/s^2: a wheel of "
-                f"{self.load / self.gravity:.3g} kg; allowed: {LEAST_MASS:g} to {MOST_MASS:g} kg"
+                f"scene.load is {mass * self.gravity:g} N at scene.gravity {self.gravity} m/s^2: a wheel of "
+                f"{mass:.3g} kg; allowed: {LEAST_MASS:g} to {MOST_MASS:g} kg"
+            )
+        if self.travel_speed is not None:
+            slow, fast = sorted((self.rim_speed, self.travel_speed))
+            slip = 1.0 - slow / fast if fast > 0.0 else 0.0
+            object.__setattr__(self, "slip", -slip if self.travel_speed > self.rim_speed else slip)
+        elif self.rim_speed == 0.0:
+            raise SceneError(
+                "scene.rim_speed is 0.0 m/s; a wheel needs more than 0, or scene.travel_speed if it is locked"
             )
         if not 0.0 <= self.settle < self.duration:
             raise SceneError(
@@ -268,12 +330,14 @@ class Wheel(Scene):
 
     @property
     def axle(self) -> Axle:
+        if isinstance(self.load, tuple):
+            return Axle(max(load for _, load in self.load) / self.gravity, self.damping, self.load)
         return Axle(self.load / self.gravity, self.damping)
 
     @property
     def speed(self) -> float:
-        """Forward speed while driving [m/s]."""
-        return self.rim_speed * (1.0 - self.slip)
+        """Along x while driving [m/s]."""
+        return self.rim_speed * (1.0 - self.slip) if self.travel_speed is None else self.travel_speed
 
     @property
     def angular_speed(self) -> float:
@@ -286,7 +350,8 @@ class Wheel(Scene):
         poses[:, 0] = self.start * self.bed.size[0] + self.speed * driven
         poses[:, 1] = 0.5 * self.bed.size[1]
         poses[:, 2] = self.body.tip_radius + self.clearance
-        poses[:, 3:] = np.array([about_y(angle) for angle in self.angular_speed * driven])
+        heading = math.radians(self.slip_angle)
+        poses[:, 3:] = np.array([about_z_y(heading, angle) for angle in self.angular_speed * driven])
         return poses
 
     def displacement(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -309,11 +374,12 @@ class Wheel(Scene):
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         driving = self.times()[: len(force)] > self.settle + 0.5 / self.frame_rate
-        pull, _, vertical = force[driving].mean(axis=0)
+        pull, lateral, vertical = along_and_across(vars(self), force[driving].mean(axis=0))
+        sideways = f"lateral force {lateral:.2f} N, " if self.slip_angle else ""
         return (
-            f"while driving: mean drawbar pull {pull:.2f} N, vertical force {vertical:.2f} N, "
+            f"while driving: mean drawbar pull {pull:.2f} N, {sideways}vertical force {vertical:.2f} N, "
             f"sinkage {1000.0 * self.sinkage(poses)[driving].mean():.1f} mm, "
-            f"torque {torque[driving, 1].mean():.3f} N m"
+            f"torque {along_and_across(vars(self), torque[driving].mean(axis=0))[1]:.3f} N m"
         )
 
     def _check_fits(self) -> None:
@@ -321,11 +387,18 @@ class Wheel(Scene):
         lx, ly, _ = self.bed.size
         if self.width >= ly:
             raise SceneError(f"scene.width is {self.width} m; the bin is only {ly:g} m wide")
+        angle = math.radians(abs(self.slip_angle))
+        across = self.width * math.cos(angle) + 2.0 * self.body.tip_radius * math.sin(angle)
+        if across >= ly:
+            raise SceneError(
+                f"scene.slip_angle is {self.slip_angle:g} degrees: the wheel is {across:.3g} m wide across its "
+                f"travel, but the bin is only {ly:g} m wide; enlarge scene.bed.size"
+            )
         first, last = self.poses_at(self.times()[[0, -1]])[:, 0]
         if min(first, last) < 0.0 or max(first, last) > lx:
             raise SceneError(
                 f"the axle moves from x = {first:.3f} to {last:.3f} m; allowed: 0 to {lx:g} m; change scene.start, "
-                "slip, rim_speed or duration"
+                "slip, rim_speed, travel_speed or duration"
             )
         if not -self.bed.size[2] < self.clearance < self.bed.headroom:
             raise SceneError(

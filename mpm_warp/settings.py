@@ -260,7 +260,9 @@ def _checked(cls: type[Settings], name: str, value: Any, place: str = "") -> Any
     except ValidationError as error:
         problem = error.errors(include_url=False, include_context=False)[0]
     own = f"{cls.group}.{name}".lstrip(".")
-    wrong_type = "" if known.choices else _wrong_type(problem, kind)
+    # A number or rows: the words of the setting say both.
+    either = float in get_args(kind) and any(get_origin(part) is tuple for part in get_args(kind))
+    wrong_type = "" if known.choices or either else _wrong_type(problem, kind)
     # To somebody who writes Python the range says more than that a number must be finite.
     if wrong_type and (
         place or (not known.words and not (known.range and problem["type"] == "finite_number"))

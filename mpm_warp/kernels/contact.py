@@ -148,13 +148,13 @@ def axle_step(real: type) -> SceneKernel:
         impulse: wp.array(dtype=vec3),
         dt: wp.float64,
         mass: wp.float64,
-        gravity: wp.float64,
+        fall: wp.array(dtype=wp.float64),  # acceleration without soil [m/s^2]
         damping: wp.float64,
     ):
         total = wp.float64(impulse[0][2])
         gained = total - axle[2]
         axle[2] = total
-        axle[1] = (axle[1] + gained / mass - dt * gravity) / (wp.float64(1.0) + dt * damping)
+        axle[1] = (axle[1] + gained / mass - dt * fall[0]) / (wp.float64(1.0) + dt * damping)
         axle[0] = axle[0] + dt * axle[1]
 
     return step

@@ -100,7 +100,7 @@ class ReductionSettings(Group):
 
 # --- conf/model -----------------------------------------------------------------------------------------
 
-_CONTEXT = ("gravity", "friction_angle", "load", "diameter", "width", "slip")
+_CONTEXT = ("gravity", "friction_angle", "load", "diameter", "width", "slip", "slip_angle")
 
 
 def _context(words: str) -> Any:

@@ -17,13 +17,15 @@ from mpm_warp import (
     Solver,
     SolverStopped,
     Wheel,
+    effects_for,
     substeps_per_frame,
 )
+from mpm_warp.discretisation import asymmetry
 from mpm_warp.effects import expected_flow
 from mpm_warp.limits import PhysicalLimits, top_body_speed
 from mpm_warp.poses import about_y, rotate, sampled_poses
 from mpm_warp.rigid_body import stable_step
-from mpm_warp.scenes import curved, ramp
+from mpm_warp.scenes import along_and_across, curved, ramp
 from sgns_testing.scenes import UNDAMPED, BlockBed, block, cut
 from sgns_testing.solvers import momenta
 
@@ -214,6 +216,107 @@ def test_slip_kinematics():
     assert wheel(gravity=1.62).axle.mass * 1.62 == pytest.approx(scene.load)
 
 
+@pytest.mark.parametrize(
+    ("rim", "travel", "slip"),
+    [
+        (0.0, 0.1, -1.0),
+        (0.05, 0.1, -0.5),
+        (0.1, 0.1, 0.0),
+        (0.1, 0.05, 0.5),
+        (0.1, 0.0, 1.0),
+        (0.0, 0.0, 0.0),
+    ],
+)
+def test_travel_and_rim_speed_each_on_its_own(rim, travel, slip):
+    """From a locked wheel to one that turns on the spot; what `slip` says is theirs."""
+    scene = wheel(rim_speed=rim, travel_speed=travel, slip=0.3, settle=0.5, duration=1.5)
+    assert scene.slip == pytest.approx(slip)
+    assert Scene.from_dict(scene.to_dict()) == scene
+    poses = scene.poses_at(np.array([0.5, 1.5]))
+    np.testing.assert_allclose(poses[1, 0] - poses[0, 0], travel, atol=1e-12)
+    np.testing.assert_allclose(np.diff(rotation_angles(poses)), rim / 0.06, atol=1e-12)
+
+
+def rotation_angles(poses):
+    """About a wheel's own axle [rad]."""
+    return 2.0 * np.arctan2(np.hypot(poses[:, 3], poses[:, 4]), np.hypot(poses[:, 5], poses[:, 6]))
+
+
+@pytest.mark.parametrize("angle", [-90.0, -30.0, 0.0, 45.0, 90.0])
+def test_a_slip_angle_turns_the_wheel_and_not_its_travel(angle):
+    scene = wheel(bed=WIDE, slip_angle=angle, slip=0.25, settle=0.0, duration=1.0)
+    poses = scene.body_poses()
+    np.testing.assert_allclose(poses[-1, :2] - poses[0, :2], [0.075, 0.0], atol=1e-12)
+    axle = np.tile([0.0, 1.0, 0.0], (len(poses), 1))
+    a = math.radians(angle)
+    np.testing.assert_allclose(
+        rotate(poses[:, 3:], axle), np.tile([-np.sin(a), np.cos(a), 0.0], (len(poses), 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(rotation_angles(poses)[-1], 0.1 / 0.06, atol=1e-12)
+    # A force along its heading and one along its axle are found again, exactly.
+    own = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    turn = scene.poses_at(np.zeros(1))[0, 3:]
+    np.testing.assert_allclose(along_and_across(scene.to_dict(), rotate(turn, own)), own, atol=1e-15)
+    assert (asymmetry(scene) is None) == (angle == 0.0)
+
+
+WIDE = Bed(size=(0.30, 0.24, 0.08), spacing=0.02, particles_per_cell=4.0, headroom=0.1)
+
+
+def turned(angle, **kw):
+    """Forces and torques along 5 cm of travel, and in its last part their means in the wheel's own axes."""
+    values = {"bed": WIDE, "slip_angle": angle, "travel_speed": 0.2, "settle": 0.1, "duration": 0.35} | kw
+    scene = wheel(**values)
+    frames = list(Solver(scene, effects_for(scene)[0], precision="float64").frames())
+    force, torque = (np.array([getattr(f, k) for f in frames]) for k in ("force", "torque"))
+    means = [along_and_across(scene.to_dict(), a[-8:].mean(axis=0)) for a in (force, torque)]
+    return force, torque, *means
+
+
+def test_a_wheel_turned_the_other_way_feels_the_mirrored_forces():
+    one, moment, _, _ = turned(40.0, rim_speed=0.05)
+    other, counter, _, _ = turned(-40.0, rim_speed=0.05)
+    assert one[:, 1].max() > 1.0
+    np.testing.assert_allclose(other, one * [1, -1, 1], atol=1e-6 * np.abs(one).max())
+    np.testing.assert_allclose(counter, moment * [-1, 1, -1], atol=1e-6 * np.abs(moment).max())
+
+
+def test_a_locked_wheel_pushed_sideways_is_a_blade():
+    """Soil pushes it along its axle only; by symmetry it neither pulls nor turns it about the axle."""
+    _, _, (pull, lateral, vertical), (_, drive, _) = turned(90.0, rim_speed=0.0)
+    assert lateral > 0.5 * vertical > 0.0
+    assert abs(pull) < 1e-6 * lateral
+    assert abs(drive) < 1e-6 * lateral
+
+
+def test_a_locked_wheel_is_held_back_more_than_one_that_rolls():
+    _, _, locked, braking = turned(0.0, rim_speed=0.0)
+    _, _, rolling, _ = turned(0.0, rim_speed=0.2)
+    assert locked[0] < -0.1 * locked[2] < rolling[0]
+    assert braking[1] > 0.0  # the soil would turn it
+
+
+def test_a_load_over_time_is_carried():
+    """The vertical force at rest follows it; the mass is that of the largest."""
+    loads = ((0.0, 40.0), (0.6, 40.0), (0.7, 80.0))
+    scene = wheel(load=loads, start=0.5, settle=1.2)
+    assert scene.axle.mass * 9.81 == pytest.approx(80.0)
+    assert Scene.from_dict(scene.to_dict()) == scene
+    force = np.array([f.force[2] for f in Solver(scene).frames()])
+    assert force[18:36].mean() == pytest.approx(40.0, rel=0.02)
+    assert force[54:72].mean() == pytest.approx(80.0, rel=0.02)
+
+
+def test_a_load_over_time_drives_a_free_fall():
+    """Half the load of its mass: half of gravity."""
+    fall = {"clearance": 0.05, "damping": 0.0, "settle": 1.0 / 12.0}
+    full, half = (
+        [f.body_pose[2] for f in Solver(wheel(load=load, **fall)).frames()]
+        for load in (60.0, ((0.0, 30.0), (1.0, 30.0), (2.0, 60.0)))
+    )
+    assert full[0] - full[-1] == pytest.approx(2.0 * (half[0] - half[-1]), rel=1e-12)
+
+
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_free_fall_of_a_wheel_is_exact(precision):
     """Symplectic Euler, in double precision whatever the solver's: z falls by g dt^2 n (n + 1) / 2."""
@@ -354,6 +457,15 @@ def test_a_wheels_summary_leaves_the_settling_out():
     force[7:], torque[7:, 1] = [2.0, 0.0, 60.0], -0.5
     words = scene.summary(force, torque, poses)
     assert "drawbar pull 2.00 N, vertical force 60.00 N" in words
+    assert "torque -0.500 N m" in words
+
+
+def test_the_summary_of_a_turned_wheel_is_in_its_own_axes():
+    scene = wheel(bed=WIDE, slip_angle=90.0, settle=0.1, duration=0.2)
+    poses = scene.body_poses()
+    force, torque = np.tile([-7.0, 2.0, 60.0], (len(poses), 1)), np.tile([0.5, 0.0, 0.0], (len(poses), 1))
+    words = scene.summary(force, torque, poses)
+    assert "drawbar pull 2.00 N, lateral force 7.00 N, vertical force 60.00 N" in words
     assert "torque -0.500 N m" in words
 
 

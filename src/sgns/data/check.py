@@ -47,7 +47,9 @@ QUATERNION_TOLERANCE = 1e-5
 """How far a quaternion's length may be from 1."""
 INTERVAL_TOLERANCE = 1e-2
 """How far the time between frames may be from 1 / frame_rate, as a share of it."""
-_SCENE_NUMBERS = "depth speed rake diameter width grouser_height load slip friction_angle gravity".split()
+_SCENE_NUMBERS = (
+    "depth speed rake diameter width grouser_height slip slip_angle friction_angle gravity".split()
+)
 _BLADE_NUMBERS = ("thickness", "width", "length")
 
 
@@ -123,6 +125,9 @@ def _check_attributes(file: h5py.File) -> Iterator[str]:
 def scene_problems(scene: Mapping[str, Any]) -> list[str]:
     """Values of a scene that are not the numbers which others calculate with, in words; what is not there is none."""
     found = [(key, scene[key]) for key in _SCENE_NUMBERS if scene.get(key) is not None]
+    load = scene.get("load")
+    for row in load if isinstance(load, list) else [load]:
+        found += [("load", value) for value in (row if isinstance(row, list) else [row]) if value is not None]
     blade = scene.get("blade")
     if blade is not None:
         if not isinstance(blade, Mapping):

@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 
 from mpm_warp import State
+from mpm_warp.scenes import along_and_across
 from sgns.config import UserError, parse_yaml
 from sgns.data.files import one_line
 from sgns.data.hdf5 import BROKEN, own_attribute, own_dataset, own_object
@@ -178,7 +179,8 @@ class Run:
 
     def forces(self) -> pandas.DataFrame:
         """Force [N], torque [N m] and pose of every frame as a table: columns Fx Fy Fz, Tx Ty Tz, x y z [m] and qx qy
-        qz qw, by `time` [s]. Needs pandas.
+        qz qw, by `time` [s]; for a wheel also `pull` along its heading, `lateral` along its axle [N], and `drive`, the
+        torque about its axle [N m]. Needs pandas.
 
         Raises:
             UserError: pandas is not installed.
@@ -186,7 +188,12 @@ class Run:
         pd = library("pandas", "run.forces()")
         columns = [f"{name}{axis}" for name in "FT" for axis in AXES] + POSE
         values = np.hstack([self.force, self.torque, self.pose])
-        return pd.DataFrame(values, index=pd.Index(self.time, name="time"), columns=columns)
+        table = pd.DataFrame(values, index=pd.Index(self.time, name="time"), columns=columns)
+        scene = self.scene
+        if scene.get("kind") == "wheel":
+            table["pull"], table["lateral"], _ = along_and_across(scene, self.force).T
+            table["drive"] = along_and_across(scene, self.torque)[:, 1]
+        return table
 
     def to_xarray(self, frames: slice | int | list[int] | np.ndarray = slice(None)) -> xarray.Dataset:
         """The chosen frames with named dimensions, in memory: `position` and `velocity` (time, particle, axis), `force`

@@ -50,9 +50,9 @@ def body_triangles(run: Any, frame: int) -> np.ndarray:
 def body_silhouette(run: Any, frame: int, axes: tuple[int, int] = (0, 2)) -> list[np.ndarray]:
     """Polygons (k, 2) [m] whose union is the body seen along the axis that is not in `axes`; from the side by default.
 
-    The circle of the scene's wheel, the triangles of a mesh, else the hull of the body's corners.
+    The circle of the scene's wheel if that is not turned, the triangles of a mesh, else the hull of the body's corners.
     """
-    if is_wheel(run.scene) and axes == (0, 2):
+    if is_wheel(run.scene) and axes == (0, 2) and not run.scene.get("slip_angle"):
         return [run.pose[frame, [0, 2]] + circle(float(run.scene["diameter"]), 64)]
     if is_mesh(run):
         seen = body_triangles(run, frame)[..., axes]

@@ -18,7 +18,9 @@ from sgns.model.features import is_wheel
 
 def forward_force(scene: Mapping[str, Any]) -> tuple[str, float]:
     """Name of the forward force and the sign that F_x is reported with."""
-    return ("drawbar pull Fx", 1.0) if is_wheel(scene) else ("draft −Fx", -1.0)
+    if is_wheel(scene):
+        return "push along the travel Fx" if scene.get("slip_angle") else "drawbar pull Fx", 1.0
+    return "draft −Fx", -1.0
 
 
 # Both runs are files of the same kind and are read in chunks of frames, so memory does not grow with the length

@@ -71,9 +71,10 @@ def describe(scene: Mapping[str, Any]) -> str:
         depth, speed, rake, motion = (scene[key] for key in ("depth", "speed", "rake", "motion"))
         return f"{100 * depth:.3g} cm deep, {100 * speed:.3g} cm/s, rake {rake:.3g}°, {motion} motion"
     if all(key in scene for key in ("diameter", "load", "slip")):
-        words = (
-            f"{100 * scene['diameter']:.3g} cm wheel, {scene['load']:.3g} N, slip {100 * scene['slip']:.3g} %"
-        )
+        load, turned = scene["load"], scene.get("slip_angle")
+        words = f"{100 * scene['diameter']:.3g} cm wheel, "
+        words += "load over time" if isinstance(load, list) else f"{load:.3g} N"
+        words += f", slip {100 * scene['slip']:.3g} %" + (f", slip angle {turned:.3g}°" if turned else "")
         angle, gravity = scene.get("friction_angle"), scene.get("gravity")
         words += "" if angle is None else f", friction angle {angle:.3g}°"
         return words + ("" if gravity is None else f", gravity {gravity:.3g} m/s²")

@@ -178,7 +178,17 @@ def nearest_rigid(reference: Tensor, points: Tensor) -> Tensor:
 
 def varying_context(runs: Sequence[ReducedRun], candidates: Sequence[str]) -> list[str]:
     """Those of the candidates, keys of the scene such as `load` or `material.friction_angle`, whose numbers differ
-    between runs: a constant tells nothing."""
+    between runs: a constant tells nothing.
+
+    Raises:
+        UserError: runs have different loads over time, which are no numbers.
+    """
+    loads = [run.scene.get("load") for run in runs]
+    if any(isinstance(load, list) for load in loads) and any(load != loads[0] for load in loads):
+        raise UserError(
+            "the training runs have different scene.load over time, which a model cannot be told; give each run a "
+            "constant scene.load, or all runs the same"
+        )
     values = {key: {_value(run.scene, key) for run in runs} for key in candidates}
     return [
         key
