@@ -43,6 +43,8 @@ def test_panels_show_units_and_the_sinkage_of_a_wheel(tmp_path):
         labels = [panel.label for panel in plot.curves(run)]
     assert labels[0] == "drawbar pull Fx [N]" and labels[-1] == "sinkage [mm]"
     assert all(label.endswith("]") for label in labels)
+    with Run(make_run(tmp_path / "turned.h5", n=100, scene=WHEEL | {"slip_angle": 30.0})) as run:
+        assert plot.curves(run)[0].label == "forward Fx [N]"
 
 
 def test_a_moving_picture_plays_in_real_time(run_file, tmp_path):

@@ -19,7 +19,7 @@ from sgns.model.features import is_wheel
 def forward_force(scene: Mapping[str, Any]) -> tuple[str, float]:
     """Name of the forward force and the sign that F_x is reported with."""
     if is_wheel(scene):
-        return "push along the travel Fx" if scene.get("slip_angle") else "drawbar pull Fx", 1.0
+        return "forward Fx" if scene.get("slip_angle") else "drawbar pull Fx", 1.0
     return "draft −Fx", -1.0
 
 

@@ -143,6 +143,14 @@ BOX = CORNERS, np.array([[f[0], f[k], f[k + 1]] for f in FACES for k in (1, 2)])
 TOOL = {"tool": {"shape": "mesh", "file": "/etc/passwd", "digest": "0123"}}
 
 
+def test_a_load_is_a_number_or_rows_of_numbers(tmp_path):
+    for load, wrong in ((5.0, 0), ([[0.0, 5.0], [1.0, 6.0]], 0), ("much", 1)):
+        found = check_run(make_run(tmp_path / "a.h5", scene={"load": load}))
+        assert sum("scene.load" in words for words in found) == wrong
+    found = check_run(make_run(tmp_path / "a.h5", scene={"load": [[0.0, float("nan")]]}))
+    assert any("scene.load is nan, not a finite number" in words for words in found)
+
+
 def mesh_run(path, mesh=BOX, scene=TOOL):
     """A run of two frames whose tool is a box."""
     with make_writer(path, n=3, m=2, scene=scene, mesh=mesh) as writer:

@@ -87,6 +87,16 @@ def test_a_table_of_forces_has_named_columns(tmp_path):
         np.testing.assert_array_equal(table.loc[:, "x":], run.pose)
 
 
+def test_a_table_of_a_wheel_has_its_own_axes_too(tmp_path):
+    """Turned by 30 degrees: forces and torque along its heading and along its axle."""
+    with Run(make_run(tmp_path / "a.h5", scene={"kind": "wheel", "slip_angle": 30.0})) as run:
+        table, force, torque = run.forces(), run.force, run.torque
+    c, s = np.sqrt(0.75), 0.5
+    np.testing.assert_allclose(table.pull, c * force[:, 0] + s * force[:, 1])
+    np.testing.assert_allclose(table.lateral, c * force[:, 1] - s * force[:, 0])
+    np.testing.assert_allclose(table.drive, c * torque[:, 1] - s * torque[:, 0])
+
+
 def test_xarray_knows_dimensions_by_name(tmp_path):
     with Run(make_run(tmp_path / "a.h5")) as run:
         found = run.to_xarray([0, -1])

@@ -211,6 +211,8 @@ def test_description_and_file_name():
     assert describe(scene) == "5 cm deep, 10 cm/s, rake 3.8°, curved motion"
     wheel = {"diameter": 0.15, "load": 100.0, "slip": 0.4, "friction_angle": 30.0, "gravity": 3.72}
     assert describe(wheel) == "15 cm wheel, 100 N, slip 40 %, friction angle 30°, gravity 3.72 m/s²"
+    turned = wheel | {"slip_angle": 60.0, "load": [[0.0, 1.0], [1.0, 2.0]]}
+    assert describe(turned).startswith("15 cm wheel, load over time, slip 40 %, slip angle 60°, friction")
     assert describe({"kind": "bed"}) == ""
     assert picture("../a b/ü.h5", "", "", Figure()).name == "-a-b-h5"
 

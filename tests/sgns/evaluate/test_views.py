@@ -238,6 +238,14 @@ def test_a_wheel_is_its_rims_and_from_the_side_a_circle():
     assert np.linalg.norm(body_silhouette(run, 0)[0] - REST[0, [0, 2]], axis=1) == pytest.approx(0.075)
 
 
+def test_a_turned_wheel_is_from_the_side_as_wide_as_it_is_thick():
+    """Pushed sideways it is a box of its width and height; from above it is turned the same way."""
+    scene = Wheel(diameter=0.15, width=0.08, slip_angle=90.0)
+    run = SimpleNamespace(scene=scene.to_dict(), pose=scene.body_poses()[:1])
+    for axes, size in (((0, 2), [0.08, 0.15]), ((0, 1), [0.08, 0.15])):
+        assert np.ptp(body_silhouette(run, 0, axes)[0], axis=0) == pytest.approx(size)
+
+
 def test_a_blade_is_its_box(pair):
     run = pair[0]
     corners = body_corners(run, 3)

@@ -1,6 +1,7 @@
 """The graph: which edges, and what is written on nodes and edges."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from sgns.model.features import (
     markers,
     slowest_travel,
     step_frames,
+    varying_context,
 )
 from sgns_testing.runs import random_poses
 
@@ -90,6 +92,17 @@ def test_a_number_is_told_whatever_its_type(number) -> None:
 def test_what_is_no_finite_number_is_named(bad) -> None:
     with pytest.raises(UserError, match=r"load .*(must be finite|needs)|no number load"):
         context_of({"load": bad}, ["load"])
+
+
+def test_different_loads_over_time_are_refused_in_words() -> None:
+    """A model can be told a number only; the same load over time in every run tells nothing."""
+    rows = [[0.0, 10.0], [1.0, 20.0]]
+    same, other = (SimpleNamespace(scene={"load": load, "slip": 0.2}) for load in (rows, 10.0))
+    assert varying_context([same, same], ["load", "slip"]) == []
+    with pytest.raises(
+        UserError, match=r"different scene.load over time.*give each run a constant scene.load"
+    ):
+        varying_context([same, other], ["load"])
 
 
 # --- When soil takes a step: with the tool, with the clock, not at all ------------------------------------
