@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from .bed import PADDING
 from .poses import rotation_matrices
 from .scene import Scene
-from .tool_geometry import place_unit, size_warning, time_warning
+from .tool_geometry import Odd, odd_size, odd_times, place_unit
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class Preview:
     """Particles left out because the tool is where they would be at the start."""
     warnings: tuple[str, ...] = ()
     """What a user should know."""
+    not_meant: tuple[str, ...] = ()
+    """Those of the warnings after which the run would come to nothing: numbers in another unit. Commands refuse it."""
     lines: tuple[str, ...] = ()
     """What the tool does, in words."""
 
@@ -41,7 +44,7 @@ class Preview:
         """Of a scene; takes milliseconds."""
         body, warnings = scene.body, scene.warnings()
         if body is None:
-            return Preview(warnings=tuple(warnings))
+            return Preview(warnings=tuple(warnings), lines=tuple(_bin(scene)))
         times = scene.passing_times()
         poses, outline = scene.poses_at(times), body.outline()
         low = scene.lowest_points(poses)
@@ -51,14 +54,15 @@ class Preview:
         touching = np.flatnonzero((low < 0.0) & over)
         touch = float(times[touching[0]]) if len(touching) else None
         reach = np.stack([outline.min(axis=0), outline.max(axis=0)]) - body.path_point
-        odd_size = size_warning(outline, scene.bed.size, scene.open_sides)
-        warnings += ([odd_size] if odd_size else []) + _of_path(scene, low, touch)
+        found = [odd_size(outline, scene.bed.size, scene.open_sides), *_of_path(scene, low, touch)]
+        odd = [one for one in found if one]
+        warnings += [one.words for one in odd]
         if len(scene.displaced):
             warnings.append(
                 f"the tool is in the soil at the start, {_words(-low[0])} deep: {len(scene.displaced)} particles "
                 "that would lie inside it are left out; soil closes in on it in the first 0.2 s: let it rest so long"
             )
-        lines = [] if scene.axle is not None else _way(scene, low, times, touch)
+        lines = _bin(scene) + ([] if scene.axle is not None else _way(scene, low, times, touch))
         given = scene.path_times()
         if len(given) > 1 and given[-1] < scene.duration - 1.0 / scene.frame_rate:
             lines.append(
@@ -66,7 +70,7 @@ class Preview:
             )
         if given.size:
             sides = ", ".join(
-                f"{1e3 * a:.0f} to {1e3 * b:.0f} mm along {axis}"
+                f"{round(1e3 * a)} to {round(1e3 * b)} mm along {axis}"
                 for axis, a, b in zip("xyz", *reach, strict=True)
             )
             named = {
@@ -75,10 +79,11 @@ class Preview:
                 "tip": "tip (middle of its lowest face)",
             }
             used = getattr(body, "origin", "com")
+            places = {name: [round(1e3 * x) for x in place] for name, place in body.origins.items()}
             others = "".join(
-                f"; the {named[name]} is at ({', '.join(f'{1e3 * x:.0f}' for x in place)}) mm from the centre of mass"
-                for name, place in body.origins.items()
-                if name != "com" and np.abs(place).max() >= 5e-4
+                f"; the {named[name]} is at ({', '.join(map(str, place))}) mm from the centre of mass"
+                for name, place in places.items()
+                if name != "com" and any(place)
             )
             lines.insert(
                 0,
@@ -91,12 +96,26 @@ class Preview:
             reach=reach,
             displaced=len(scene.displaced),
             warnings=tuple(warnings),
+            not_meant=tuple(one.words for one in odd if one.sure),
             lines=tuple(lines),
         )
 
 
 def _words(length: float) -> str:
     return f"{1e3 * length:.3g} mm" if length < 1.0 else f"{length:.3g} m"
+
+
+def _bin(scene: Scene) -> list[str]:
+    """Where the walls are if the grid does not fit the bin."""
+    bed, h = scene.bed, scene.bed.spacing
+    wide = [h * (count - 1 - 2 * PADDING) for count in bed.node_counts[:2]]
+    if np.allclose(wide, bed.size[:2], rtol=1e-5):
+        return []
+    soil, walls = (f"{x:.4g} x {y:.4g} m" for x, y in (bed.size[:2], wide))
+    return [
+        f"the bin of {soil} is no whole number of grid spacings ({h:.4g} m): the soil fills {soil}, the walls stand "
+        f"{walls} apart"
+    ]
 
 
 def _way(scene: Scene, low: np.ndarray, times: np.ndarray, touch: float | None) -> list[str]:
@@ -109,30 +128,34 @@ def _way(scene: Scene, low: np.ndarray, times: np.ndarray, touch: float | None) 
     ]
 
 
-def _of_path(scene: Scene, low: np.ndarray, touch: float | None) -> list[str]:
+def _of_path(scene: Scene, low: np.ndarray, touch: float | None) -> list[Odd]:
     """One line at most on what is odd: a wrong unit explains the rest; and one where path and run end apart."""
     times = scene.path_times()
-    if len(times) and (odd := time_warning(times, scene.duration)):
+    if len(times) and (odd := odd_times(times, scene.duration)):
         return [odd]
     ends = []
     if len(times) > 1 and times[-1] > scene.duration + 1.0 / scene.frame_rate:
-        ends = [
+        words = (
             f"the run ends at {scene.duration:g} s and the path goes on to {times[-1]:.4g} s: the rest is left out; "
             f"scene.duration={times[-1]:.4g} takes it all"
-        ]
+        )
+        ends = [Odd(words)]
     return ends + _of_poses(scene, times, low, touch)
 
 
-def _of_poses(scene: Scene, times: np.ndarray, low: np.ndarray, touch: float | None) -> list[str]:
+def _of_poses(scene: Scene, times: np.ndarray, low: np.ndarray, touch: float | None) -> list[Odd]:
     if len(times) > 1 and not scene.largest_displacement(scene.times()).any():
-        return ["the tool does not move: the path's rows in the time of the run hold the same pose"]
+        return [Odd("the tool does not move: the path's rows in the time of the run hold the same pose")]
     if touch is not None or scene.axle is not None:
         return []
     unit = place_unit(scene.poses_at(times)[:, :3], scene.bed.size) if len(times) else ""
     likely = f"the positions look like {unit} and are taken as metres" if unit else ""
     if low.min() < 0.0:
-        return [f"the tool never touches soil: it stays beside the bin; {likely or 'see scene.bed.size'}"]
-    likely = likely or "z = 0 is the surface and depths are negative"
-    return [
-        f"the tool never touches soil: its lowest point stays {_words(low.min())} above the surface; {likely}"
-    ]
+        place, remedy = "it stays beside the bin", "see scene.bed.size"
+    else:
+        place = f"its lowest point stays {_words(low.min())} above the surface"
+        remedy = (
+            "z = 0 is the surface and below it the z of a path is negative; scene.depth, which is positive, counts "
+            "from scene.clearance"
+        )
+    return [Odd(f"the tool never touches soil: {place}; {likely or remedy}", bool(likely))]

@@ -23,7 +23,7 @@ from .poses import (
 )
 from .settings import Settings, build, setting, settings, short
 from .state import SceneError
-from .tool_geometry import HOLDS, distances, place_unit, size_warning, thickening
+from .tool_geometry import HOLDS, distances, odd_size, place_unit, thickening
 
 MOST_FRAMES = 1_000_000
 MOST_COURANT = 0.8
@@ -323,8 +323,8 @@ class Scene(Settings):
                 data = data | {"tool": build(MeshBody, tool, "scene.tool", partial(MeshBody.of_mesh, *mesh))}
             elif tool.get("digest"):
                 raise SceneError(
-                    "scene.tool is a mesh that was read before and does not come with these data; give it, as in "
-                    "Scene.from_dict(scene.to_dict(), scene.mesh), or leave out tool.digest to read tool.file again"
+                    "scene.tool is a mesh, which these data do not hold (nor does a checkpoint); take it from a "
+                    "run: Scene.from_dict(run.scene, run.mesh); or leave out tool.digest to read tool.file again"
                 )
         return build(Scene.classes[kind], data, "scene")
 
@@ -333,10 +333,11 @@ class Scene(Settings):
     def _check_thickness(self, body: Tool, what: str) -> None:
         """A body must be thick enough for soil to be inside before it is pushed out."""
         if body.half_thickness + self.contact_distance < HOLDS * self.bed.spacing:
-            odd = size_warning(body.outline(), self.bed.size, self.open_sides)
+            odd = odd_size(body.outline(), self.bed.size, self.open_sides)
+            remedy = odd.words if odd else "use a smaller bed.spacing (at most half the thickness is good)"
             raise SceneError(
                 f"{what} of {2.0 * body.half_thickness:g} m is too thin for a grid of {self.bed.spacing:g} m: "
-                f"soil would pass through; {odd or 'use a smaller bed.spacing (at most half the thickness is good)'}"
+                f"soil would pass through; {remedy}"
             )
 
     def _check_inside(self, body: Tool, what: str, remedy: str) -> None:
@@ -357,12 +358,13 @@ class Scene(Settings):
                 axis = int(np.argmax(outside[pose].any(axis=0)))
                 at = points[pose, np.argmax(outside[pose, :, axis]), axis]
                 allowed = (f"0 to {lx:g} m", f"0 to {ly:g} m", f"at least {-lz:g} m")[axis]
-                odd = size_warning(outline, self.bed.size, self.open_sides)
                 if self._path and (unit := place_unit(np.array(self._path)[:, 1:4], self.bed.size)):
-                    odd = f"the path's positions look like {unit} and are taken as metres"
+                    remedy = f"the path's positions look like {unit} and are taken as metres"
+                elif odd := odd_size(outline, self.bed.size, self.open_sides):
+                    remedy = odd.words
                 raise SceneError(
                     f"{what} leaves the bin at {times[some[pose]]:.3f} s: {'xyz'[axis]} = {at:.4f} m, "
-                    f"allowed {allowed} below the surface; {odd or remedy}"
+                    f"allowed {allowed} below the surface; {remedy}"
                 )
 
 

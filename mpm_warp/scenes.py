@@ -17,7 +17,7 @@ from .poses import about_y, about_z_y, rotate
 from .scene import Scene
 from .settings import same, setting, settings, short
 from .state import SceneError
-from .tool_geometry import least_thickness, size_warning, thickening, thinnest
+from .tool_geometry import least_thickness, odd_size, thickening, thinnest
 
 CUT_LENGTH = 0.4
 """Horizontal travel of the published cuts [m]."""
@@ -160,7 +160,7 @@ class Body(Scene):
 
     def warnings(self) -> list[str]:
         found, h = super().warnings(), self.bed.spacing
-        if size_warning(self.tool.outline(), self.bed.size, self.open_sides):
+        if odd_size(self.tool.outline(), self.bed.size, self.open_sides):
             return found  # which is another matter
         thickness = thinnest(self.tool, 2.0 * h)
         if thickness < 2.0 * h:

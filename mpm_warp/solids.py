@@ -125,7 +125,7 @@ def _joined(
     middle = vertices[ends[bad][0]].mean(axis=0)
     raise SceneError(
         f"tool.file: the mesh in {name} is not closed: {bad.sum()} of {len(bad)} edges do not belong to exactly two "
-        f"triangles, the first at ({', '.join(f'{x:.4g}' for x in middle)}); {_REPAIR}"
+        f"triangles, the first at ({', '.join(f'{1e3 * x + 0.0:.4g}' for x in middle)}) mm; {_REPAIR}"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -50,7 +51,13 @@ def mesh_asymmetry(body: MeshBody) -> float:
 
 def wall_thickness(body: MeshBody, most: float) -> np.ndarray:
     """How thick the mesh is below each of its triangles [m], shape (t,); infinite where there is no wall of at most
-    `most` [m]: no other side that runs along with the triangle, as at edges that taper."""
+    `most` [m]: no other side that runs along with the triangle, as at edges that taper.
+
+    A body keeps what was measured: several ask.
+    """
+    before, known = body.__dict__.get("_walls", (0.0, None))
+    if most <= before:
+        return np.where(known <= most, known, np.inf)
     device = find_device("cpu")
 
     def on_device(points: np.ndarray) -> wp.array:
@@ -68,6 +75,7 @@ def wall_thickness(body: MeshBody, most: float) -> np.ndarray:
         given = [on_device(begin), on_device(-normals), mesh.id, most, found]
         Launch(wall_kernel(), len(triangles), given, device).launch()
         thickness = np.minimum(thickness, found.numpy())
+    body.__dict__["_walls"] = most, thickness
     return thickness
 
 
@@ -114,9 +122,16 @@ _CLOCK = 1e8
 """Seconds since 1970 in the year 1973."""
 
 
-def size_warning(outline: np.ndarray, size: tuple[float, float, float], open_sides: bool) -> str | None:
+class Odd(NamedTuple):
+    """What is odd about numbers, and whether nobody can mean it: then another unit explains them."""
+
+    words: str
+    sure: bool = False
+
+
+def odd_size(outline: np.ndarray, size: tuple[float, float, float], open_sides: bool) -> Odd | None:
     """What is odd about a tool with surface points (k, 3) in a bin of `size` [m]; None if nothing is. With
-    `open_sides` it may be wider than the bin."""
+    `open_sides` it may be wider than the bin. One up to ten times as long as the bin may have a long handle."""
     kept = [0, 2] if open_sides else [0, 1, 2]
     side, room = float(np.ptp(outline, axis=0)[kept].max()), max(size[axis] for axis in kept)
     if room / _LONG <= side <= room:
@@ -125,10 +140,15 @@ def size_warning(outline: np.ndarray, size: tuple[float, float, float], open_sid
     found = f"the tool is {side:.3g} m long, {way} the bin ({room:g} m)"
     likely = _likely(_LENGTHS, lambda scale: room / _LONG <= scale * side <= room)
     if likely:
-        return f"{found}: its numbers look like {likely} and are taken as metres (of a mesh: scene.tool.unit)"
+        words = (
+            f"{found}: its numbers look like {likely} and are taken as metres (of a mesh: scene.tool.unit)"
+        )
+        return Odd(words, side > 10.0 * room)
     if room / _LONG <= 1e3 * side <= room:
-        return f"{found}: it was made a thousand times too small (of a mesh: scene.tool.unit, scale)"
-    return f"{found}; lengths are in metres"
+        return Odd(
+            f"{found}: it was made a thousand times too small (of a mesh: scene.tool.unit, scale)", True
+        )
+    return Odd(f"{found}; lengths are in metres")
 
 
 def place_unit(places: np.ndarray, size: tuple[float, float, float]) -> str:
@@ -143,22 +163,25 @@ def place_unit(places: np.ndarray, size: tuple[float, float, float]) -> str:
     return "" if (np.abs(places - middle) <= room).all() else _likely(_LENGTHS, fits)
 
 
-def time_warning(times: np.ndarray, duration: float) -> str | None:
+def odd_times(times: np.ndarray, duration: float) -> Odd | None:
     """What is odd about the times of a path's rows in a run of `duration` [s]; None if nothing is."""
     first, last = float(times[0]), float(times[-1])
     found = f"the path's times are {first:.10g} to {last:.10g}, the run's 0 to {duration:.4g} s"
     likely = _likely(_TIMES, lambda scale: 0.1 <= scale * last / duration <= 10.0)
-    likely = f"; they look like {likely} and are taken as seconds" if likely else ""
+    unit = f"; they look like {likely} and are taken as seconds" if likely else ""
     if len(times) < 2:
         return None
     if first >= _CLOCK:
-        return f"{found}: they look like those of a clock; subtract the first from all (in seconds)"
+        return Odd(
+            f"{found}: they look like those of a clock; subtract the first from all (in seconds)", True
+        )
     if first >= duration or last <= 0.0:
-        return f"{found}: the tool does not move{likely}"
+        return Odd(f"{found}: the tool does not move{unit}", bool(likely))
     if last - first > _LONG * duration:
-        return f"{found}: only the first {100.0 * (duration - first) / (last - first):.2g} % is used{likely}"
+        used = 100.0 * (duration - first) / (last - first)
+        return Odd(f"{found}: only the first {used:.2g} % is used{unit}", bool(likely))
     if _LONG * (last - first) < duration:
-        return f"{found}: the tool rests for nearly all of it; are the times in seconds?"
+        return Odd(f"{found}: the tool rests for nearly all of it; are the times in seconds?")
     return None
 
 

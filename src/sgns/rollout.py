@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +17,7 @@ import torch
 from sgns.config import UserError, differences
 from sgns.data.files import only_here
 from sgns.data.run import frame_chunks
-from sgns.data.writer import RunWriter, require_run_place
+from sgns.data.writer import RunWriter, require_new_run
 from sgns.numbers import elapsed
 
 if TYPE_CHECKING:
@@ -210,7 +211,8 @@ def rollout_scene(
 ) -> RolloutTiming:
     """Rolls a scene out from the common start at rest into a run file; warns where path or soil leave what the training
     runs covered."""
-    with single_thread():
+    with single_thread(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of the range, which is told below
         rollout = simulator.rollout(scene.body_poses(), scene.body_points(), values=scene.to_dict())
     if rollout.excess is not None and (words := rollout.excess.words()):
         log.warning("%s: forces and soil are a guess there", words)
@@ -227,11 +229,10 @@ def main(cfg: DictConfig) -> float:
     """The `sgns rollout` command; returns wall seconds per simulated second (steps with force)."""
     from mpm_warp import Preview
     from sgns.simulate.campaign import require_space, run_cost
-    from sgns.simulate.scene import scene_from_config
+    from sgns.simulate.scene import require_meant, scene_from_config
     from sgns.simulator import Simulator
 
     output = Path(cfg.output)
-    require_run_place(output)
     # First: without a checkpoint the scene is not the one that the settings were written for.
     simulator = Simulator.load(
         cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes, rate_independent=cfg.rate_independent
@@ -239,10 +240,13 @@ def main(cfg: DictConfig) -> float:
     scene = scene_from_config(cfg)
     require_same_freedom(simulator, scene, cfg.checkpoint)
     require_known_bed(simulator, scene, cfg.checkpoint)
-    for warning in Preview.of(scene).warnings:
+    preview = Preview.of(scene)
+    require_meant(preview, "sgns.Simulator.rollout takes it in Python")
+    for warning in preview.warnings:
         if warning not in scene.warnings():  # those are of the solver
             log.warning("%s", warning)
     ignored = unlearned(simulator.scene, scene.to_dict(), simulator.context_keys)
+    require_new_run(output, cfg.overwrite)
     if ignored:
         log.warning("the network follows the tool's path only; it does not know of %s", ", ".join(ignored))
     with only_here(output):

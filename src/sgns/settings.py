@@ -306,6 +306,7 @@ class Limits(Group):
     group: ClassVar[str] = "limits"
     time: float = setting(30.0, "longest time of a run on one core, estimated", "days", gt=0, le=1e6)
     disk: float = setting(1000.0, "largest size of a command's run files", "GB", gt=0, le=1e9)
+    any_unit: bool = setting(False, "true: a path or tool may look like one in another unit")
 
 
 @settings

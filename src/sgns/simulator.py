@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import math
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -27,10 +28,12 @@ from sgns.data.run import Surface, soil_surface
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step
 from sgns.model.features import ToolMotion, context_of, markers
-from sgns.model.training_range import Excess
+from sgns.model.training_range import FAR, Excess
 from sgns.numbers import check_pose, check_poses, elapsed, finite_array, first_pose, is_whole, real_array
 from sgns.reduction.basis import Basis
 
+# Every so many steps it is looked at whether the tool is far outside the training range.
+_LOOK_EVERY = 30
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
 _SETTLING = 0.5
 
@@ -47,7 +50,8 @@ class State:
         pose: Tool's centre of mass [m] and quaternion x, y, z, w, shape (7,).
     """
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return f"{short_repr(self)[:-1]}, outside={self.outside:.3g})"
 
     frame: int
     latent: np.ndarray
@@ -88,7 +92,8 @@ class Rollout:
         wall_time_s: Time of all steps, force included, decoding not [s].
     """
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return f"{short_repr(self)[:-1]}, outside={self.outside:.3g})"
 
     latent: np.ndarray
     force: np.ndarray
@@ -103,6 +108,11 @@ class Rollout:
         """How far every frame is outside the training runs' range, see `State.outside`, and in what; None: a
         predicted tool is nowhere."""
         return self._excess()
+
+    @property
+    def outside(self) -> float:
+        """The largest of all frames, as `State.outside`."""
+        return np.nan if self.excess is None else self.excess.largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +197,7 @@ class Simulator:
             tensor.cpu().numpy().copy()
             for tensor in (surrogate.start_positions, surrogate.body_points, dynamics.force.mean)
         )
+        self._warned = False
         self._start_latent = self.basis.transform(surrogate.start_positions.cpu())
         self.reset()
 
@@ -296,7 +307,26 @@ class Simulator:
         self._poses, self._motion, self._latent, self._load = poses, motion, latent, load
         self._shown = [shown, (pose, latent[0, -1].cpu().numpy().copy())]
         self._frame += 1
-        return self._state()
+        state = self._state()
+        if self._frame % _LOOK_EVERY == 1:
+            self._look(self._frame - 1, np.stack([shown[0], pose]), self._points, self._context)
+        return state
+
+    def _look(self, begin: int, poses: np.ndarray, points: np.ndarray, context: Mapping[str, float]) -> None:
+        """Warns, once, of a tool that is far outside the training range at poses (T, 7) from frame `begin` on."""
+        if self._warned:
+            return
+        latent = np.zeros((len(poses), self.num_modes, 3))
+        found = self._surrogate.training_range.excess(poses, points, latent, context, of="the tool's")
+        if found is None or not found.largest > FAR:
+            return
+        self._warned, worst = True, int(found.amount.argmax())
+        warnings.warn(
+            f"at frame {begin + worst} {found.quantity[worst]} is {found.amount[worst]:.2g} times its training range "
+            "outside of it: force and soil are a guess there (`outside` of every state and rollout says how far; this "
+            "line comes once)",
+            stacklevel=3,
+        )
 
     def _step_soil(
         self, poses: Sequence[np.ndarray], pose: np.ndarray
@@ -366,6 +396,7 @@ class Simulator:
         found = self.dynamics.follow(poses[None], points, told, latent, self._pace, given, loads)
         wall_time = elapsed(began, time.perf_counter())
         states, force, torque, poses, world = (part[0] for part in found)
+        self._look(0, poses, points, context)
         excess = partial(self._surrogate.training_range.excess, poses, points, states, context)
         return Rollout(states, force, torque, poses, world, wall_time, excess)
 

@@ -5,7 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from mpm_warp import Bed, Body, Box, Column, Excavation, MeshBody, Preview, SceneError, Walls, Wheel
+from mpm_warp import Bed, Body, Box, Column, Excavation, MeshBody, Preview, Scene, SceneError, Walls, Wheel
+from mpm_warp.kernels.signed_distance import wall_kernel
 from sgns_testing.meshes import box_corners, box_triangles
 from sgns_testing.scenes import cut
 
@@ -62,7 +63,7 @@ def test_scenes_that_come_to_something_say_no_more_than_before():
         (np.add(ROWS, [5, 0, 0, 0]), "times are 5 to 7, the run's 0 to 2 s: the tool does not move"),
         (ROWS * [1000, 1, 1, 1] + [3000, 0, 0, 0], "the tool does not move; they look like milliseconds"),
         (ROWS / [60, 1, 1, 1], "rests for nearly all of it; are the times in seconds"),
-        (np.add(ROWS, [0, 0, 0, 0.2]), "never touches soil: its lowest point stays 180 mm above the surface; z = 0 is"),
+        (np.add(ROWS, [0, 0, 0, 0.2]), "stays 180 mm above .*; z = 0 is the surface and below it .* neg"),
         (ROWS[:, [0, 1, 3, 2]], "never touches soil: its lowest point stays 250 mm above"),
         (ROWS[[0, 0, 0]] * [0, 1, 1, 1] + [[t, 0, 0, 0] for t in (0, 1, 2)], "the tool does not move"),
     ],
@@ -70,6 +71,9 @@ def test_scenes_that_come_to_something_say_no_more_than_before():
 def test_one_line_names_what_comes_to_nothing(rows, words):
     (found,) = Preview.of(body(rows)).warnings
     assert re.search(words, found), found
+    # Commands refuse what another unit explains.
+    sure = "look like" in words
+    assert Preview.of(body(rows)).not_meant == ((found,) if sure else ())
 
 
 def test_a_tool_that_starts_in_the_soil_is_told():
@@ -80,17 +84,19 @@ def test_a_tool_that_starts_in_the_soil_is_told():
 
 
 @pytest.mark.parametrize(
-    ("scale", "words"),
+    ("scale", "words", "sure"),
     [
-        (0.001, "0.0002 m long, less than 1/50 of the bin .* a thousand times too small"),
-        (8.0, "1.6 m long, longer"),
+        (0.001, "0.0002 m long, less than 1/50 of the bin .* a thousand times too small", True),
+        (8.0, "1.6 m long, longer", False),  # it may have a long handle
+        (200.0, "40 m long, longer than the bin .* look like millimetres", True),
     ],
 )
-def test_the_size_of_a_tool_is_looked_at(scale, words):
-    found, _ = Preview.of(
-        body(np.add(ROWS, [0, 0, 0, 0.5]), tool=mesh(scale))
-    ).warnings  # and touches nothing
+def test_the_size_of_a_tool_is_looked_at(scale, words, sure):
+    rows = np.add(ROWS, [0, 0, 0, 0.15 * scale])
+    preview = Preview.of(body(rows, tool=mesh(scale)))
+    found = preview.warnings[0]
     assert re.search(words, found), found
+    assert preview.not_meant[:1] == ((found,) if sure else ())
 
 
 def test_a_channel_may_be_narrower_than_the_tool():
@@ -117,3 +123,27 @@ def test_a_channel_may_be_narrower_than_the_tool():
 def test_what_is_refused_for_its_unit_names_it(make, words):
     with pytest.raises(SceneError, match=words):
         make()
+
+
+def test_walls_are_measured_once(monkeypatch):
+    """Rays through a mesh of many triangles take a while, and several ask."""
+    asked = []
+    monkeypatch.setattr("mpm_warp.tool_geometry.wall_kernel", lambda: asked.append(1) or wall_kernel())
+    fine = Bed(size=(0.8, 0.6, 0.15), spacing=0.02, particles_per_cell=8.0)
+    scene = body(ROWS - [0, 0, 0, 0.12], tool=mesh(0.4), bed=fine)  # it starts in the soil
+    assert any("thinnest part is 20 mm" in line for line in Preview.of(scene).warnings)
+    assert len(scene.displaced) and len(asked) == 7  # places in each triangle
+
+
+def test_where_the_walls_are_if_the_grid_does_not_fit_the_bin():
+    (line,) = Preview.of(Column(bed=Bed(size=(0.61, 0.6, 0.15), spacing=0.02))).lines
+    assert line.endswith("the soil fills 0.61 x 0.6 m, the walls stand 0.62 x 0.6 m apart")
+    assert Preview.of(Column()).lines == ()
+
+
+def test_a_checkpoints_scene_with_a_mesh_says_where_the_mesh_is():
+    scene = body(tool=mesh(1.0))
+    data = scene.to_dict()
+    data["tool"]["digest"] = "0123"
+    with pytest.raises(SceneError, match=r"from a run: Scene.from_dict\(run.scene, run.mesh\)"):
+        Scene.from_dict(data)

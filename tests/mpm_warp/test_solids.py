@@ -136,7 +136,9 @@ def test_an_uneven_mesh_has_its_volumes_centre():
 
 def test_what_is_no_solid_is_refused():
     vertices = box_corners(*A)
-    with pytest.raises(SceneError, match=r"not closed: 3 of 18 edges.*the first at \(.*fill_holes"):
+    with pytest.raises(
+        SceneError, match=r"not closed: 3 of 18 edges.*the first at \([\d. ,]+\) mm; .*fill_holes"
+    ):
         closed_mesh(vertices, OUT[1:], "a.stl")
     with pytest.raises(SceneError, match="encloses no volume"):
         closed_mesh(vertices * [1, 1, 0], OUT, "a.stl")

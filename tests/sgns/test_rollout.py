@@ -175,13 +175,23 @@ def test_a_rollout_holds_the_mesh_of_its_tool(simulator, tmp_path):
 def test_a_path_that_comes_to_nothing_is_told(tmp_path, monkeypatch, caplog):
     """As `sgns simulate` does, without what is about the solver only."""
     file = tmp_path / "path.csv"
-    file.write_text("t,x,y,z,qx,qy,qz,qw\n0,400,300,120,0,0,0,1\n2,500,300,30,0,0,0,1\n")
+    file.write_text("0,0.4,0.3,0.12,0,0,0,1\n2,0.5,0.3,0.1,0,0,0,1\n")
     known = SimpleNamespace(scene={}, context_keys=())
     monkeypatch.setattr(Simulator, "load", lambda *_, **__: known)
     for check in ("require_known_bed", "require_same_freedom"):
         monkeypatch.setattr(rolling, check, lambda *_: None)
     monkeypatch.setattr(rolling, "rollout_scene", lambda *_, **__: rolling.RolloutTiming(1.0, 1.0, 1.0))
     thin = ["scene=body", f"scene.path={file}", "scene.tool.size=[0.01,0.2,0.1]"]
-    rolling.main(composed(*thin, "checkpoint=a.ckpt", f"output={tmp_path / 'run.h5'}", command="rollout"))
+    cfg = composed(*thin, "checkpoint=a.ckpt", f"output={tmp_path / 'run.h5'}", command="rollout")
+    with caplog.at_level("INFO"):
+        rolling.main(cfg)
     (words,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
-    assert "the positions look like millimetres" in words
+    assert "the tool never touches soil" in words
+    assert caplog.records[-1].getMessage() == f"to look at it: sgns plot {tmp_path / 'run.h5'}"
+    # In another unit it is refused, before an output that is taken.
+    (tmp_path / "run.h5").touch()
+    with pytest.raises(UserError, match=r"run\.h5 is there already"):
+        rolling.main(cfg)
+    file.write_text("0,400,300,120,0,0,0,1\n2,500,300,30,0,0,0,1\n")
+    with pytest.raises(UserError, match="the positions look like millimetres"):
+        rolling.main(cfg)

@@ -196,12 +196,29 @@ def test_it_says_how_far_a_path_is_outside(trained, kind) -> None:
     simulator, path = trained.simulator(kind), trained.data.runs("train")[0].pose.copy()
     assert np.isnan(simulator.reset().outside)
     path[9:, 1] += 1.0
-    excess = simulator.rollout(path).excess
+    with pytest.warns(
+        UserWarning, match=r"at frame 9 the tool's displacement per frame \(y\) is .* times its train"
+    ):
+        rollout = simulator.rollout(path)
+    excess = rollout.excess
+    assert repr(rollout).endswith(f"outside={excess.largest:.3g})")
     # The network has hardly been trained: its soil leaves the range as well, but not as far.
     assert excess.amount[:9].max() < 1 < excess.amount[9:].min()
     assert excess.quantity[9] == "the tool's displacement per frame (y)"
-    told = [0.0] + [state.outside for state in stepped(simulator, path)[1:]]
+    told = [0.0] + [state.outside for state in stepped(simulator, path)[1:]]  # without a second warning
     np.testing.assert_allclose(told, excess.amount, rtol=1e-12)
+
+
+def test_a_step_far_outside_is_told_once(trained) -> None:
+    simulator, pose = trained.simulator("pose"), trained.run.pose[0].copy()
+    simulator.reset(pose)
+    pose[2] += 5.0
+    with pytest.warns(UserWarning, match=r"at frame 1 the tool's .* \(`outside` of"):
+        state = simulator.step(pose)
+    assert state.outside > 0.5 and f"outside={state.outside:.3g})" in repr(state)
+    simulator.reset()
+    for _ in range(2):
+        simulator.step(pose)
 
 
 @pytest.mark.parametrize("kind", ["pose", "points"])

@@ -34,7 +34,8 @@ class Command(NamedTuple):
         output: what its `output` is: "file", "folder", or None where it has none.
         needs: dotted keys of paths that it cannot do without.
         result: the file in a folder of output that shows that the work is finished. It is not replaced without
-            `overwrite=true`, and neither is a file of output. None where finished work is kept and gone on from.
+            `overwrite=true`. None where finished work is kept and gone on from; files of output are looked after by
+            the command, once it knows that the other settings are good.
         plain: keys that may be given as plain paths, in this order.
     """
 
@@ -52,7 +53,6 @@ COMMANDS = {
         "simulate a scene or a dataset with the material point method",
         "file",
         ("output",),
-        "",
     ),
     "reduce": Command(
         "sgns.reduction.reduce",
@@ -63,7 +63,7 @@ COMMANDS = {
     ),
     "train": Command("sgns.train.command", "learn a simulator from a dataset", "folder", ("dataset.path",)),
     "rollout": Command(
-        "sgns.rollout", "let a trained network play a scene", "file", ("checkpoint", "output"), ""
+        "sgns.rollout", "let a trained network play a scene", "file", ("checkpoint", "output")
     ),
     "evaluate": Command(
         "sgns.evaluate.command",
@@ -328,12 +328,8 @@ def _place_output(cfg: DictConfig, hydra_cfg: Any, command: Command, in_sweep: b
 
 def _require_new(cfg: DictConfig, command: Command) -> None:
     """Refuse to replace finished work that nobody asked to replace."""
-    if (
-        command.result is None
-        or cfg.overwrite
-        or (cfg.get("dataset") is not None and command.output == "file")
-    ):
-        return  # a campaign keeps what is finished
+    if command.result is None or cfg.overwrite:
+        return
     result = Path(cfg.output) / command.result
     if result.is_file():
         raise UserError(

@@ -99,6 +99,19 @@ def stopped_path(path: Path) -> Path:
     return path.with_name(f"{path.stem}.stopped{path.suffix}")
 
 
+def require_new_run(path: Path, overwrite: bool) -> None:
+    """Refuse a run's name that is not one of a run, is taken, unless `overwrite` is true, or as `require_run_place`.
+
+    Raises:
+        UserError: says what is there.
+    """
+    require_run_place(path)
+    if path.suffix.lower() != ".h5":
+        raise UserError(f"output is {path}; a run is a .h5 file: output={path.with_suffix('.h5')}")
+    if path.is_file() and not overwrite:
+        raise UserError(f"{path} is there already; choose another output, or replace it with overwrite=true")
+
+
 def require_run_place(path: Path) -> None:
     """Refuse a run's name if the run, or its frames if it stops, would destroy something else than an earlier run.
 

@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
 
 from mpm_warp.scenes import sinkage
-from sgns.data.run import SurfaceGrid, height_map
+from sgns.data.run import SurfaceGrid, height_map, particle_spacing
 from sgns.evaluate.metrics import (
     NEGLIGIBLE_SHARE,
     ParticleErrors,
@@ -98,25 +98,28 @@ def png(figure: Figure) -> bytes:
 def profile_figure(runs: Mapping[str, Any], frames: Sequence[int], grid: SurfaceGrid) -> Figure:
     """Height of the surface along the middle of the bed, a panel for each of some frames.
 
-    The two rows of columns next to mid-width are averaged. Grey: the first run at rest.
+    The two rows of columns next to mid-width are averaged. Grey: the first run at rest. As of `Run.surface`, the soil
+    reaches half a particle spacing above the highest particle.
     """
     figure, axes = charts(len(frames), 1.45 * len(frames) + 0.8, share_y=True)
-    rest = middle_line(next(iter(runs.values())), 0, grid)
+    first = next(iter(runs.values()))
+    above = 500.0 * particle_spacing(first.positions(0)[0])  # [mm]
+    rest = middle_line(first, 0, grid) + above
     for axis, frame in zip(axes, frames, strict=True):
         for name, run in runs.items():
             colour = TRUTH if name.startswith("simulated") else NETWORK
-            heights = middle_line(run, frame, grid)
+            heights = middle_line(run, frame, grid) + above
             axis.plot(grid.x_centres, heights, color=colour, label=name, marker=".", markersize=4)
             axis.set_title(f"t = {run.time[frame]:.2f} s")
         axis.plot(grid.x_centres, rest, color=BASELINE, linestyle="--", label="before")
     axes[-1].set_xlabel("x [m]")
-    figure.supylabel("highest particle [mm]", fontsize=10)
+    figure.supylabel("height z of the surface [mm]", fontsize=10)
     legend_above(figure, axes[0].get_lines(), ncols=len(runs) + 1)
     return figure
 
 
 def middle_line(run: Any, frame: int, grid: SurfaceGrid) -> np.ndarray:
-    """Surface height along x, mean over the columns next to mid-width that hold particles [mm], shape (nx,)."""
+    """Highest particle along x, mean over the columns next to mid-width that hold particles [mm], shape (nx,)."""
     heights, count = height_map(run.positions(frame)[0], grid), grid.shape[1]
     middle = np.ma.masked_invalid(heights[:, (count - 1) // 2 : count // 2 + 1])
     return 1e3 * middle.mean(axis=1).filled(np.nan)

@@ -249,7 +249,7 @@ def whole_run(evaluation: Evaluation, chosen: EvaluatedRun, label: str) -> Figur
         surface = picture(
             f"surface_{chosen.name}",
             f"{chosen.label}: surface along mid-width",
-            "Height of the highest particle of every column: black simulated, blue predicted.",
+            "Height of the surface at mid-width: black simulated, blue predicted.",
             profile_figure(runs, frames, surface_grid(evaluation.start)),
         )
     own, median = (

@@ -50,9 +50,9 @@ def nice(value: float) -> float:
     return next(step * power for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * power >= value * (1 - 1e-9))
 
 
-def upper_scale(*values: np.ndarray) -> Normalize:
-    """From zero to about the largest of the values, in whichever array it is."""
-    top = max(float(np.percentile(some, 99.5)) for some in values)
+def upper_scale(*values: np.ndarray, least: float = 0.0) -> Normalize:
+    """From zero to about the largest of the values, in whichever array it is, or to `least` if that is more."""
+    top = max(least, *(float(np.percentile(some, 99.5)) for some in values))
     return Normalize(0.0, nice(top) if top > 0.0 else 1.0)
 
 
@@ -96,6 +96,8 @@ SIDE_ARROW = 0.22
 SHORTEST_ARROW = 0.02
 
 
+# The colours of the speed reach at least so far [m/s], so that soil at rest looks at rest.
+LEAST_SPEED = 0.01
 # A view shows at most so many particles: more of them would lie on top of each other.
 MOST_PARTICLES = 20_000
 
@@ -155,7 +157,7 @@ def common_scales(runs: Sequence[Any], frames: Sequence[int], start: np.ndarray)
     top = max(min(tool + spacing, high[2] + TOOL_ABOVE), highest + 2.0 * spacing)
     strongest = max(float(np.linalg.norm(run.force[frame, [0, 2]])) for run, frame in shown)
     arrow = SIDE_ARROW * (x_limits[1] - x_limits[0]) / strongest if strongest > 0.0 else 0.0
-    speed = upper_scale(*(speeds(runs[0], frame, chosen) for frame in frames))
+    speed = upper_scale(*(speeds(runs[0], frame, chosen) for frame in frames), least=LEAST_SPEED)
     disc = spacing
     if chosen.sum() == MOST_PARTICLES:  # they take the room of those left out
         disc = max(disc, math.sqrt(3.0 * (high[0] - low[0]) * (high[2] - low[2]) / MOST_PARTICLES))
@@ -215,8 +217,10 @@ def draw_view(axis: Axes, title: str, run: Any, frame: int, scales: Scales, widt
     if size > 0.0 and silhouette:
         outline = np.concatenate(silhouette)
         head = "-|>,head_width=0.25,head_length=0.5" if size > SHORTEST_ARROW else "-"
-        foot = outline[np.argmin(outline[:, 1])]
-        draw_force(axis, run, force, foot, foot + force * scales.arrow, head=head)
+        # From the lowest point, but moved so that the head is in the picture.
+        low, high = np.transpose([scales.x_limits, scales.z_limits])
+        tip = np.clip(outline[np.argmin(outline[:, 1])] + force * scales.arrow, low, high)
+        draw_force(axis, run, force, tip - force * scales.arrow, tip, head=head, clip=False)
     axis.set(xlim=scales.x_limits, ylim=scales.z_limits, aspect="equal")
     axis.set_title(f"{title}, t = {run.time[frame]:.2f} s")
 

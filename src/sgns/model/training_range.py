@@ -19,6 +19,8 @@ from sgns.reduction.reduce import ReducedRun
 NOTEWORTHY = 0.05
 """Excess above which a path is called unlike the training runs; held-out runs of the same kind stay below it
 (experiments/stability/)."""
+FAR = 0.5
+"""Excess of a tool above which a simulator warns by itself."""
 # A component that varies less than the others of its quantity is given this share of their range as its own.
 _FLOOR = 0.1
 _AXES = ("x", "y", "z")
@@ -108,15 +110,21 @@ class TrainingRange:
         return low - margin * widths(low, high), high + margin * widths(low, high)
 
     def excess(
-        self, poses: np.ndarray, points: np.ndarray, latent: np.ndarray, context: Mapping[str, float]
+        self,
+        poses: np.ndarray,
+        points: np.ndarray,
+        latent: np.ndarray,
+        context: Mapping[str, float],
+        of: str = "",
     ) -> Excess | None:
         """How far a path of poses (T, 7), body points in the body frame (M, 3) [m] and modes (T, r, 3) [m] is outside;
-        None where the tool is nowhere. Fewer modes than those of the training are compared with the first of them."""
+        None where the tool is nowhere. Fewer modes than those of the training are compared with the first of them.
+        Quantities count whose names begin with `of`."""
         if not np.isfinite(poses).all():
             return None
         amounts, names = [], []
         found = quantities(poses, in_world_frame(poses, points), latent, context)
-        for name in self.low:
+        for name in (name for name in self.low if name.startswith(of)):
             values = found[name]
             low, high = (side[name][: values.shape[1]] for side in (self.low, self.high))
             amounts.append(np.maximum(np.maximum(low - values, values - high), 0.0) / widths(low, high))

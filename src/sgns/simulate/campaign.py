@@ -83,7 +83,7 @@ def run_cost(scene: Scene) -> RunCost:
 def cost_line(costs: Sequence[RunCost]) -> str:
     """What runs take in all, in words."""
     steps = sum(one.particle_steps for one in costs)
-    work = "" if len(costs) > 1 else f"{costs[0].particles:.3g} particles in {costs[0].steps:.3g} steps: "
+    work = "" if len(costs) > 1 else f"{costs[0].particles} particles in {costs[0].steps} steps: "
     size = size_words(sum(one.size for one in costs))
     return f"{work}about {duration_words(steps / CORE_RATE)} of one core and {size} of disk"
 

@@ -18,16 +18,17 @@ from mpm_warp import Preview, Scene
 from sgns.config import Interrupted, UserError
 from sgns.data.files import only_here
 from sgns.data.run import Run
-from sgns.data.writer import require_run_place, stopped_path
+from sgns.data.writer import require_new_run, stopped_path
 from sgns.settings import Limits
 from sgns.simulate.campaign import cost_line, plan, require_limits, require_space, run_cost
 from sgns.simulate.run import Restart, restart_from, simulate_scene, unfinished
 from sgns.simulate.scene import (
     asked_effects,
     decided,
-    decision_line,
+    effects_line,
     plain,
     recorded,
+    require_meant,
     scene_from_config,
     warning_summary,
 )
@@ -71,10 +72,10 @@ def main(cfg: DictConfig) -> float | None:
                 "dataset.where picks among runs that are there; to simulate fewer change dataset.draw"
             )
         campaign = plan(settings, base_scene(settings), asked, cfg.solver.precision, cfg.seed)
-        for line in warning_summary(campaign.scenes):
+        limits = Limits.from_dict(plain(cfg.limits))
+        for line in warning_summary(campaign.scenes, limits.any_unit):
             log.warning("%s", line)
         batch = 1 if cfg.device == "cpu" else cfg.solver.batch
-        limits = Limits.from_dict(plain(cfg.limits))
         share = {"shard": cfg.shard, "shards": cfg.shards}
         simulate_campaign(campaign, device=cfg.device, batch=batch, limits=limits, **share)
         return None
@@ -82,13 +83,14 @@ def main(cfg: DictConfig) -> float | None:
         raise UserError("shard and shards divide the runs of a dataset; give dataset=... or leave them out")
     scene = scene_from_config(cfg)
     preview = Preview.of(scene)
+    if not Limits.from_dict(plain(cfg.limits)).any_unit:
+        require_meant(preview, "limits.any_unit=true")
     for line in preview.lines:
         log.info("%s", line)
     for warning in preview.warnings:
         log.warning("%s", warning)
     effects, decisions = decided(scene, asked)
-    for name, decision in decisions.items():
-        log.info("%s", decision_line(name, decision))
+    log.info("%s", effects_line([decisions]))
     reasons, precision = recorded(decisions), cfg.solver.precision
     return simulate_one(scene, cfg, effects=effects, reasons=reasons, seed=cfg.seed, precision=precision)
 
@@ -105,7 +107,7 @@ def simulate_one(scene: Scene, cfg: DictConfig, restart: Restart | None = None, 
     """Simulate a scene into `cfg.output` with a bar and a few words about it; see `scene_stages`."""
     output = Path(cfg.output)
     with only_here(output):
-        require_run_place(output)
+        require_new_run(output, bool(cfg.get("overwrite")))
         if restart is None and not cfg.get("overwrite"):
             same = {name: settings[name] for name in ("effects", "seed", "precision")}
             restart = unfinished(output, scene, **same)

@@ -9,7 +9,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,16 +17,18 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from scipy.interpolate import PchipInterpolator
 
-from mpm_warp import Bed, Decision, Effects, Preview, Scene, Tolerances, effects_for
+from mpm_warp import Bed, Decision, Effects, Preview, Scene, SceneError, Tolerances, effects_for
 from mpm_warp.bodies import Tool
 from mpm_warp.inputs import read_text
 from mpm_warp.poses import rotation_matrices
+from mpm_warp.settings import short
 from sgns.config import UserError, flattened
 
 # --- From conf to a scene of mpm_warp -------------------------------------------------------------------
 
 _MOST_BYTES = 1 << 26
 """Of a path file: a minute in steps of a millisecond takes a tenth of that."""
+_COLUMNS = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 
 
 def scene_from_config(cfg: DictConfig) -> Scene:
@@ -36,9 +38,16 @@ def scene_from_config(cfg: DictConfig) -> Scene:
 
 def scene_from_data(data: dict[str, Any]) -> Scene:
     """A scene from nested data, in which `path` may be the name of a file."""
-    if isinstance(data.get("path"), str):
-        data = {**data, "path": read_path(Path(data["path"]))}
-    return Scene.from_dict(data)
+    if not isinstance(data.get("path"), str):
+        return Scene.from_dict(data)
+    file = Path(data["path"])
+    rows = _rows_by_line(file)
+    lines = list(rows)
+    try:
+        return Scene.from_dict({**data, "path": list(rows.values())})
+    except SceneError as error:  # its rows are lines of the file
+        words = re.sub(r"\brow (\d+)", lambda row: f"line {lines[int(row[1]) - 1]} of {file}", str(error))
+        raise SceneError(words) from None
 
 
 def plain(group: DictConfig) -> dict[str, Any]:
@@ -66,35 +75,48 @@ def read_path(file: Path) -> list[list[float]]:
     A first line with these names may be there or not. Blank lines, commas at the end of a line and what stands behind
     a # are left out.
     """
-    wanted = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
-    values: list[list[float]] = []
-    number, first = 0, True
+    return list(_rows_by_line(file).values())
+
+
+def _rows_by_line(file: Path) -> dict[int, list[float]]:
+    """As `read_path`, by the number of the line."""
+    values: dict[int, list[float]] = {}
+    first, rows = True, csv.reader([])
     try:
         rows = csv.reader(io.StringIO(read_text(file, _MOST_BYTES), newline=""))
-        for number, cells in enumerate(rows, start=1):
+        for cells in rows:
             row = _without_comment(cells)
             if not row:
                 continue
-            if not first or _is_number(row[0]):
-                if len(row) != len(wanted):
-                    raise UserError(
-                        f"scene.path: line {number} of {file} has {len(row)} values instead of {len(wanted)}"
-                    )
-                if not all(map(_is_number, row)):
-                    raise UserError(
-                        f"scene.path: line {number} of {file} holds something that is not a number"
-                    )
-                values.append([float(v) for v in row])
-            elif [name.lower() for name in row] != wanted:
-                raise UserError(f"scene.path: the first line of {file} must be {','.join(wanted)}")
+            if len(row) == len(_COLUMNS) and all(map(_is_number, row)):
+                values[rows.line_num] = [float(value) for value in row]
+            elif not first or [name.lower() for name in row] != _COLUMNS:
+                raise UserError(_not_a_row(file, rows.line_num, row, first))
             first = False
     except csv.Error as error:
-        raise UserError(f"scene.path: cannot read {file} after line {number}: {error}") from None
+        raise UserError(f"scene.path: cannot read {file} after line {rows.line_num}: {error}") from None
     except (OSError, ValueError) as error:
         raise UserError(f"scene.path: cannot read {file}: {error}") from None
     if first:
-        raise UserError(f"scene.path: {file} is empty; it needs rows {','.join(wanted)}")
+        raise UserError(f"scene.path: {file} is empty; it needs rows {','.join(_COLUMNS)}")
     return values
+
+
+def _not_a_row(file: Path, number: int, row: list[str], first: bool) -> str:
+    """What is wrong with a line of a path."""
+    text, names = ",".join(row), [name.lower() for name in row]
+    begin = f"scene.path: line {number} of {file} is {short(text)}"
+    for mark, words in ((";", "semicolons"), ("\t", "tabs"), (None, "spaces")):
+        if len(row) < len(_COLUMNS) <= len(text.split(mark)):
+            return f"{begin}: its values have {words} between them; they need commas (and points in 0.5)"
+    if not first or _is_number(row[0]):
+        if len(row) != len(_COLUMNS):
+            return f"{begin}: {len(row)} values instead of {len(_COLUMNS)}: {','.join(_COLUMNS)}"
+        return f"{begin}: {next(cell for cell in row if not _is_number(cell))!r} is not a number"
+    missing = [name for name in _COLUMNS if name not in names]
+    if not missing:
+        return f"{begin}: the columns must stand in this order, and no others: {','.join(_COLUMNS)}"
+    return f"{begin}: it lacks {', '.join(missing)}; the first line must be {','.join(_COLUMNS)}, or there is none"
 
 
 def _without_comment(cells: list[str]) -> list[str]:
@@ -113,12 +135,29 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def warning_summary(scenes: Mapping[str, Scene]) -> list[str]:
+def require_meant(preview: Preview, remedy: str, name: str = "") -> None:
+    """Refuses a scene that would come to nothing because its numbers are in another unit.
+
+    Raises:
+        UserError: what looks wrong in the scene `name`, and how to begin all the same.
+    """
+    if preview.not_meant:
+        raise UserError(f"{name}{preview.not_meant[0]}; if it is meant: {remedy}")
+
+
+def warning_summary(scenes: Mapping[str, Scene], any_unit: bool = False) -> list[str]:
     """What a user should know about the runs of a dataset before they are made, by name: one line for each kind of
-    warning, with how often it comes and the words of the first."""
+    warning, with how often it comes and the words of the first.
+
+    Raises:
+        UserError: a run would come to nothing because its numbers are in another unit, unless `any_unit` is true.
+    """
     found: dict[str, list[str]] = {}
     for name, scene in scenes.items():
-        for words in Preview.of(scene).warnings:
+        preview = Preview.of(scene)
+        if not any_unit:
+            require_meant(preview, "limits.any_unit=true", f"{name}: ")
+        for words in preview.warnings:
             found.setdefault(re.sub(r"[\d.e+-]*\d", "", words), []).append(f"{name}: {words}")
     lines = [f"{len(every)} of {len(scenes)} runs, such as {every[0]}" for every in found.values()]
     if len({scene.arrangement_hash for scene in scenes.values()}) > 1:
@@ -155,23 +194,21 @@ def recorded(decisions: Mapping[str, Decision]) -> dict[str, dict[str, Any]]:
     return {name: decision._asdict() for name, decision in decisions.items()}
 
 
-def decision_line(name: str, decision: Decision) -> str:
-    """A decision for people to read."""
-    return f"{name} {'on' if decision.on else 'off'}: {decision.reason}"
-
-
-def decision_summary(every: Iterable[Mapping[str, Decision]]) -> list[str]:
-    """One line for each effect over all runs of a dataset: how often it is on, and the most frequent reason."""
-    lines, every = [], list(every)
+def effects_line(every: Sequence[Mapping[str, Decision]]) -> str:
+    """The effects of all runs of a dataset, or of one run, in a line: what is on; and why, where a number decided it,
+    where it is another in some runs, and where it was asked for against it."""
+    on, told = [], []
     for name in every[0]:
         made = [decisions[name] for decisions in every]
-        on = sum(decision.on for decision in made)
-        if on in (0, len(made)):
-            lines.append(f"{decision_line(name, made[0])}{' (the first run)' if len(made) > 1 else ''}")
-        else:
+        first, count = made[0], sum(decision.on for decision in made)
+        if 0 < count < len(made):
             reasons = Counter(decision.reason for decision in made if not decision.on)
-            lines.append(f"{name} on in {on} of {len(made)} runs; else off: {reasons.most_common(1)[0][0]}")
-    return lines
+            told.append(f"{name} on in {count} of {len(made)} runs; else off: {reasons.most_common(1)[0][0]}")
+        elif first.reason.startswith("asked for; auto") or (first.on and first.number is not None):
+            told.append(f"{name} {'on' if first.on else 'off'}: {first.reason}")
+        elif first.on:
+            on.append(name)
+    return "; ".join([f"effects on: {', '.join(on) or 'no others'}", *told, "the run file has every reason"])
 
 
 # --- Tool paths drawn by chance, to simulate and to train on --------------------------------------------

@@ -41,7 +41,7 @@ from sgns.simulate.campaign import (
     size_words,
 )
 from sgns.simulate.run import Restart, scene_stages, unfinished
-from sgns.simulate.scene import decision_summary, recorded
+from sgns.simulate.scene import effects_line, recorded
 
 log = logging.getLogger(__name__)
 
@@ -95,8 +95,7 @@ def simulate_campaign(
     log.info("dataset %s in %s: %s, %d to do", campaign.name, campaign.path, total, len(missing))
     if not missing:
         return
-    for line in decision_summary(physics[name][1] for name in missing):
-        log.info("%s", line)
+    log.info("%s", effects_line([physics[name][1] for name in missing]))
     size = sum(costs[name].size for name in missing)
     waiting = {name: costs[name] for name in missing}
     log.info("%s", cost_line(list(waiting.values())))

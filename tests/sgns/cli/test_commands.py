@@ -177,9 +177,9 @@ def test_bad_input_gives_one_line_and_leaves_nothing(
 @pytest.mark.parametrize(
     ("rows", "part"),
     [
-        ("1,0.2,nan,0.15,0,0,0,1", "not finite in row 2, column 3"),
-        ("1,0.2,0.3", "line 3 of path.csv has 3 values"),
-        ("1,left,0.3,0.15,0,0,0,1", "line 3 of path.csv holds something that is not a number"),
+        ("1,0.2,nan,0.15,0,0,0,1", "not finite in line 3 of path.csv, column 3"),
+        ("1,0.2,0.3", "line 3 of path.csv is '1,0.2,0.3': 3 values instead of 8"),
+        ("1,left,0.3,0.15,0,0,0,1", "'left' is not a number"),
     ],
 )
 def test_a_bad_blade_path_gives_one_line_and_leaves_nothing(rows: str, part: str, empty_folder: Path) -> None:

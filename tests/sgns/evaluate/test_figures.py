@@ -10,7 +10,7 @@ from tensorboard.summary.writer.record_writer import masked_crc32c
 from torch.utils.tensorboard import SummaryWriter
 
 from sgns.config import UserError
-from sgns.data.run import Run, surface_grid
+from sgns.data.run import Run, particle_spacing, surface_grid
 from sgns.evaluate import figures
 from sgns.evaluate.command import read_log
 from sgns.evaluate.figures import (
@@ -57,6 +57,9 @@ def test_profile(truth, prediction):
     grid = surface_grid(truth.positions(slice(0, 1))[0])
     figure = figures.profile_figure({"simulated (MPM)": truth, "network": prediction}, [4, 9, 14], grid)
     assert [len(axis.lines) for axis in figure.axes] == [3, 3, 3]
+    # As of `Run.surface`: half a particle spacing above the highest particle.
+    rest = figures.middle_line(truth, 0, grid) + 500.0 * particle_spacing(truth.positions(0)[0])
+    np.testing.assert_allclose(figure.axes[0].lines[2].get_ydata(), rest)
     pixels(figure)
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from mpm_warp.scenes import Wheel, sinkage
-from sgns.data.run import Run
+from sgns import plot
+from sgns.data.run import Run, particle_spacing
 from sgns.evaluate import figures
 from sgns.evaluate.body_shape import (
     CAMERA,
@@ -22,8 +23,10 @@ from sgns.evaluate.body_shape import (
     simpler,
 )
 from sgns.evaluate.views import (
+    LEAST_SPEED,
     MOST_PARTICLES,
     common_scales,
+    draw_view,
     latent_path,
     middle_slice,
     nice,
@@ -294,3 +297,30 @@ def test_a_mesh_of_very_many_triangles_is_made_simpler_and_looks_the_same():
 def test_a_view_shows_a_bounded_number_of_particles():
     bed = np.random.default_rng(0).uniform(size=(3 * MOST_PARTICLES, 3)) * [1.0, 0.01, 1.0]
     assert middle_slice(bed).sum() == MOST_PARTICLES
+
+
+def test_a_force_that_points_out_of_the_picture_is_drawn_in_it(pair):
+    """From the foot of the tool downwards: matplotlib leaves an arrow out whose head is outside."""
+    run, down = pair[0], np.tile([0.0, 0.0, -1000.0], (20, 1))
+    scales = common_scales([run], [10], run.positions(0)[0].astype(float))._replace(arrow=1e-3)
+    axis = figures.new_figure(4.0, 3.0).subplots()
+    draw_view(axis, "run", changed(run, force=down), 10, scales, 4.0)
+    (arrow,) = (text for text in axis.texts if getattr(text, "arrow_patch", None))
+    assert scales.z_limits[0] <= arrow.xy[1] <= scales.z_limits[1] and arrow.get_annotation_clip() is False
+    assert arrow.xyann[1] - arrow.xy[1] == pytest.approx(1.0)
+
+
+def test_soil_at_rest_looks_at_rest(pair):
+    """Its jitter does not set the colours."""
+    run, start = pair[0], pair[0].positions(0)[0].astype(float)
+    still = changed(
+        run, positions=lambda _: run.positions(0) + 1e-4, velocities=lambda _: 1e-4 * run.velocities(0)
+    )
+    assert common_scales([still], [1], start).speed.vmax == LEAST_SPEED
+    colours = plot.surface_figure(still, 1, start).axes[0].images[0]
+    assert colours.norm.vmax >= 2e3 * particle_spacing(start)
+
+
+def changed(run, **parts):
+    names = "positions velocities force pose scene body_points mesh time producer".split()
+    return SimpleNamespace(**{name: getattr(run, name) for name in names} | parts)

@@ -9,7 +9,7 @@ import h5py
 import pytest
 from omegaconf import OmegaConf
 
-from mpm_warp import Effects, Excavation
+from mpm_warp import Effects, Excavation, effects_for
 from mpm_warp.solver import run_concurrently
 from sgns.config import UserError
 from sgns.data.check import check_run
@@ -17,6 +17,7 @@ from sgns.data.files import only_here
 from sgns.data.run import Run
 from sgns.simulate import command as simulate
 from sgns.simulate.run import scene_stages
+from sgns.simulate.scene import effects_line
 from sgns_testing.campaigns import campaign
 from sgns_testing.commands import SHORT, sgns
 
@@ -26,6 +27,9 @@ def test_command_writes_a_complete_run(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "run.h5: 200 particles (one of every 7 recorded), 4 frames" in done.stdout
     assert "particle-steps/s" in done.stdout
+    assert done.stdout.rstrip().endswith("to look at it: sgns plot run.h5")
+    (physics,) = (line for line in done.stdout.splitlines() if "effects on" in line)
+    assert "yielding" in physics and "granular soil flows" not in physics  # the run says why
     assert check_run(tmp_path / "run.h5") == []
     with Run(tmp_path / "run.h5") as run:
         assert run.producer == "mpm"
@@ -75,3 +79,27 @@ def test_what_takes_longer_or_more_disk_than_the_limits_is_refused_before_it_beg
         assert done.returncode == 2 and words in done.stderr.splitlines()[-1], done.stderr
         assert " of one core and " in done.stdout + done.stderr
         assert not list(tmp_path.rglob("*.h5"))
+
+
+def test_other_settings_are_looked_at_before_an_output_that_is_taken(tmp_path):
+    """And a run is a .h5 file."""
+    (tmp_path / "run.h5").touch()
+    for settings, words in (
+        (["scene.depth=9", "output=run.h5"], "leaves the bin"),
+        (["output=run.h5"], "run.h5 is there already; choose another output"),
+        (["output=run.csv"], "output is run.csv; a run is a .h5 file: output=run.h5"),
+        (["output=run"], "output=run.h5"),
+    ):
+        done = sgns(tmp_path, "simulate", *SHORT, *settings)
+        assert done.returncode == 2 and words in done.stderr.splitlines()[-1], done.stderr
+    assert (tmp_path / "run.h5").stat().st_size == 0
+
+
+def test_effects_are_told_in_one_line_with_what_decided_them():
+    scene = Excavation(speed=4.0)
+    decisions = effects_for(scene, {"torque": False})[1]
+    line = effects_line([decisions])
+    assert line.startswith("effects on: yielding, separation")
+    assert "; rate_dependence on: the body moves soil at" in line
+    assert "; torque off: asked for; auto would turn it on" in line
+    assert "fluidity" not in line and "granular soil" not in line

@@ -15,7 +15,14 @@ from sgns.data.run import Run
 from sgns.rollout import require_same_freedom
 from sgns.simulate.campaign import plan
 from sgns.simulate.command import simulate_campaign
-from sgns.simulate.scene import asked_effects, decided, read_path, scene_from_config, warning_summary
+from sgns.simulate.scene import (
+    asked_effects,
+    decided,
+    read_path,
+    scene_from_config,
+    scene_from_data,
+    warning_summary,
+)
 from sgns_testing.commands import composed, sgns
 
 # --- Effects --------------------------------------------------------------------------------------------
@@ -219,12 +226,50 @@ def test_path_files_with_blank_lines_commas_and_comments(tmp_path, text):
     [
         ("", "is empty"),
         ("# nothing\n", "is empty"),
-        (f"time,x,y,z,qx,qy,qz,qw\n{ROW}\n", "the first line of .* must be t,x,y"),
-        (f"{ROW}\n\n0.5,1\n", "line 3 of .* has 2 values instead of 8"),
-        (f"{ROW}\n{ROW[:-1]}x\n", "line 2 of .* not a number"),
+        (
+            f"time,x,y,z,qx,qy,qz,qw\n{ROW}\n",
+            "line 1 of .* is 'time,x,.*: it lacks t; the first line must be t,x,y",
+        ),
+        (f"t,x,y,z\n{ROW}\n", "it lacks qx, qy, qz, qw"),
+        (f"t,x,y,z,qw,qx,qy,qz\n{ROW}\n", "is 't,x,y,z,qw,.* must stand in this order"),
+        (f"t,x,y,z,qx,qy,qz,qw,v\n{ROW}\n", "in this order, and no others"),
+        (ROW.replace(",", ";"), "line 1 of .* semicolons between them; they need commas"),
+        (f"# mine\n{ROW}\n" + ROW.replace(",", "\t"), "line 3 of .* tabs between"),
+        (f"{ROW}\n\n0.5,1\n", "line 3 of .*: 2 values instead of 8"),
+        (f"{ROW}\n{ROW[:-1]}x\n", "line 2 of .* 'x' is not a number"),
     ],
 )
 def test_path_files_it_refuses(tmp_path, text, words):
     (tmp_path / "path.csv").write_text(text)
     with pytest.raises(UserError, match=words):
         read_path(tmp_path / "path.csv")
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([f"0,{ROW[4:]}", f"0,{ROW[4:]}"], "line 5 of .*path.csv does not come after"),
+        ([ROW, "1,1,2,3,0,0,0,2"], "quaternion in line 5 of .*path.csv is not of length 1"),
+        (["0,1e14,2,3,0,0,0,1"], "line 4 of .*path.csv of the path holds"),
+    ],
+)
+def test_what_is_wrong_with_poses_is_told_by_the_line_of_the_file(tmp_path, rows, words):
+    (tmp_path / "path.csv").write_text("\n".join(["# of 3 May", "t,x,y,z,qx,qy,qz,qw", "", *rows]))
+    with pytest.raises(SceneError, match=words):
+        scene_from_data({"kind": "body", "path": str(tmp_path / "path.csv")})
+
+
+def test_numbers_in_another_unit_are_refused_before_the_run(tmp_path):
+    """And not where a person says that they are meant."""
+    (tmp_path / "path.csv").write_text("0,200,300,300,0,0,0,1\n0.1,205,300,300,0,0,0,1\n")
+    asked = ["scene=body", "scene.path=path.csv", "scene.duration=0.1", "scene.bed.spacing=0.05"]
+    refused = sgns(tmp_path, "simulate", *asked, "output=run.h5")
+    assert refused.returncode == 2 and not (tmp_path / "run.h5").exists()
+    assert "never touches soil" in refused.stderr and "look like millimetres" in refused.stderr
+    assert refused.stderr.rstrip().endswith("if it is meant: limits.any_unit=true")
+    done = sgns(tmp_path, "simulate", *asked, "limits.any_unit=true", "output=run.h5")
+    assert done.returncode == 0 and "look like millimetres" in done.stderr + done.stdout
+    scenes = {"far": scene_from_config(composed(*asked[:1], f"scene.path={tmp_path}/path.csv"))}
+    with pytest.raises(UserError, match=r"far: .* look like millimetres"):
+        warning_summary(scenes)
+    assert len(warning_summary(scenes, any_unit=True)) == 1
