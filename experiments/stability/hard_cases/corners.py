@@ -13,6 +13,7 @@ from .measures import blade_shares, frames_of, shares, top_speed, volume_gain
 
 CUT_BED = Bed(spacing=0.02)
 WHEEL_BED = Bed(size=(0.40, 0.19, 0.0583), spacing=0.04 / 3.0, particles_per_cell=4.0, headroom=0.10)
+LONG_BED = replace(WHEEL_BED, size=(0.48, 0.32, 0.08))
 K0_ANGLE = float(np.degrees(np.arctan(np.sqrt(3.0) * (1.0 - 0.6) / 1.3)))
 """Friction angle at which soil of Poisson's ratio 0.3 just bears its K0 state [degrees]."""
 
@@ -24,21 +25,24 @@ def excavation(depth: float, speed: float, rake: float, motion: str) -> tuple[fl
     return blade_shares(scene, frames_of(scene, effects=Effects(symmetry=True)))
 
 
-def wheel(duration: float = 3.0, bed: Bed = WHEEL_BED, **values) -> tuple[float, str]:
-    """A run of the wheel campaign, with 1 s of settling: what must hold of any wheel."""
+def wheel(
+    duration: float = 3.0, bed: Bed = WHEEL_BED, bulldozing: float = 0.0, **values
+) -> tuple[float, str]:
+    """A run of the wheel campaign, with 1 s of settling: what must hold of any wheel. One that pushes soil before it
+    may have so many loads more of horizontal force."""
     scene = Wheel(**({"bed": bed, "duration": duration, "damping": 5.0, "friction_angle": 37.0} | values))
-    frames = frames_of(scene, effects=Effects(symmetry=True))
+    frames = frames_of(scene, effects=Effects(symmetry=scene.slip_angle == 0.0))
     settled = frames[round(0.5 * scene.frame_rate) :]
-    carried = float(np.mean([f.force[2] for f in settled])) / scene.load
+    carried = float(np.mean([f.force[2] for f in settled])) / values["load"]
     sinkage = float(scene.sinkage(np.array([f.body_pose for f in frames])).max())
-    pull = float(np.mean([abs(f.force[0]) for f in settled])) / scene.load
+    pull = float(np.mean([np.hypot(*f.force[:2]) for f in settled])) / values["load"]
     fall = np.sqrt(2.0 * scene.gravity * scene.bed.size[2])
     return shares(
         {
             "load not carried": (100.0 * abs(carried - 1.0), 5.0, "%"),
             "sinkage": (sinkage, scene.bed.size[2], "m"),
-            "horizontal force": (pull, scene.material.limit_friction + scene.friction, "loads"),
-            "speed": (top_speed(frames), 2.0 * scene.rim_speed + fall, "m/s"),
+            "horizontal force": (pull, scene.material.limit_friction + scene.friction + bulldozing, "loads"),
+            "speed": (top_speed(frames), 2.0 * max(scene.rim_speed, scene.speed) + fall, "m/s"),
             "volume gain": (100.0 * volume_gain(scene, frames[-1].position), 3.0, "%"),
         }
     )
@@ -104,6 +108,13 @@ MEASURES = {
     ),
     "wheel 5 cm, 70 %, Earth, 25 N, 30°": partial(
         wheel, diameter=0.05, slip=0.7, load=25.0, width=0.0833, friction_angle=30.0
+    ),
+    "wheel locked": partial(wheel, load=40.0, travel_speed=0.05, rim_speed=0.0, bulldozing=1.0, bed=LONG_BED),
+    "wheel pushed sideways, 90°": partial(
+        wheel, load=40.0, slip_angle=90.0, travel_speed=0.05, rim_speed=0.0, bulldozing=1.0, bed=LONG_BED
+    ),
+    "wheel turned by 45°, rim ten times as fast": partial(
+        wheel, load=40.0, slip_angle=45.0, travel_speed=0.02, rim_speed=0.2, bed=LONG_BED
     ),
     "wheel on soil at the K0 limit": partial(wheel, load=60.0, friction_angle=K0_ANGLE, duration=2.0),
     "wheel on soil with mu_s at 1, above mu_2": raised_limit,
