@@ -1,29 +1,25 @@
-"""Wrong inputs for every command, made from the definitions of the settings; and what the commands do with them.
+"""Inputs that are wrong by the way they are made: every command refuses each with status 2, in a line, soon and small.
 
-Each case is a process of its own, with a limit on its time and memory.
+Wrong settings come from the definitions of the settings and from what people wrote, wrong files from `wrong_files`.
 """
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
 import random
-import re
 import resource
+import shlex
+import shutil
 import signal
 import sys
 import tempfile
 import time
 import traceback
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
-from unittest.mock import patch
-
-import torch
 
 from mpm_warp import Bed, Effects, Material
 from mpm_warp.bed import Walls
@@ -31,23 +27,28 @@ from mpm_warp.bodies import Box, Cylinder, MeshBody, Plate
 from mpm_warp.scenes import Body, Column, Excavation, Incline, Wheel
 from mpm_warp.settings import Setting
 from sgns import settings as typed
-from sgns.config import UserError
-from sgns_testing.commands import SHORT, TRAIN, call
-from sgns_testing.wrong_files import good_files, wrong_files
+from sgns_testing.commands import call
+from sgns_testing.wrong_files import (
+    CAMPAIGN,
+    CHECKPOINT,
+    CUT,
+    CUT_ON_PATH,
+    DATA,
+    FIT,
+    LEARN,
+    ON_PATH,
+    PUBLISHED,
+    READ,
+    RUN,
+    WITH_MESH,
+    Case,
+    good_files,
+    wrong_file,
+    wrong_files,
+)
 
-SECONDS, MEMORY = 20.0, 3 << 30
-"""That a case may take; the memory [bytes] is all that the process holds at its highest."""
-MOST_OF_A_KIND = 300
-"""Cases that are drawn of one kind."""
-
-
-class Case(NamedTuple):
-    """A command that is to be refused."""
-
-    kind: str
-    arguments: tuple[str, ...]
-    wrong: bool = True
-    """False: it may be right after all."""
+SECONDS, BYTES = 20.0, 3 << 30
+"""That a command may take to refuse; the bytes are all that its process holds at its highest."""
 
 
 class Outcome(NamedTuple):
@@ -55,63 +56,62 @@ class Outcome(NamedTuple):
 
     case: Case
     status: int
-    """2: refused; 0: done, or good enough to begin the long part; 1: a bug; negative: ended by a signal."""
+    """2: refused; 0: done; 1: a bug; negative: ended by a signal."""
     said: str
+    """On standard error."""
     seconds: float
-    memory: int
+    bytes: int
+
+    @property
+    def line(self) -> str:
+        """The last that was said."""
+        return (self.said.strip().splitlines() or [""])[-1]
 
     @property
     def fault(self) -> str:
         """What is bad about it; empty: nothing."""
-        if self.status not in (0, 2):
+        if self.status != 2:
             return f"status {self.status}"
-        if self.seconds > SECONDS or self.memory > MEMORY:
-            return f"{self.seconds:.0f} s, {self.memory / 1e9:.1f} GB"
-        if "Traceback" in self.said or (self.status == 2 and not self.said.startswith("sgns")):
-            return "no line of its own"
-        return "accepted" if self.case.wrong and self.status == 0 else ""
+        if self.seconds > SECONDS or self.bytes > BYTES:
+            return f"{self.seconds:.0f} s, {self.bytes / 1e9:.1f} GB"
+        if not self.line.startswith("sgns") or "Traceback" in self.said or self.said.count("\n") > 1:
+            return "not one line"
+        known = "no such key" in self.case.names or "no such key" not in self.line
+        return "" if known and self.case.names in self.line else f"does not name {self.case.names}"
 
 
 # --- Settings, by their definitions ---------------------------------------------------------------------
 
-_ABSURD = ("1e300", "-1e300", "1e30", "1e-300", "-1", "1000000000000", str(1 << 70), "0.4999999999", "10.5")
-_NO_NUMBER = ("[a]", "{a: 1}", "text", "[]", "true", "nan", "inf", "-inf", "[[1,2],[3]]", "1e400", "''")
-_NO_TEXT = ("[a]", "{a: 1}", "[]", "5", "true", "[[1,2],[3]]", "'a\\0b'")
-
-_BODY = ("scene=body", "scene.path=path.csv")
-_SCENES = {
-    "excavation": (SHORT, Excavation),
-    "body": (
-        [*SHORT[:4], *_BODY, "scene.tool.size=[0.1,0.1,0.08]"],
-        Body,
-    ),
-    "wheel": (["scene=quick_wheel"], Wheel),
-    "column": (["scene=column"], Column),
-    "incline": (["scene=incline"], Incline),
-}
-_DATA = ("dataset.path=data",)
-_CHECKPOINT = "checkpoint=out/best.ckpt"
+_SCENES: list[tuple[tuple[str, ...], Any]] = [
+    (CUT, Excavation),
+    (ON_PATH, Body),
+    (("scene=quick_wheel", "scene.duration=0.05", "scene.settle=0"), Wheel),
+    (("scene=column", "scene.bed.spacing=0.04", "scene.duration=0.05"), Column),
+    (("scene=incline", "scene.bed.spacing=0.02", "scene.duration=0.05"), Incline),
+]
 
 
-def _groups() -> Iterator[tuple[str, list[str], str, Any]]:
+def _groups() -> Iterator[tuple[str, tuple[str, ...], str, Any]]:
     """Command, arguments with which it is good, prefix of keys and class of every group of settings."""
-    for arguments, cls in _SCENES.values():
-        yield "simulate", arguments, "scene.", cls
-    for prefix, cls in (("scene.bed.", Bed), ("scene.bed.walls.", Walls), ("scene.blade.", Plate)):
-        yield "simulate", SHORT, prefix, cls
-    for prefix, cls in (("material.", Material), ("effects.", Effects), ("solver.", typed.SolverSettings)):
-        yield "simulate", SHORT, prefix, cls
-    yield "simulate", _SCENES["body"][0], "scene.tool.", Box
-    round_tool = ["scene.tool.diameter=0.1", "scene.tool.width=0.1"]
-    yield "simulate", [*SHORT[:4], *_BODY, "scene/tool=cylinder", *round_tool], "scene.tool.", Cylinder
-    yield (
-        "simulate",
-        [*SHORT[:4], *_BODY, "scene/tool=mesh", "scene.tool.file=tool.obj"],
-        "scene.tool.",
-        MeshBody,
-    )
-    learn = [*_DATA, *TRAIN]
-    yield "reduce", [*_DATA, *TRAIN[:2]], "reduction.", typed.ReductionSettings
+    for base, cls in _SCENES:
+        yield "simulate", base, "scene.", cls
+    for prefix, cls in (
+        ("scene.bed.", Bed),
+        ("scene.bed.walls.", Walls),
+        ("scene.blade.", Plate),
+        ("material.", Material),
+        ("effects.", Effects),
+        ("solver.", typed.SolverSettings),
+        ("limits.", typed.Limits),
+    ):
+        yield "simulate", CUT, prefix, cls
+    yield "simulate", ON_PATH, "scene.tool.", Box
+    round_tool = ("scene/tool=cylinder", "scene.tool.diameter=0.1", "scene.tool.width=0.1")
+    yield "simulate", (*ON_PATH[:-1], *round_tool), "scene.tool.", Cylinder
+    yield "simulate", WITH_MESH, "scene.tool.", MeshBody
+    yield "simulate", CAMPAIGN, "dataset.", typed.DatasetSettings
+    yield "reduce", LEARN[:3], "reduction.", typed.ReductionSettings
+    yield "reduce", LEARN[:3], "dataset.", typed.DatasetSettings
     for prefix, cls in (
         ("reduction.", typed.ReductionSettings),
         ("model.", typed.ModelSettings),
@@ -119,26 +119,27 @@ def _groups() -> Iterator[tuple[str, list[str], str, Any]]:
         ("training.loss.", typed.LossWeights),
         ("dataset.", typed.DatasetSettings),
     ):
-        yield "train", learn, prefix, cls
-    fit = [*_DATA, *TRAIN[:2], "model=polynomial", "training=polynomial"]
-    yield "train", fit, "model.", typed.PolynomialSettings
-    yield "train", fit, "training.", typed.FitSettings
-    yield "train", ["dataset=published"], "dataset.", typed.PublishedSettings
-    yield "simulate", ["dataset=quick"], "dataset.", typed.DatasetSettings
-    yield "rollout", [_CHECKPOINT], "scene.", Excavation
-    yield "advise", [], "error.", typed.Errors
+        yield "train", LEARN, prefix, cls
+    yield "train", FIT, "model.", typed.PolynomialSettings
+    yield "train", FIT, "training.", typed.FitSettings
+    yield "train", PUBLISHED, "dataset.", typed.PublishedSettings
+    for prefix, cls in (("scene.", Excavation), ("scene.blade.", Plate), ("material.", Material)):
+        yield "rollout", CHECKPOINT, prefix, cls
+    yield "evaluate", (*DATA, *CHECKPOINT), "dataset.", typed.DatasetSettings
+    yield "advise", ("error.force=0.35",), "error.", typed.Errors
     own = {
-        "simulate": SHORT,
-        "reduce": [*_DATA, *TRAIN[:2]],
-        "train": learn,
-        "rollout": [_CHECKPOINT],
-        "evaluate": [*_DATA, _CHECKPOINT],
-        "check": ["run.h5"],
-        "plot": ["run=run.h5"],
-        "render": ["run=run.h5"],
+        "simulate": CUT,
+        "reduce": LEARN[:3],
+        "train": LEARN,
+        "rollout": CHECKPOINT,
+        "evaluate": (*DATA, *CHECKPOINT),
+        "advise": ("error.force=0.35",),
+        "check": (f"files=[{RUN}]",),
+        "plot": (f"run={RUN}", "output=a.png"),
+        "render": (f"run={RUN}", "output=a.gif"),
     }
     for name, cls in typed.COMMANDS.items():
-        yield name, own.get(name, []), "", cls
+        yield name, own.get(name, ()), "", cls
 
 
 def _setting_of(cls: Any, name: str) -> Setting:
@@ -150,436 +151,518 @@ def _setting_of(cls: Any, name: str) -> Setting:
     return Setting("")
 
 
-def _values(known: Setting, hint: Any) -> Iterator[tuple[str, str, bool]]:
-    """Kind, value, and whether it is certainly wrong."""
+def _wrong_values(known: Setting, hint: Any) -> tuple[list[str], list[str]]:
+    """Values of another type, and numbers that are too large or too small."""
     kinds = {part for one in (hint, *get_args(hint)) for part in (one, *get_args(one))}
-    optional = type(None) in kinds
-    if known.choices:
-        yield from (("wrong type", value, True) for value in ("[a]", "{a: 1}", "nosuch", "1e300"))
-        if not optional:
-            yield "wrong type", "null", True
-    elif kinds & {int, float}:
-        for limit, beyond in ((known.ge, -1), (known.gt, 0), (known.le, 1), (known.lt, 0)):
-            if limit is not None:
-                yield (
-                    "out of range",
-                    f"{limit + beyond * (abs(limit) * 0.5 + 1e-6):.17g}",
-                    kinds & {list} == set(),
-                )
-        yield from (("absurd number", value, False) for value in _ABSURD)
-        lists = bool({list, tuple} & {getattr(part, "__origin__", part) for part in kinds})
-        yield from (("wrong type", value, not (lists and value == "[]")) for value in _NO_NUMBER)
-        if not optional:
-            yield "wrong type", "null", True
-    elif bool in kinds:
-        yield from (("wrong type", value, True) for value in ("[a]", "{a: 1}", "maybe", "7", "null"))
+    origins = {getattr(part, "__origin__", part) for part in kinds}
+    types, sizes = ["{a: 1}", "[[1, 2], [3]]"], []
+    if type(None) not in kinds:
+        types.append("null")
+    if bool in kinds or any(isinstance(choice, bool) for part in kinds for choice in get_args(part)):
+        types += ["maybe", "7", "[true]", "1e300"]
+    elif int in kinds or float in kinds:
+        types += ["nan", "inf", "-inf", "1e400", "true", "''", "[a, b, c]", "[nan, 0, 0]"]
+        types += ["text", "10.5.1", "0x1g"]
+        wrong = [(known.ge, -1), (known.gt, 0), (known.le, 1), (known.lt, 0)]
+        sizes = [f"{v + sign * (abs(v) / 2 + 1e-3):.17g}" for v, sign in wrong if v is not None]
+        sizes += ["1e300", "-1e300", "1" + "0" * 30, "1e-300"]
+        if int in kinds and float not in kinds:
+            sizes += ["10.5", "1e17", "-1000000000000000000000"]
+        if list in origins or tuple in origins:
+            types += ["[]", "5"]
+            sizes = [f"[{', '.join([size] * (3 if float in kinds else 2))}]" for size in sizes]
+    elif known.choices or any(getattr(part, "__origin__", None) is not None for part in kinds):
+        types += ["5", "1e300"] + (["nosuch"] if dict not in origins and list not in origins else [])
     else:
-        yield from (("wrong type", value, False) for value in (*_NO_TEXT, "null"))
+        types += ["[]", "5", "true", "[a]"] + ([] if dict in origins else ["'a\\0b'"])
+    return types, sizes
 
 
-def _of_settings() -> Iterator[Case]:
-    for command, good, prefix, cls in _groups():
+_RIGHT = {("device", "'a\\0b'")}
+"""Key and value of what the rules above take for wrong and is not."""
+
+
+def _of_settings(chance: random.Random) -> Iterator[Case]:
+    """Of every setting a value of another type and, if it is a number, one that it cannot be, too."""
+    for command, base, prefix, cls in _groups():
         hints = get_type_hints(cls, localns={cls.__name__: cls})
         for one in fields(cls):
-            hint = hints[one.name]
+            hint, key = hints[one.name], f"{prefix}{one.name}"
             if any(is_dataclass(part) for part in (hint, *get_args(hint))):
-                for value in ("[a]", "5", "null", "{nosuch: 1}"):
-                    yield Case("wrong type", (command, *good, f"{prefix}{one.name}={value}"))
-                continue
-            for kind, value, wrong in _values(_setting_of(cls, one.name), hint):
-                certain = wrong and (prefix, one.name) != ("", "device")
-                yield Case(kind, (command, *good, f"{prefix}{one.name}={value}"), certain)
+                types, sizes = ["[a]", "5", "text", "[[1]]"], []
+            else:
+                types, sizes = _wrong_values(_setting_of(cls, one.name), hint)
+            types = [value for value in types if (key, value) not in _RIGHT]
+            picked = [chance.choice(types), chance.choice(sizes)] if sizes else chance.sample(types, 1)
+            for kind, value in zip(("type", "size"), picked, strict=False):
+                yield Case(f"setting, {kind}", command, base, (f"{key}={value}",), one.name)
 
 
-# --- What people have written --------------------------------------------------------------------------
+# --- What people wrote ----------------------------------------------------------------------------------
 
-_PATHS = (
-    *(
-        "[1,2,3]",
-        "[a,b]",
-        "[[1,2],[3]]",
-        "[null]",
-        "[[[0,0,0,0,0,0,0,1]]]",
-        "[[0,0,0,0,0,0,0,null]]",
-        "{}",
-        "5",
+_PATHS = """
+[1,2,3]
+[a,b]
+[[1,2],[3]]
+[null]
+[[[0,0,0,0,0,0,0,1]]]
+[[0,0,0,0,0,0,0,null]]
+{}
+{a: [0,0,0,0,0,0,0,1]}
+5
+[]
+[[]]
+[[nan,0,0,0,0,0,0,1]]
+[[0,1e300,0,0,0,0,0,1]]
+[[0,0,0,0,0,0,0,0]]
+true
+[[0,0.2,0.1,0.1,0,0,0,1],[0,0.2,0.1,0.1,0,0,0,1]]
+[[0,a,b,c,d,e,f,g]]
+[[0,0,0,0,0,0,0,1,1]]
+nosuch.csv
+""".strip().splitlines()
+# Command and arguments with which it is good, then an input a line; what its line must name stands after `->`.
+_WRITTEN: list[tuple[str, tuple[str, ...], str]] = [
+    (
+        "simulate",
+        CUT,
+        CUT_ON_PATH,
+        """
+scene.duration=1e5 -> limits.time
+scene.duration=1e300 -> duration
+scene.gravity=1e30 -> gravity
+material.youngs_modulus=1e20 -> youngs_modulus
+scene.courant=1e-300 -> courant
+scene.bed.headroom=1e6 -> headroom
+material.packing=1e-300 -> packing
+scene.bed.spacing=1e-9 -> spacing
+scene.bed.spacing=1e-4 -> spacing
+material.poissons_ratio=0.4999999999 -> poissons_ratio
+seed=18446744073709551616 -> seed
+seed=1e30 -> seed
+seed=-1 -> seed
+device=meta -> device
+device=mps -> device
+device=cuda:99 -> device
+device=xpu -> device
+"device=''" -> device
+device=cpu:7 -> device
+scene.bed.size=[1e3,1e3,1e3] -> bed
+scene.bed.size=[1e300,1,1] -> size
+scene.bed.size=[0.4,0.2] -> size
+scene.bed.size=[0.4,0.2,0] -> size
+"scene.bed.size='0.4 0.2 0.1'" -> size
+scene.bed.particles_per_cell=1e12 -> particles_per_cell
+scene.bed.arrangement=random -> arrangement
+scene.bed.walls.x=rough -> walls
+scene.bed.walls.x=-0.5 -> walls
+scene.bed.walls.floor=periodic -> walls
+scene.frame_rate=1e-300 -> frame_rate
+scene.frame_rate=1e300 -> frame_rate
+scene.speed=1e300 -> speed
+scene.speed=1e5 -> speed
+scene.speed=0 -> speed
+scene.blade.width=1e300 -> width
+scene.blade.thickness=0 -> thickness
+scene.blade.friction=1e300 -> friction
+scene.blade.friction=-0.1 -> friction
+material.grain_density=1e-300 -> grain_density
+material.grain_density=1e300 -> grain_density
+material.friction_angle=90 -> friction_angle
+scene.body_grid=[1e9,1e9] -> body_grid
+scene.body_grid=[0,4] -> body_grid
+scene.motion=path -> path
+scene.motion=fly -> motion
+scene.tilt=90 -> tilt
+scene.rake=89 -> rake
+scene.bed.store_every=0 -> store_every
+scene.velocity_memory=1e-300 -> velocity_memory
+scene.remap_distance=1e-300 -> remap_distance
+scene.bed.seed=1e30 -> seed
+scene.bed.seed=-1 -> seed
+shards=1000000000000 -> shards
+shard=-1 -> shard
+shard=5 -> shard
+continue_from=nosuch.h5 -> nosuch.h5
+continue_from=../good/run.h5 -> run.h5
+output=/dev/full -> /dev/full
+output=/proc/x.h5 -> /proc/x.h5
+output=. -> output
+"output=''" -> output
+output=null -> output
+output=../good/run.h5 -> overwrite=true
+output=../good/run.h5/a.h5 -> run.h5
+scene.bed=null -> bed
+scene={} -> scene
+scene=[] -> scene
+scene=null -> scene
+material=null -> material
+effects=null -> effects
+solver=null -> solver
+dataset=nosuch -> nosuch
+scene=nosuch -> nosuch
+material=nosuch -> nosuch
++scene.x=1 -> x
+scene.sped=0.1 -> no such key
+speed=0.1 -> no such key
+~scene.speed_ -> speed_
+scene.speed=${scene.speed} -> speed
+scene.speed=${nosuch} -> nosuch
+scene.speed=${oc.env:NOSUCH_1} -> NOSUCH_1
+scene.speed=??? -> speed
+scene.speed=0.1.2 -> speed
+scene.speed=0,1 -> speed
+"scene.speed='" -> speed
+scene.speed=0.1;scene.rake=1 -> ;
+=3 -> =3
+scene..x=1 -> x
+hydra.run.dir=/proc/x -> /proc/x
+hydra.verbose={} -> verbose
+hydra=null -> hydra
+hydra.job_logging.root.level=LOUD -> logging
+'+hydra.callbacks.x={_target_: os.system}' -> callbacks
+hydra.sweeper.max_batch_size=0 -m seed=1,2 -> max_batch_size
+hydra.searchpath=[pkg://os] -> searchpath
+hydra/launcher=nosuch -> nosuch
+'hydra.job.env_set={A: b}' -> env_set
+--nosuch -> --nosuch
+--config-dir nosuch -> nosuch
+--cfg nosuch -> nosuch
+--package scene -> --package
+--resolve -> --resolve
+--info nosuch -> nosuch
+--version -> --version
+nosuch -> nosuch
+experiment=nosuch -> nosuch
+-m seed=range(0,1e12) -> jobs
+-m seed=range(0,1000000000000) -> jobs
+-m seed=range(0,10,0) -> range
+-m seed=choice() -> choice
+-m seed=range(nan,3) -> range
+-m seed=interval(0,1) -> seed
+-m seed=a,b -> seed
+-m scene.speed=range(0,1,1e-300) -> speed
+-m seed=1,2 --cfg job -> --cfg
+""",
+    ),
+    ("simulate", ON_PATH, "\n".join(f"'scene.path={text}' -> path" for text in _PATHS)),
+    (
+        "simulate",
+        CUT_ON_PATH,
+        "\n".join(f"'scene.path={text}' -> path" for text in _PATHS[::2]),
+    ),
+    (
+        "simulate",
+        CAMPAIGN,
+        """
+dataset.runs=10.5 -> runs
+dataset.runs=1e12 -> runs
+dataset.runs=2 -> runs
+dataset.split=[a,b,c] -> split
+dataset.split=5 -> split
+dataset.split=null -> split
+dataset.split=[nan,0,0] -> split
+dataset.split=[1,1,1] -> split
+dataset.split=[1e300,-1e300,1] -> split
+dataset.path=[a] -> path
+dataset.path=/proc/x -> /proc/x
+dataset.draw=5 -> draw
++dataset.draw.speed=[0.1] -> speed
++dataset.draw.tool=[1] -> tool
+dataset.draw.path=[] -> path
+dataset.draw.path=5 -> path
+dataset.draw.path=[nosuch.csv] -> nosuch.csv
+dataset.draw.path=[nosuch*.csv] -> nosuch
++dataset.draw.duration=[a] -> duration
++dataset.draw.duration=[-1] -> duration
+'dataset.draw=[[1]]' -> draw
+dataset.draw.seed=1 -> seed
+dataset.change=[1] -> change
+'dataset.change={nosuch: 1}' -> nosuch
+dataset.scene=[] -> scene
+dataset.scene=nosuch -> nosuch
+dataset.where=5 -> where
+shards=3 shard=3 -> shard
+limits.disk=1e-7 -> limits.disk
+limits.time=1e-12 -> limits.time
+""",
+    ),
+    (
+        "train",
+        LEARN,
+        """
+model.kind=[] -> kind
+model.kind=nosuch -> kind
+model=nosuch -> nosuch
+preset=nosuch -> nosuch
+model.history=100000 -> history
+model.message_passing_steps=1000000 -> message_passing_steps
+model.hidden_width=1000000000 -> hidden_width
+model.hidden_width=10000 model.hidden_layers=100 -> hidden_width
+training.threads=100000 -> threads
+training.max_steps=1e300 -> max_steps
+training.batch_size=1000000000000 -> batch_size
+training.learning_rate=0 -> learning_rate
+training.learning_rate=1e300 -> learning_rate
+training.horizon=1000 -> horizon
+training.loss=null -> loss
+training.loss=[1] -> loss
+training.resume=maybe -> resume
+model.context=[1,2] -> context
+model.context={} -> context
+model.context=[nosuch] -> context
+reduction.num_modes=7 -> num_modes
+reduction.num_modes=1000000 -> num_modes
+reduction.max_modes=100000000 -> max_modes
+dataset.split=[a,b,c] -> split
+dataset.path=nosuch -> nosuch
+dataset.path=../good/run.h5 -> run.h5
+dataset.path={} -> path
+'dataset.where={a: 1}' -> a
+'dataset.where={gravity: 7}' -> gravity
+checkpoint=../good/run.h5 -> run.h5
+checkpoint=nosuch.ckpt -> nosuch.ckpt
+checkpoint=[a] -> checkpoint
+device=meta -> device
+device=cuda:99 -> device
+device=nosuch -> device
+seed=1e30 -> seed
+output=/proc/x -> /proc/x
+output=../good/run.h5 -> run.h5
+dataset=nosuch -> nosuch
+model=polynomial -> training
+""",
+    ),
+    (
+        "rollout",
+        CHECKPOINT,
+        """
+num_modes=100 -> num_modes
+num_modes=0 -> num_modes
+num_modes=1e300 -> num_modes
+device=meta -> device
+device=cuda:99 -> device
+scene.duration=1e300 -> duration
+scene.duration=1e5 -> duration
+scene.gravity=1e30 -> gravity
+scene.depth=-1 -> depth
+checkpoint=[] -> checkpoint
+checkpoint=null -> checkpoint
+checkpoint=nosuch.ckpt -> nosuch.ckpt
+checkpoint=../good/run.h5 -> run.h5
+checkpoint=../good/data -> data
+scene=nosuch -> nosuch
+scene=wheel -> wheel
+scene=column -> scene
+scene.motion=path -> path
+scene.bed.size=[0.8,0.4,0.16] -> bed
+scene.bed.spacing=0.02 -> bed
+rate_independent=nope -> rate_independent
+output=/proc/x.h5 -> /proc/x.h5
+output=../good/run.h5 -> overwrite=true
+effects.yielding=false -> no such key
+solver.precision=float64 -> no such key
+""",
+    ),
+    (
+        "evaluate",
+        (*DATA, *CHECKPOINT),
+        """
+num_modes=100 -> num_modes
+timing_repeats=1e12 -> timing_repeats
+timing_repeats=1 -> timing_repeats
+new_rollouts=[1,2] -> new_rollouts
+new_rollouts={} -> new_rollouts
+new_rollouts=[nosuch.h5] -> nosuch.h5
+new_rollouts=[../good/path.csv] -> path.csv
+split=nosuch -> split
+device=meta -> device
+output=/proc/x -> /proc/x
+dataset.path=nosuch -> nosuch
+dataset=quick -> quick
+checkpoint=nosuch.ckpt -> nosuch.ckpt
+'dataset.where={gravity: 7}' -> gravity
+""",
+    ),
+    (
+        "frontier",
+        (),
+        """
+axis=[] -> axis
+axis=nosuch -> axis
+axis=none -> axis
+study=nosuch -> nosuch
+study=null -> study
+study.name=[a] -> name
+study.scenes=5 -> scenes
+study.scenes={} -> scenes
+study.scenes.cut.scene=nosuch -> nosuch
+study.scenes.cut.scene=5 -> scene
+study.scenes.cut.dataset=nosuch -> nosuch
+study.scenes.cut.dataset=[a] -> dataset
+study.scenes.cut.cases=5 -> cases
+study.scenes.cut.cases={} -> cases
+study.scenes.cut.cases.deep=[scene.nosuch=1] -> nosuch
+study.scenes.cut.cases.deep=5 -> deep
+study.scenes.cut.bands=5 -> bands
+study.scenes.cut.bands.force_nrmse=text -> force_nrmse
+study.scenes.cut.bands.force_nrmse=-1 -> force_nrmse
+study.scenes.cut.reference=5 -> reference
+study.scenes.cut.reference.set=[scene.bed.spacing=-1] -> spacing
+study.scenes.cut.reference.label=[a] -> label
+study.scenes.cut.solver=5 -> solver
+'study.scenes.cut.solver=[{axis: dx}]' -> label
+'study.scenes.cut.solver=[{axis: dx, label: a, sett: [b]}]' -> sett
+'study.scenes.cut.solver=[{axis: dx, label: a},{axis: dx, label: a}]' -> label
+'study.scenes.cut.reduction=[{axis: r, label: a, modes: [0]}] axis=reduction' -> modes
++study.scenes.cut.x=1 -> x
++study.x=1 -> x
+output=/proc/x -> /proc/x
+output=../good/run.h5 -> run.h5
+""",
+    ),
+    (
+        "advise",
+        ("error.force=0.35",),
+        """
+task=nosuch -> nosuch
+time=0 -> time
+time=1e400 -> time
+time=-1 -> time
+table=nosuch.csv -> nosuch.csv
+table=../good/run.h5 -> run.h5
+table=../good/path.csv -> path.csv
+table=[] -> table
+error=5 -> error
+error.force=nan -> force
+error.force=[1] -> force
+error.nosuch=1 -> nosuch
+against=[] -> against
+particles=5 -> particles
+output=a -> no such key
+scene=wheel -> scene
+""",
+    ),
+    (
+        "check",
+        (),
+        """
+nosuch.h5 -> nosuch.h5
+../good/path.csv -> good
+../good/out/best.ckpt -> good
+../good/tool.stl -> good
+../good/run.h5 ../good/path.csv -> good
+. -> .h5
+files=5 -> files
+files=[[a]] -> files
+files={} -> files
+files=null -> files
+files=[] -> run
+-m files=a,b -> a
+""",
     ),
     *(
-        "[]",
-        "[[]]",
-        "[[nan,0,0,0,0,0,0,1]]",
-        "[[0,1e300,0,0,0,0,0,1]]",
-        "[[0,0,0,0,0,0,0,0]]",
-        "true",
-        "null",
-    ),
-    *("[[0,0.2,0.1,0.1,0,0,0,1],[0,0.2,0.1,0.1,0,0,0,1]]", "[[0,a,b,c,d,e,f,g]]", "[[0,0,0,0,0,0,0,1,1]]"),
-)
-_WRITTEN = [
-    *(
-        ("simulate", *SHORT, text)
-        for text in (
-            *(
-                "scene.duration=1e5",
-                "scene.duration=1e300",
-                "scene.gravity=1e30",
-                "material.youngs_modulus=1e20",
-            ),
-            *(
-                "scene.courant=1e-300",
-                "scene.bed.headroom=1e6",
-                "material.packing=1e-300",
-                "scene.bed.spacing=1e-9",
-            ),
-            *(
-                "material.poissons_ratio=0.4999999999",
-                f"seed={1 << 64}",
-                f"seed={10**30}",
-                "seed=1e30",
-                "seed=-1",
-            ),
-            *("device=meta", "device=mps", "device=cuda:99", "device=xpu", "device=''", "device=cpu:7"),
-            *("scene.bed.size=[1e3,1e3,1e3]", "scene.bed.size=[1e300,1,1]", "scene.bed.size=[0.4,0.2]"),
-            *("scene.bed.particles_per_cell=1e12", "scene.frame_rate=1e-300", "scene.frame_rate=1e300"),
-            *(
-                "scene.speed=1e300",
-                "scene.speed=1e5",
-                "scene.blade.width=1e300",
-                "scene.blade.friction=1e300",
-            ),
-            *("material.grain_density=1e-300", "material.grain_density=1e300", "scene.body_grid=[1e9,1e9]"),
-            *(
-                "scene.motion=path",
-                "scene.tilt=89.99999999",
-                "scene.bed.store_every=0",
-                "scene.velocity_memory=1e-300",
-            ),
-            *(
-                "scene.remap_distance=1e-300",
-                "scene.bed.seed=1e30",
-                "scene.bed.arrangement=poisson scene.bed.size=9",
-            ),
-            *(
-                "shards=1000000000000",
-                "shard=-1",
-                "shard=5",
-                "continue_from=nosuch.h5",
-                "continue_from=run.h5",
-            ),
-            *(
-                "output=/dev/full",
-                "output=/proc/x.h5",
-                "output=.",
-                f"output={'x' * 5000}",
-                "output=''",
-                "output=null",
-            ),
-            *(
-                "scene.bed=null",
-                "scene=null",
-                "scene=[]",
-                "scene={}",
-                "material=null",
-                "effects=null",
-                "solver=null",
-            ),
-            *("dataset=nosuch", "scene=nosuch", "+scene.x=1", "~scene.speed", "scene.speed=${scene.speed}"),
-            *(
-                "scene.speed=${nosuch}",
-                "scene.speed=???",
-                "scene.speed=0.1.2",
-                "scene.speed='",
-                "=3",
-                "scene..x=1",
-            ),
-            *(
-                "hydra.run.dir=/proc/x",
-                "hydra.job.name=[]",
-                "hydra.verbose={}",
-                "hydra=null",
-                "--nosuch",
-                "nosuch",
-            ),
+        (
+            name,
+            (),
+            f"""
+nosuch.h5 -> nosuch.h5
+../good/path.csv -> path.csv
+../good/out/best.ckpt -> best.ckpt
+../good/data -> data
+run=[a] -> run
+run=null -> run
+{RUN} output=x.txt -> x.txt
+{RUN} output=/proc/x.{suffix} -> /proc/x.{suffix}
+{RUN} output=[a] -> output
+{RUN} output=../good/run.h5 -> run.h5
+{RUN} a.{suffix} b.{suffix} -> b.{suffix}
+{RUN} overwrite=maybe -> overwrite
+{RUN} frame=3 -> no such key
+""",
         )
+        for name, suffix in (("plot", "png"), ("render", "gif"))
     ),
-    *(
-        ("simulate", *SHORT, "-m", text)
-        for text in (
-            *(
-                "seed=range(0,1e12)",
-                "seed=range(0,1000000000000)",
-                "seed=range(0,10,0)",
-                "seed=choice()",
-                "seed=a,b",
-            ),
-            *("seed=interval(0,1)", "seed=range(nan,3)", "scene.speed=range(0,1,1e-300)", "seed=glob(*)"),
-        )
-    ),
-    *(("simulate", *SHORT[:4], "scene=body", f"scene.path={text}") for text in _PATHS),
-    *(("simulate", *SHORT, "scene.motion=path", f"scene.path={text}") for text in _PATHS),
-    *(
-        ("simulate", "dataset=own", "dataset.path=o/campaign", *more)
-        for more in (
-            *(
-                ("dataset.runs=10.5",),
-                ("dataset.runs=1e12",),
-                ("dataset.split=[a,b,c]",),
-                ("dataset.split=5",),
-            ),
-            *(("dataset.split=null",), ("dataset.split=[nan,0,0]",), ("dataset.split=[1e300,-1e300,1]",)),
-            *(
-                ("dataset.path=[a]",),
-                ("dataset.draw=5",),
-                ("dataset.draw={scene.speed: []}",),
-                ("dataset.draw={x: [1]}",),
-            ),
-            *(
-                ("dataset.draw={scene.speed: 5}",),
-                ("dataset.change=[1]",),
-                ("dataset.scene=[]",),
-                ("dataset.where=5",),
-            ),
-            (f"dataset.draw={{{','.join(f'scene.k{i}: {list(range(100))}' for i in range(20))}}}",),
-        )
-    ),
-    *(
-        ("train", *_DATA, *TRAIN, text)
-        for text in (
-            *(
-                "model.kind=[]",
-                "model.kind=null",
-                "model.history=100000",
-                "model.message_passing_steps=1000000",
-            ),
-            *(
-                "training.threads=100000",
-                "device=meta",
-                "model.hidden_width=1000000000",
-                "training.max_steps=1e300",
-            ),
-            *("model.hidden_width=10000 model.hidden_layers=100", "training.batch_size=1000000000000"),
-            *("dataset.split=[a,b,c]", "dataset.split=5", "dataset.split=null", "dataset.split=[nan,0,0]"),
-            *(
-                "dataset.path=[a]",
-                "dataset.path={}",
-                "dataset.path=nosuch",
-                "dataset.path=run.h5",
-                "dataset.where={a: 1}",
-            ),
-            *(
-                "reduction.num_modes=1000000",
-                "reduction.max_modes=100000000",
-                "checkpoint=run.h5",
-                "checkpoint=[a]",
-            ),
-            *(
-                "training.loss=null",
-                "training.loss=[1]",
-                "model.context=[1,2]",
-                "model.context={}",
-                "seed=1e30",
-            ),
-        )
-    ),
-    *(
-        ("rollout", _CHECKPOINT, text)
-        for text in (
-            *(
-                "num_modes=100",
-                "num_modes=1e300",
-                "device=meta",
-                "scene.duration=1e300",
-                "scene.gravity=1e30",
-            ),
-            *("scene.duration=1e5", "checkpoint=[]", "checkpoint=run.h5", "checkpoint=data", "scene=nosuch"),
-        )
-    ),
-    *(
-        ("evaluate", *_DATA, _CHECKPOINT, text)
-        for text in (
-            *(
-                "num_modes=100",
-                "timing_repeats=1e12",
-                "new_rollouts=[1,2]",
-                "new_rollouts={}",
-                "new_rollouts=[run.h5]",
-            ),
-            *("split=nosuch", "device=meta", "new_rollouts=[nosuch.h5]", "output=/proc/x"),
-        )
-    ),
-    *(
-        ("frontier", text)
-        for text in ("axis=[]", "study=nosuch", "study=null", "+study.x=1", "output=/proc/x")
-    ),
-    *(
-        ("advise", text)
-        for text in (
-            *(
-                "task=nosuch",
-                "time=0",
-                "time=1e400",
-                "table=nosuch.csv",
-                "table=run.h5",
-                "table=[]",
-                "error=5",
-            ),
-            *("error.force=nan", "error.force=[1]", "against=[]", "table=path.csv", "particles=5"),
-        )
-    ),
-    *(
-        ("check", text)
-        for text in ("nosuch.h5", "path.csv", "out/best.ckpt", "files=5", "files=[[a]]", "files={}")
-    ),
-    *(
-        (name, *rest)
-        for name in ("plot", "render")
-        for rest in (
-            *(
-                ("nosuch.h5",),
-                ("path.csv",),
-                ("out/best.ckpt",),
-                ("run.h5", "output=x.txt"),
-                ("run=[a]",),
-                ("run={}",),
-            ),
-            *(
-                ("run.h5", "a.png", "b.png"),
-                ("run=data",),
-                ("run.h5", "output=/proc/x"),
-                ("run.h5", "output=[a]"),
-            ),
-        )
-    ),
-    *((name,) for name in ("rollout", "evaluate", "train", "reduce", "check", "plot", "render", "nosuch")),
+    *((name, (), f"'' -> {name}") for name in ("rollout", "evaluate", "check", "plot", "render")),
+    ("reduce", (), "dataset=own -> data/own\ndataset.path=null -> path\ndevice=tpu -> device"),
+    ("nosuch", (), "'' -> nosuch\nscene.speed=1 -> nosuch\n--help -> nosuch"),
 ]
 
 
 def _written() -> Iterator[Case]:
-    for arguments in _WRITTEN:
-        *rest, last = arguments
-        kind = "a path that is no table" if "scene.path=" in last else "as people wrote it"
-        yield Case(kind, (*rest, *(last.split(" ") if "=" in last else [last])))
+    for command, base, lines in _WRITTEN:
+        for line in lines.strip().splitlines():
+            text, _, names = line.rpartition(" -> ")
+            kind = "path" if "scene.path=" in text else "as people wrote it"
+            yield Case(kind, command, base, tuple(filter(None, shlex.split(text))), names)
 
 
 # --- All of them ----------------------------------------------------------------------------------------
 
 
-def every_case(folder: Path, seed: int = 15) -> list[Case]:
-    """All of them, in an order that follows from the seed; the good files that they name and the wrong ones are made
-    in the folder."""
-    good_files(folder)
-    found = [*_of_settings(), *_written()]
-    found += [Case(kind, arguments, wrong) for kind, arguments, wrong in wrong_files(folder, seed)]
-    found = list(dict.fromkeys(found))
-    random.Random(seed).shuffle(found)
-    counts: Counter[str] = Counter()
-    kept = []
-    for one in found:
-        counts[one.kind] += 1
-        if counts[one.kind] <= MOST_OF_A_KIND:
-            kept.append(one)
-    return kept
+def every_case(seed: int = 15) -> list[Case]:
+    """All of them, in an order that follows from the seed."""
+    chance = random.Random(seed)
+    found = [*_of_settings(chance), *_written(), *wrong_files()]
+    chance.shuffle(found)
+    return list({one.what: one for one in found}.values())
 
 
-# --- Run ------------------------------------------------------------------------------------------------
-
-
-class _Begun(UserError):
-    """The settings were good enough to begin the long part."""
-
-
-@contextlib.contextmanager
-def _nothing_long() -> Iterator[None]:
-    """Commands end where the computing would begin."""
-
-    def begun(*_: Any, **__: Any) -> None:
-        raise _Begun("begun")
-
-    with contextlib.ExitStack() as stack:
-        for name in (
-            "mpm_warp.solver.Solver.stages",
-            "sgns.simulate.workers.compile_kernels",
-            "sgns.train.lightning_module.run_trainer",
-            "sgns.train.polynomial.best_polynomial",
-            "sgns.evaluate.command.roll_out",
-            "sgns.rollout.rollout_scene",
-            "sgns.frontier.command.measure",
-        ):
-            with contextlib.suppress(AttributeError):
-                stack.enter_context(patch(name, begun))
-        yield
+def good_cases() -> list[Case]:
+    """The commands as the cases have them, with nothing wrong: they do their work."""
+    used = {(command, base, ()) for command, base, *_ in (*_groups(), *_WRITTEN) if base}
+    found = [Case("good", command, base, ()) for command, base, _ in sorted(used)]
+    return [
+        *found,
+        *(one for good in READ for one in wrong_file(good, "good", "as it is", lambda file: None)),
+    ]
 
 
 def run_cases(cases: Iterable[Case], folder: Path) -> Iterator[Outcome]:
-    """Each in a process of its own, one after another, in `folder`."""
-    torch.set_num_threads(1)
+    """What the commands do with them, each in a process and an empty folder of its own, one after another.
+
+    The start of Python is not in their times. Good files are made in `folder` first.
+    """
     call("simulate", "--cfg", "job")  # what is loaded once
-    for number, case in enumerate(cases):
-        yield _run(case, folder, f"o/{number}")
+    if not (folder / "good").exists():
+        _in_a_process(lambda: good_files(folder / "good"), sys.stderr.fileno())
+    for case in cases:
+        place = folder / "place"
+        place.mkdir()
+        if case.make is not None:
+            case.make(place, folder / "good")
+        with tempfile.TemporaryFile("w+") as said:
+            began = time.perf_counter()
+            status, memory = _in_a_process(partial(_run, case, place, said.fileno()), said.fileno())
+            seconds = time.perf_counter() - began
+            said.seek(0)
+            yield Outcome(case, status, said.read(), seconds, memory)
+        shutil.rmtree(place)
 
 
-def _run(case: Case, folder: Path, output: str) -> Outcome:
-    with tempfile.TemporaryFile("w+") as said:
-        began = time.perf_counter()
-        child = os.fork()
-        if child == 0:
-            _be_the_case(case, folder, output, said.fileno())
-        _, status, used = os.wait4(child, 0)
-        seconds = time.perf_counter() - began
-        said.seek(0)
-        text = said.read()
-    code = os.waitstatus_to_exitcode(status)
-    return Outcome(case, code, text, seconds, used.ru_maxrss * 1024)
+def _in_a_process(action: Any, said: int) -> tuple[int, int]:
+    """What an action answers in a process of its own, its status, and the most bytes that it held."""
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            status = action() or 0
+        except BaseException:
+            os.write(said, traceback.format_exc().encode())
+        finally:
+            os._exit(status if 0 <= status < 256 else 1)
+    _, status, used = os.wait4(child, 0)
+    return os.waitstatus_to_exitcode(status), used.ru_maxrss * 1024
 
 
-def _be_the_case(case: Case, folder: Path, output: str, said: int) -> None:
-    """What the process does, to its end."""
-    status = 1
-    try:
-        os.chdir(folder)
-        null = os.open(os.devnull, os.O_RDWR)
-        os.dup2(null, 0), os.dup2(null, 1), os.dup2(said, 2)  # noqa: B018
-        signal.alarm(int(1.5 * SECONDS))
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-        limit = pages * resource.getpagesize() + MEMORY
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        command, *rest = case.arguments
-        named = any(re.match(r"output=|--|-m$", text) for text in rest)
-        has = command in ("simulate", "rollout", "plot", "render") and not named and rest
-        name = {"plot": ".png", "render": ".gif"}.get(command, ".h5")
-        if has and not (command in ("plot", "render") and len(rest) > 1):
-            rest.append(f"output={output}{name}")
-        elif command in ("train", "reduce", "evaluate", "frontier") and not named and rest:
-            rest.append(f"output={output}")
-        with _nothing_long():
-            done = call(command, *rest)
-        lines = done.stderr.splitlines() or [""]
-        begun = done.returncode == 2 and lines[-1].endswith(": begun")
-        status = 0 if begun else done.returncode
-        os.write(said, (lines[-1] + "\n" if "Traceback" not in done.stderr else done.stderr).encode())
-    except BaseException:
-        os.write(said, traceback.format_exc().encode())
-    finally:
-        os._exit(status if 0 <= status < 256 else 1)
-
-
-def main() -> None:
-    """`python -m sgns_testing.wrong_inputs FOLDER OUT.jsonl [MOST]`: try them, and keep what happened."""
-    folder, kept = Path(sys.argv[1]), Path(sys.argv[2])
-    cases = every_case(folder)[: int(sys.argv[3]) if len(sys.argv) > 3 else None]
-    with kept.open("w") as file:
-        for one in run_cases(cases, folder):
-            record = {"kind": one.case.kind, "arguments": one.case.arguments, "wrong": one.case.wrong}
-            record |= {
-                "status": one.status,
-                "said": one.said[-3000:],
-                "seconds": one.seconds,
-                "memory": one.memory,
-            }
-            file.write(json.dumps(record | {"fault": one.fault}) + "\n")
-            file.flush()
-
-
-if __name__ == "__main__":
-    main()
+def _run(case: Case, place: Path, said: int) -> int:
+    os.chdir(place)
+    null = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1):
+        os.dup2(null, stream)
+    signal.alarm(int(2 * SECONDS))
+    resource.setrlimit(resource.RLIMIT_AS, (3 * BYTES, 3 * BYTES))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    done = call(case.command, *case.base, *case.wrong)
+    os.write(said, done.stderr.encode(errors="replace"))
+    return done.returncode
