@@ -149,6 +149,10 @@ def _other_bodies(folder: Path) -> list[Case]:
         Case("wheel", (wheel,)),
         Case("wheel with grousers that hold the soil", (replace(wheel, bilateral=True, **bars),)),
         Case("half a wheel", (wheel,), Effects(symmetry=True)),
+        Case(
+            "turned wheel, load over time",
+            (replace(wheel, slip_angle=30.0, load=((0.0, 60.0), (0.1, 90.0))),),
+        ),
         Case("pushed box", (pushed,)),
         Case("pushed mesh", (replace(pushed, tool=MeshBody(file=str(file))),)),
     ]

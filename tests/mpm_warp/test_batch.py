@@ -54,6 +54,7 @@ DIFFERENT = [  # in motion, gravity, material, grid, kind, time step and number 
     cut(duration=0.08, bed=Bed(size=(0.5, 0.3, 0.1), spacing=0.025, headroom=0.12)),
     wheel(duration=0.05),
     wheel(duration=0.07, load=60.0),
+    wheel(duration=0.06, slip_angle=30.0, load=((0.0, 20.0), (0.05, 60.0))),
 ]
 BEDS = [  # with 15 and 16 rows across: particles on the plane of symmetry and none
     cut(
