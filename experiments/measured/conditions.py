@@ -34,6 +34,10 @@ class Wheel(NamedTuple):
     """[m]"""
 
 
+SMALL = Wheel(0.058, 0.050)
+"""Of the 63 conditions."""
+
+
 class Soil(NamedTuple):
     """As its authors give it."""
 
@@ -116,7 +120,7 @@ def cmu() -> list[Condition]:
         found.append(
             Condition(
                 "cmu",
-                Wheel(0.058, 0.050),
+                SMALL,
                 Soil(1330.0, 29.0),
                 angle,
                 slip,

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import bekker
+import campaign
 import judge
 import numpy as np
 import pytest
@@ -12,10 +13,11 @@ from conditions import (
     FIXES,
     QUANTITIES,
     RIM_SPEEDS,
+    SLIPS,
+    SMALL,
     Condition,
     Forces,
     Soil,
-    Wheel,
     cmu,
     ding,
     errors,
@@ -27,7 +29,7 @@ GIVEN = bekker.Parameters(3e6, 0.3, 0.4, 0.5)
 
 
 def condition(slip_angle: float = 0.0, slip: float = 0.2) -> Condition:
-    return Condition("cmu", Wheel(0.058, 0.050), Soil(1330.0, 30.0), slip_angle, slip, 20.0, {}, {})
+    return Condition("cmu", SMALL, Soil(1330.0, 30.0), slip_angle, slip, 20.0, {}, {})
 
 
 def push(c: Condition, depth: float = 0.03) -> Forces:
@@ -282,3 +284,51 @@ def test_the_committed_table_has_every_quantity_of_both_wheels() -> None:
         *(("cmu", name) for name in QUANTITIES if name != "torque"),
         *(("ding", name) for name in QUANTITIES if name != "fy"),
     }
+
+
+# --- the campaign --------------------------------------------------------------------------------------
+
+
+def test_the_campaign_begins_with_every_slip_angle_and_rim_speed() -> None:
+    first = campaign.chosen("judged")[:32]
+    assert len({c.slip_angle for c in first}) == 7
+    assert {c.slip for c in first} == set(SLIPS)
+    assert sum(c.fixed for c in first) == 3
+    assert len(campaign.chosen("judged")) == len({c.key for c in campaign.chosen("judged")}) == 69
+    assert [c.slip for c in campaign.chosen("fix")] == list(FIXES)
+
+
+def test_the_solver_gets_the_wheel_the_soil_and_both_speeds() -> None:
+    c = next(c for c in cmu() if c.slip_angle == 75.0 and c.slip == 0.5)
+    scene, _ = campaign.scene_for(c, campaign.Setting(grid=0.016, speed=0.02))
+    assert scene.load == pytest.approx(c.load)
+    assert (scene.speed, scene.rim_speed, scene.slip_angle) == pytest.approx((0.02, 0.04, 75.0))
+    assert scene.material.bulk_density == pytest.approx(1330.0)
+    assert scene.bed.spacing == pytest.approx(0.016)
+
+
+def test_the_fastest_rim_travels_slower_and_the_larger_wheel_has_as_many_cells() -> None:
+    fast = next(c for c in cmu() if c.slip_angle == 0.0 and c.slip == 0.9)
+    small, large = (campaign.scene_for(c, campaign.Setting())[0] for c in (fast, ding()[0]))
+    assert (small.rim_speed, small.slip) == pytest.approx((0.3, 0.9))
+    assert large.bed.spacing / large.diameter == pytest.approx(small.bed.spacing / small.diameter)
+
+
+def test_the_solver_has_the_tables_signs() -> None:
+    """Locked at a slip angle: pulled back, pushed along the axle, turned by the soil; coarse and short."""
+    c = next(c for c in cmu() if c.slip_angle == 45.0 and c.slip == -1.0)
+    found = campaign.solved(c, campaign.Setting(grid=0.016, per_cell=1.0, speed=0.2, travel=0.1))
+    assert found["fx"] < -2.0
+    assert found["fy"] > 2.0
+    assert found["torque"] < 0.0
+    assert 0.0 < found["sinkage"] < 0.08
+
+
+def test_a_campaign_goes_on_where_it_stopped(tmp_path) -> None:
+    file, settings = tmp_path / "ours.csv", campaign.STUDIES["speed"]
+    asked = campaign.missing("speed", settings, file)
+    assert len(asked) == 4
+    for name, _, _ in asked[:3]:
+        campaign.append(name | campaign.written({"fx": 1.0, "seconds": 60.0}), file)
+    assert campaign.missing("speed", settings, file) == asked[3:]
+    assert len(campaign.missing("grid", campaign.STUDIES["grid"], file)) == 4
