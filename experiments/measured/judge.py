@@ -92,34 +92,36 @@ def ours(file: Path = HERE / "ours.csv") -> Answers:
 
 
 def table(conditions: list[Condition], models: Mapping[str, Answers]) -> list[dict]:
-    """Errors of each model in each quantity, as shares of the largest measured value.
+    """Errors of each model in each quantity, as shares of the largest measured value, and the trials' scatter likewise.
 
-    Where there are answers of ours, `median` and the others are over their conditions; `median_all` over all judged.
+    Over the conditions that ours answers, where it answers any of that wheel; `median_all` over all judged.
     """
     rows = []
-    same = set(models["ours"]) or {c.key for c in conditions}
     for source in ("cmu", "ding"):
-        of_source = [c for c in conditions if c.source == source]
+        wheels = [c for c in conditions if c.source == source]
+        keys = {c.key for c in wheels}
+        same = keys & set(models["ours"]) or keys
         for name in QUANTITIES:
             for model, answers in models.items():
-                chosen = {key: answer for key, answer in answers.items() if key in same}
-                here, everywhere = (errors(of_source, a).get(name) for a in (chosen, answers))
-                if everywhere is None:
-                    continue
-                row = {"source": source, "quantity": name, "model": model}
-                row |= {"median_all": float(np.median(everywhere))}
-                if here is not None:
-                    row |= {"judged": len(here), "median": float(np.median(here))}
-                    row |= {"mean": float(np.mean(here)), "worst": float(np.max(here))}
-                rows.append(row)
-            scatter = [c.scatter[name] for c in of_source if name in c.scatter]
-            if scatter:
-                largest = max(abs(c.measured[name]) for c in of_source)
-                shares = np.array(scatter) / largest
-                row = {"source": source, "quantity": name, "model": "scatter of trials"}
-                row |= {"median_all": float(np.median(shares)), "worst": float(np.max(shares))}
-                rows.append(row)
+                shares = errors(wheels, {key: answer for key, answer in answers.items() if key in same}).get(
+                    name
+                )
+                if shares is not None:
+                    row = {"source": source, "quantity": name, "model": model} | summary(shares)
+                    rows.append(row | {"median_all": float(np.median(errors(wheels, answers)[name]))})
+            trials = [c for c in wheels if name in c.scatter]
+            if trials:
+                largest = max(abs(c.measured[name]) for c in trials)
+                shares = np.array([c.scatter[name] / largest for c in trials])
+                rows.append(
+                    {"source": source, "quantity": name, "model": "scatter of trials"} | summary(shares)
+                )
     return rows
+
+
+def summary(shares: np.ndarray) -> dict[str, float]:
+    median, mean, worst = (float(of(shares)) for of in (np.median, np.mean, np.max))
+    return {"conditions": len(shares), "median": median, "mean": mean, "worst": worst}
 
 
 def answered(conditions: list[Condition], models: Mapping[str, Answers]) -> list[dict]:
@@ -187,11 +189,13 @@ def main() -> None:
     for name, force in rivals().items():
         models[name] = {c.key: steady(partial(force, c), c) for c in conditions}
     rows = table(conditions, models)
+    print("wheel quantity model              conditions median   mean  worst    all")
     write_rows(HERE / "table.csv", rows, 3)
     write_rows(HERE / "conditions.csv", answered(conditions, models))
     figure(conditions, models).savefig(HERE / "figure.png", dpi=90)
     for row in rows:
-        print(*(f"{value:.3g}" if isinstance(value, float) else value for value in row.values()), sep="  ")
+        words = [f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()]
+        print(f"{words[0]:6}{words[1]:9}{words[2]:25}" + "".join(f"{word:>7}" for word in words[3:]))
 
 
 if __name__ == "__main__":

@@ -250,7 +250,7 @@ def test_rivals_are_compared_on_the_conditions_that_we_have() -> None:
     ours = {c.key: c.measured for c in conditions[:4]}
     rows = judge.table(conditions, {"ours": ours, "rival": half_wrong, "perfect": perfect})
     pull = {row["model"]: row for row in rows if row["quantity"] == "fx"}
-    assert pull["ours"]["judged"] == pull["rival"]["judged"] == 4
+    assert pull["ours"]["conditions"] == pull["rival"]["conditions"] == 4
     assert pull["rival"]["median"] == 0.0 < pull["rival"]["median_all"]
 
 
