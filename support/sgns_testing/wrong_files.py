@@ -80,7 +80,8 @@ def good_files(folder: Path) -> None:
     write_stl(folder / "tool.stl", corners, triangles)
     write_text_stl(folder / "text.stl", corners, triangles)
     for suffix in ("ply", "off", "glb", "3mf"):
-        trimesh.Trimesh(corners, triangles).export(folder / f"tool.{suffix}")
+        unit = 1000.0 if suffix == "3mf" else 1.0  # which says that it is in millimetres
+        trimesh.Trimesh(corners * unit, triangles).export(folder / f"tool.{suffix}")
     published = folder / "published"
     published.mkdir()
     for split, count in (("train", 4), ("valid", 2), ("test", 1)):

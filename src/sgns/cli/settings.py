@@ -72,7 +72,7 @@ MOST_JOBS = 10_000
 
 
 def require_options(overrides: Sequence[str], groups: Iterable[str]) -> None:
-    """Refuse null, numbers and groups of keys as options of a group.
+    """Refuse null and numbers as options of a group.
 
     Raises:
         UserError: It names the group.
@@ -86,7 +86,7 @@ def require_options(overrides: Sequence[str], groups: Iterable[str]) -> None:
                 f"{override.input_line}: --config-dir is missing, the folder that holds experiment/*.yaml"
             )
         if key in groups and not (override.is_delete() or override.is_sweep_override()):
-            if not isinstance(value, (str, list)):
+            if not isinstance(value, (str, list, dict)):
                 raise UserError(
                     f"{key} is {_shown(value)}; allowed: {', '.join(options_of(key)) or 'names of files'}"
                 )
