@@ -210,7 +210,7 @@ class Bed(Settings):
     arrangement: Arrangement = setting(
         "lattice", "of the particles: a lattice, one with each particle moved at random, or random points"
     )
-    seed: int = setting(0, "of the random arrangements")
+    seed: int = setting(0, "of the random arrangements", ge=0, le=10**18)
     mirrored: bool = setting(False, "a random arrangement mirrors itself about y = Ly / 2, as symmetry needs")
     initial_stress: Literal["geostatic", "k0", "none"] = setting(
         "geostatic",

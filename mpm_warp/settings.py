@@ -25,13 +25,15 @@ from typing import (
 )
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from typing_extensions import Self, dataclass_transform  # in `typing` from Python 3.11
 
 from .state import SceneError
 
 T = TypeVar("T")
 _CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True)
+# Of what must be above 0, and of what has no limit of its own: their squares and products stay finite.
+_SMALLEST, _LARGEST = 1e-15, 1e15
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,7 @@ def described(cls: type) -> list[tuple[str, str, str, str]]:
 def reference(groups: Iterable[type[Settings]]) -> str:
     """The page of the documentation that lists the settings of some classes, in Markdown."""
     lines = ["# Every setting", "", "Python and the command line have the same names."]
+    lines += [f"Numbers are at most {_LARGEST:g} in size, and what is above 0 is at least {_SMALLEST:g}."]
     for cls in groups:
         base = cls.__base__
         shared = described(base) if base and is_dataclass(base) else []
@@ -237,11 +240,19 @@ def _limited(hint: Any, known: Setting) -> Any:
     if hint in (bool, str):
         return Annotated[hint, Field(strict=True)]
     if hint in (int, float):
-        return Annotated[hint, Field(strict=True, gt=known.gt, ge=known.ge, lt=known.lt, le=known.le)]
+        limits = Field(strict=True, gt=known.gt, ge=known.ge, lt=known.lt, le=known.le)
+        most = max(_LARGEST, known.le or 0)
+
+        def sized(value: float) -> float:
+            if abs(value) > most or (known.gt == 0 and value < _SMALLEST):
+                raise ValueError
+            return value
+
+        return Annotated[hint, limits, AfterValidator(sized)]
     parts = tuple(_limited(part, known) for part in get_args(hint))
     if get_origin(hint) in (Union, UnionType):
         return Union[parts]  # noqa: UP007
-    return get_origin(hint)[parts] if get_origin(hint) in (tuple, list) else hint
+    return get_origin(hint)[parts] if get_origin(hint) in (tuple, list, dict) else hint
 
 
 def _checked(cls: type[Settings], name: str, value: Any, place: str = "") -> Any:
@@ -264,9 +275,8 @@ def _checked(cls: type[Settings], name: str, value: Any, place: str = "") -> Any
     either = float in get_args(kind) and any(get_origin(part) is tuple for part in get_args(kind))
     wrong_type = "" if known.choices or either else _wrong_type(problem, kind)
     # To somebody who writes Python the range says more than that a number must be finite.
-    if wrong_type and (
-        place or (not known.words and not (known.range and problem["type"] == "finite_number"))
-    ):
+    range_says_more = known.words or (known.range and problem["type"] == "finite_number")
+    if wrong_type and (place or problem["type"] == "value_error" or not range_says_more):
         index = "" if problem["type"] == "missing" else "".join(f"[{i}]" for i in problem["loc"])
         raise cls.raises(f"{place or own}{index} is {problem['input']!r}; {wrong_type}")
     if isinstance(value, list) and get_origin(kind) is tuple:
@@ -281,6 +291,8 @@ def _wrong_type(problem: Any, kind: Any) -> str:
             return "it must be a whole number"
         case "float_type" | "finite_number":
             return "it must be a finite number"
+        case "value_error":
+            return f"it must be {_SMALLEST:g} to {_LARGEST:g} in size"
         case "bool_type":
             return "allowed: true, false"
         case "string_type":

@@ -32,9 +32,11 @@ def closed_mesh(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Solid
     united.
 
     Raises:
-        SceneError: the mesh is open or encloses no volume.
+        SceneError: the mesh is open, encloses no volume, or is larger than anything.
     """
     notes: list[str] = []
+    if not np.abs(vertices).max(initial=0.0) <= _FARTHEST:
+        raise SceneError(f"tool.file: a corner of the mesh in {name} is not finite or beyond {_FARTHEST:g} m")
     if not len(triangles):
         raise SceneError(f"tool.file: no triangle of the mesh in {name} has an area")
     vertices, triangles = _joined(vertices, triangles, name, notes)

@@ -36,7 +36,7 @@ class DatasetSettings(Group):
     change: dict[str, Any] | None = setting(
         None, "values in that scene", words="; it must be a group of keys of the scene"
     )
-    draw: dict[str, Any] | list[Any] | None = setting(
+    draw: dict[str, Any] | list[dict[str, Any]] | None = setting(
         None,
         "every run takes one combination of a grid",
         words="; it must be a grid, key: [values], or a list of such grids",
@@ -258,6 +258,49 @@ class FitSettings(Group):
         for key in ("noises", "penalties"):
             if not getattr(self, key):
                 raise UserError(f"training.{key} is []; it must be a list of numbers, 0 or more")
+
+
+# --- conf/study -----------------------------------------------------------------------------------------
+
+
+@settings
+class PointSettings(Group):
+    """What makes a point of a study."""
+
+    group: ClassVar[str] = "study.scenes"
+    axis: str = setting("", "what is varied")
+    label: str = setting("", "its name, unique in its list")
+    set: list[str] = setting(
+        list, "overrides: of `sgns simulate` for the solver, of `sgns train` for surrogates"
+    )
+    paper: bool = setting(False, "it is an operating point of the paper")
+    centring: Literal["scalar", "particle", "particle_axis"] = setting("particle_axis", "of a reduction")
+    modes: list[int] = setting(list, "of a reduction: the numbers r, a point each", ge=1)
+
+
+def _points() -> Any:
+    return setting(None, "its points", words="; it must be a list of points, each with axis and label")
+
+
+@settings
+class StudySceneSettings(Group):
+    """One figure of a study: a kind of scene, what it is judged on, and its points."""
+
+    group: ClassVar[str] = "study.scenes"
+    scene: str = setting("", "option of the group `scene` that all points start from")
+    dataset: str = setting("", "that surrogates learn from; the cases are among its test runs")
+    cases: dict[str, list[str]] = setting(
+        dict, "runs that all points are judged on", words="; it must be case: [overrides of sgns simulate]"
+    )
+    bands: dict[str, float] | None = setting(
+        None, "how wrong the reference may be", ge=0, words="; it must be column of errors: number, 0 or more"
+    )
+    reference: dict[str, Any] = setting(
+        dict, "the most accurate run", words="; it must be a group with label and set"
+    )
+    solver: list[Any] | None = _points()
+    reduction: list[Any] | None = _points()
+    surrogate: list[Any] | None = _points()
 
 
 # --- The commands' own keys -----------------------------------------------------------------------------

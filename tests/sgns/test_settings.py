@@ -93,6 +93,23 @@ def test_presets_state_only_what_is_allowed() -> None:
         (TrainingSettings, {"schedule": "flat"}, "training.schedule is 'flat'; allowed: cosine, exponential"),
         (TrainingSettings, {"max_steps": 2.5}, "training.max_steps is 2.5; it must be a whole number"),
         (TrainingSettings, {"max_steps": True}, "training.max_steps is True; it must be a whole number"),
+        (
+            TrainingSettings,
+            {"learning_rate": 1e-300},
+            "training.learning_rate is 1e-300; it must be 1e-15 to 1e+15 in size",
+        ),
+        (
+            TrainingSettings,
+            {"weight_decay": 1e300},
+            "training.weight_decay is 1e+300; it must be 1e-15 to 1e+15 in size",
+        ),
+        (DatasetSettings, {"draw": [[1]]}, "dataset.draw is [[1]]; it must be a grid"),
+        (typed.PointSettings, {"modes": [0]}, "study.scenes.modes is [0]; it must be 1 or more"),
+        (
+            typed.StudySceneSettings,
+            {"bands": {"a": "x"}},
+            "study.scenes.bands[a] is 'x'; it must be a finite number",
+        ),
         (TrainingSettings, {"resume": True}, "training.resume is True; allowed: auto, false"),
         (TrainingSettings, {"noise": float("nan")}, "training.noise is nan; it must be a finite number"),
         (TrainingSettings, {"loss": {"force": -1}}, "training.loss.force is -1.0; it must be 0 or more"),

@@ -492,7 +492,7 @@ def test_what_a_simulator_is_made_of_is_looked_at(trained) -> None:
         with pytest.raises(UserError, match=r"cannot be used: .*; use device=cpu"):
             Simulator(surrogate, device)
     for num_modes in (0, 1.5, True, 5, "2"):
-        with pytest.raises(UserError, match=r"trained with 4 modes and cannot have .*; allowed: 1 to 4"):
+        with pytest.raises(UserError, match=r"num_modes is .*; allowed: 1 to 4, with which"):
             Simulator(surrogate, num_modes=num_modes)
     for rate_independent in (None, 1, "yes"):
         with pytest.raises(UserError, match="rate_independent"):

@@ -93,6 +93,7 @@ _UNWRITABLE = (
     errno.EROFS,
 )
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_LONGEST = 1000  # characters of a line about an error; what a person wrote stands in it, and may be longer
 
 
 class _Stopped(BaseException):
@@ -190,11 +191,12 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
     from hydra.core.plugins import Plugins
     from hydra.types import RunMode
 
-    from sgns.cli.settings import CheckedLoader, ConfigDir, require_few_jobs
+    from sgns.cli.settings import CheckedLoader, ConfigDir, OwnFiles, require_few_jobs
 
     if arguments.config_dir is not None and not os.path.isdir(arguments.config_dir):
         raise UserError(f"--config-dir: folder '{arguments.config_dir}' not found")
-    Plugins.instance().register(ConfigDir)
+    for plugin in (ConfigDir, OwnFiles):
+        Plugins.instance().register(plugin)
     ConfigDir.folder = None if arguments.config_dir is None else os.path.abspath(arguments.config_dir)
     settings = arguments.settings
     with initialize_config_module("sgns.conf", job_name="sgns", version_base="1.3"):
@@ -400,7 +402,8 @@ def _line_of(error: Exception) -> str | None:
         return f"{' '.join(taken_out)}: what is taken out here is needed; leave this out"
     from sgns.cli.help import describe
 
-    return describe(error)
+    line = describe(error)
+    return None if line is None else _one_line(line)
 
 
 def _of_mkdir(error: BaseException) -> bool:
@@ -412,7 +415,8 @@ def _of_mkdir(error: BaseException) -> bool:
 
 
 def _one_line(text: str) -> str:
-    return " ".join(text.split())
+    line = " ".join(text.split())
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
 
 
 def _show_traceback() -> None:

@@ -161,10 +161,6 @@ def describe(error: Exception) -> str | None:
         return _missing_option(error)
     if isinstance(error, errors.ConfigCompositionException):
         return _composition(error)
-    if isinstance(error, ValueError) and str(error).startswith("Config group override must be a string"):
-        return (
-            "a group is null or a number; groups take one of their options, as in dataset=quick; see --help"
-        )
     if isinstance(error, ValueError) and str(error).startswith(_LOGGING):
         cause = "" if error.__cause__ is None else f": {error.__cause__}"
         return _flat(f"the settings of the logging are wrong: {error}{cause}")

@@ -6,7 +6,8 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,15 +18,16 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
-from hydra.plugins.config_source import ConfigSource
+from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from sgns import settings as typed
 from sgns.cli.help import describe, groups_of, options_of
-from sgns.config import UserError
+from sgns.config import UserError, parse_yaml
 
 # --- Settings run nothing and open no file: what Hydra's own settings may hold --------------------------
 # Hydra makes objects by their names: `_target_` in its launchers, sweepers and callbacks, classes in its
@@ -67,6 +69,27 @@ def require_plain_overrides(overrides: Sequence[str]) -> None:
 
 MOST_JOBS = 10_000
 """Of a sweep."""
+
+
+def require_options(overrides: Sequence[str], groups: Iterable[str]) -> None:
+    """Refuse null and numbers as options of a group.
+
+    Raises:
+        UserError: It names the group.
+    """
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key, value = override.key_or_group, None if override.is_sweep_override() else override.value()
+        if not key:
+            raise UserError(f"cannot read {override.input_line!r}; settings are written key=value")
+        if key == "experiment" and ConfigDir.folder is None:
+            raise UserError(
+                f"{override.input_line}: --config-dir is missing, the folder that holds experiment/*.yaml"
+            )
+        if key in groups and not (override.is_delete() or override.is_sweep_override()):
+            if not isinstance(value, (str, list, dict)):
+                raise UserError(
+                    f"{key} is {_shown(value)}; allowed: {', '.join(options_of(key)) or 'names of files'}"
+                )
 
 
 def require_few_jobs(overrides: Sequence[str]) -> None:
@@ -263,6 +286,37 @@ def _refusal(path: Keys, value: Any, hint: str = "") -> UserError:
 
 # --- How settings are put together: by Hydra, with a look at each result before anybody acts on it ------
 
+_sources: Any = Plugins.instance().discover(ConfigSource)
+_Files: Any = next(one for one in _sources if one.scheme() == "file")
+_MOST_BYTES = 1 << 20
+"""Of a file of settings."""
+
+
+class OwnFiles(_Files):
+    """Files of settings that anybody may have written: looked at before OmegaConf copies what aliases stand for."""
+
+    @staticmethod
+    def scheme() -> str:
+        return "own"
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """As Hydra's own.
+
+        Raises:
+            UserError: The file is no group of settings, or stands for more than fits in memory.
+        """
+        from sgns.data.files import read_text
+
+        file = Path(self.path, self._normalize_file_name(config_path))
+        text = read_text(file, "no file of settings", "repair it", _MOST_BYTES)
+        try:
+            content = parse_yaml(text)
+        except ValueError as error:
+            raise UserError(f"{file} is no file of settings: {error}; repair it") from None
+        if not isinstance(content, dict | None):
+            raise UserError(f"{file} is no file of settings: it holds no keys with values; repair it")
+        return super().load_config(config_path)
+
 
 class ConfigDir(SearchPathPlugin):
     """Adds the folder of `--config-dir` to the places where options of groups are found."""
@@ -271,7 +325,7 @@ class ConfigDir(SearchPathPlugin):
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         if ConfigDir.folder is not None:
-            search_path.append("command-line", f"file://{ConfigDir.folder}")
+            search_path.append("command-line", f"{OwnFiles.scheme()}://{ConfigDir.folder}")
 
 
 class CheckedLoader(ConfigLoader):
@@ -298,6 +352,8 @@ class CheckedLoader(ConfigLoader):
         validate_sweep_overrides: bool = True,
     ) -> DictConfig:
         overrides = self._with_scene(overrides, config_name)
+        with suppress(HydraException):  # composing says what cannot be read
+            require_options(overrides, ("hydra", *groups_of(config_name or "")))
         return self._checked(
             overrides,
             lambda: self._loader.load_configuration(
@@ -319,7 +375,8 @@ class CheckedLoader(ConfigLoader):
         if config_name != "simulate" or not datasets or any(one.startswith("scene=") for one in overrides):
             return overrides
         try:
-            alone = self._loader.load_configuration("simulate", datasets[-1:], RunMode.RUN)
+            own = [one for one in overrides if one.startswith("dataset.scene=")]
+            alone = self._loader.load_configuration("simulate", [*datasets[-1:], *own], RunMode.RUN)
             scene = alone.dataset.get("scene")
         except Exception:  # said where everything is composed
             return overrides
@@ -436,6 +493,12 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
     Raises:
         UserError: The line names the key.
     """
+    own: Any = typed.COMMANDS[command]
+    if odd := set(cfg) - _keys_of(command):
+        # A file of settings may be for several commands.
+        if odd := odd.difference(*map(_keys_of, typed.COMMANDS)):
+            known = ", ".join(sorted(_keys_of(command)))
+            raise UserError(f"{min(odd)}: no such key; keys of sgns {command}: {known}")
     campaign = command == "simulate" and cfg.get("dataset") is not None  # may draw what its scene lacks
     missing = sorted(
         key for key in OmegaConf.missing_keys(cfg) if not (campaign and key.startswith("scene."))
@@ -446,7 +509,8 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
         takes = {"check": "run files", "plot": "a run file", "render": "a run file"}.get(command)
         give = keys if takes is None else f"{takes}, as in sgns {command} run.h5"
         raise UserError(f"{what} missing for {', '.join(missing)}; give {give}; see sgns {command} --help")
-    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    every: Any = OmegaConf.to_container(cfg, resolve=True)
+    plain = {key: value for key, value in every.items() if key in _keys_of(command)}
     for group, default in groups_of(command).items():
         if default is not None and cfg.get(group) is None:
             allowed = ", ".join(options_of(group))
@@ -461,7 +525,6 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
         raise UserError(
             "dataset.name is missing; choose a dataset, as in dataset=quick, or give this one a name"
         )
-    own: Any = typed.COMMANDS[command]
     own.from_dict({one.name: plain[one.name] for one in fields(own) if one.name in plain})
     if plain.get("dataset") is not None:
         typed.dataset_settings(plain["dataset"])
@@ -471,6 +534,11 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
         typed.training_settings(plain["model"], plain["training"])
     if "solver" in plain:
         typed.SolverSettings.from_dict(plain["solver"])
+
+
+def _keys_of(command: str) -> set[str]:
+    """Keys and groups of a command."""
+    return {one.name for one in fields(typed.COMMANDS[command])} | set(groups_of(command))  # type: ignore[arg-type]
 
 
 def _shown(value: Any) -> str:

@@ -133,6 +133,11 @@ def scene_problems(scene: Mapping[str, Any]) -> list[str]:
         if not isinstance(blade, Mapping):
             return [f"scene.blade is {blade!r:.40}, not a group of keys"]
         found += [(f"blade.{key}", blade.get(key)) for key in _BLADE_NUMBERS]
+    if "bed" in scene:
+        size = scene["bed"].get("size") if isinstance(scene["bed"], Mapping) else None
+        if not isinstance(size, list) or len(size) != 3:
+            return [f"scene.bed.size is {size!r:.40}, not three lengths"]
+        found += [(f"bed.size[{axis}]", length) for axis, length in enumerate(size)]
     return [
         f"scene.{key} is {value!r:.40}, not a finite number"
         for key, value in found

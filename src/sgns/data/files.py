@@ -252,6 +252,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         # A full disk is reported without a name.
         if error.filename is None or str(error.filename).endswith(_SUFFIX):
             error.filename = str(path)
+        if error.errno == errno.ENOENT:  # there are folders that take no files, such as /proc
+            raise UserError(f"cannot write {path}: {error.strerror}; choose another output") from error
         raise
 
 

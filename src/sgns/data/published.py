@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from mpm_warp.inputs import open_file, read_text
+from mpm_warp.inputs import open_file
 from mpm_warp.poses import fitted_poses
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
-from sgns.data.files import parse_json
+from sgns.data.files import read_json
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset, ReducedRun
 
@@ -35,7 +35,6 @@ _SUBSPACE = 6  # the particle type of a subspace node; all others are nodes of t
 _FREE = 0  # the particle type of a wheel's nodes; those of a blade, which is prescribed, are 3
 _MOST_BYTES = 1 << 33  # of a .tfrecord; the authors' largest has a tenth of that
 _MOST_OF_RUN = 1 << 28  # of one run in it
-_MOST_METADATA = 1 << 22
 _LONGEST = 63  # bits before the last part of a number
 _MARGIN = 0.1  # the authors' bin starts at this coordinate on each axis [m]
 _BINS = {"excavation": (0.80, 0.60, 0.15), "wheel": (0.40, 0.19, 0.0583)}  # Lx, Ly, Lz [m]
@@ -64,15 +63,16 @@ class PublishedRun:
 def read_published(folder: str | Path, split: str = "valid") -> list[PublishedRun]:
     """The runs of one folder with `<split>.tfrecord` and `metadata.json`."""
     folder = Path(folder)
-    try:
-        metadata = parse_json(read_text(folder / "metadata.json", _MOST_METADATA))
-        cases = metadata["dataset_split"].get(split)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{folder} does not hold the published {split} runs: {error}") from None
+    about = folder / "metadata.json"
+    metadata = read_json(about, "no description of published runs", "copy the authors' files again")
+    splits = metadata.get("dataset_split") if isinstance(metadata, dict) else None
+    cases = splits.get(split) if isinstance(splits, dict) else ()
     if cases is not None and (
         not isinstance(cases, list) or not all(case is None or type(case) is int for case in cases)
     ):
-        raise UserError(f"{folder}: metadata.json does not name the {split} runs by their numbers")
+        raise UserError(
+            f"{about} does not name the {split} runs by their numbers; it needs dataset_split: {{{split}: [1, 2]}}"
+        )
     try:
         with open_file(folder / f"{split}.tfrecord", _MOST_BYTES) as file:
             records = _records(file)

@@ -17,7 +17,7 @@ from sgns.evaluate.report import PAGES, ReportFigure, write_figures
 from sgns.frontier.figures import known, reduction_figure, scene_figure, through_time_figure, training_figure
 from sgns.frontier.observation import Observation, compare, errors
 from sgns.frontier.point import ERRORS, Point, front, write_points
-from sgns.frontier.study import AXES, Study, StudyScene
+from sgns.frontier.study import AXES, Study, StudyScene, composed, composed_scene
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +37,10 @@ def main(cfg: DictConfig) -> None:
         *(file for file in measured if not file.is_file()),  # those that are there are read only
     )
     if axes:
+        for scene in study.scenes:  # what is wrong there is said now, not after hours
+            composed("reduce", [f"dataset={scene.dataset}"])
+            for overrides in scene.cases.values():
+                composed_scene(overrides)
         with file_lock(folder / "study.yaml", wait=True):  # what it says is read and added to
             study.record()
         from sgns.frontier.measure import measure  # training takes seconds to import

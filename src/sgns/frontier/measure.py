@@ -28,7 +28,6 @@ from sgns.evaluate.results import Scores, aggregate, run_scores
 from sgns.frontier.observation import Observation, Seen, observe
 from sgns.frontier.point import Point
 from sgns.frontier.study import (
-    PointSettings,
     Study,
     StudyScene,
     Workload,
@@ -39,9 +38,10 @@ from sgns.frontier.study import (
     one_core,
     stopwatch,
 )
-from sgns.reduction.basis import CENTRINGS, Basis, reconstruction_curve
+from sgns.reduction.basis import Basis, reconstruction_curve
 from sgns.reduction.reduce import ReducedDataset, fit_runs, reduce_dataset
 from sgns.rollout import finite_frames
+from sgns.settings import PointSettings
 from sgns.simulate.scene import asked_effects, decided
 from sgns.simulator import Rollout, Simulator
 from sgns.train.command import train
@@ -140,16 +140,15 @@ def reduction_points(scene: StudyScene) -> Iterator[PointSettings]:
     """
     for entry in scene.points("reduction"):
         where = f"study.scenes.{scene.name}.reduction, {entry.label!r}"
-        centring, modes = entry.centring, entry.modes
-        if centring not in CENTRINGS:
-            raise UserError(f"{where}: centring is {centring!r}; allowed: {', '.join(CENTRINGS)}")
-        if not isinstance(modes, list) or not all(type(r) is int and r >= 1 for r in modes):
-            raise UserError(f"{where}: modes is {modes!r}; it must be a list of whole numbers, 1 or more")
-        for r in modes:
-            changes = [f"reduction.centring={centring}", f"reduction.num_modes={r}"]
+        if not entry.modes:
+            raise UserError(
+                f"{where}: modes is missing; a reduction needs a list of whole numbers, 1 or more"
+            )
+        for r in entry.modes:
+            changes = [f"reduction.centring={entry.centring}", f"reduction.num_modes={r}"]
             if r > 64:  # kept by default
                 changes.append(f"reduction.max_modes={r}")
-            yield replace(entry, label=f"{entry.label}, r {r}", set=tuple(changes), modes=r)
+            yield replace(entry, label=f"{entry.label}, r {r}", set=changes, modes=[r])
 
 
 def reduction_jobs(study: Study, scene: StudyScene, workload: Workload) -> Jobs:
@@ -161,7 +160,7 @@ def reduction_jobs(study: Study, scene: StudyScene, workload: Workload) -> Jobs:
     data = training_settings(scene.dataset).dataset
     dataset = Dataset.open(data.path, data.get("where"))
     training, held_out = dataset.runs("train"), [*dataset.runs("validation"), *dataset.runs("test")]
-    pca = fit_runs(training, max(p.modes for p in asked))
+    pca = fit_runs(training, max(p.modes[0] for p in asked))
     log.info("%s, reduction: fitted on %d runs (%.0f s)", scene.name, len(training), watch()[0])
     # Mean square [m²] about each particle's mean place: what the energy is a share of, for every centring.
     motion = float(reconstruction_curve(held_out, pca.basis("particle_axis", 1))[0])
@@ -169,21 +168,22 @@ def reduction_jobs(study: Study, scene: StudyScene, workload: Workload) -> Jobs:
         basis = pca.basis(centring, pca.rank(centring))
         left_out = reconstruction_curve(held_out, basis)
         for entry in (p for p in asked if p.centring == centring):
-            if entry.modes > basis.num_modes:
-                log.info("%s: r %d left out, the data has %d modes", scene.name, entry.modes, basis.num_modes)
+            (r,) = entry.modes
+            if r > basis.num_modes:
+                log.info("%s: r %d left out, the data has %d modes", scene.name, r, basis.num_modes)
                 continue
             columns = {
                 "settings": shlex.join([f"dataset={scene.dataset}", *entry.set]),
-                "modes": float(entry.modes),
+                "modes": float(r),
                 "particles": float(len(basis.modes)),
                 "own_runs": float(len(held_out)),
-                "own_position_rmse_mm": 1e3 * float(left_out[entry.modes]) ** 0.5,
+                "own_position_rmse_mm": 1e3 * float(left_out[r]) ** 0.5,
                 "frozen_rmse_mm": 1e3 * motion**0.5,
-                "energy": 1.0 - float(left_out[entry.modes]) / motion,
+                "energy": 1.0 - float(left_out[r]) / motion,
                 "training_runs": float(len(training)),
             }
             point = new_point(study, scene, "reduction", entry, **columns)
-            yield entry, partial(coded, point, basis.sliced(entry.modes), held_out[0], workload)
+            yield entry, partial(coded, point, basis.sliced(r), held_out[0], workload)
 
 
 def coded(point: Point, basis: Basis, path: Path, workload: Workload) -> Measured:

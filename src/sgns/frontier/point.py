@@ -207,6 +207,8 @@ def read_points(file: Path) -> list[Point]:
         UserError: it cannot be read or is no such table.
     """
     rows = read_table(file, "no table of operating points", "make it: sgns frontier")
+    if not rows:
+        raise UserError(f"{file} is no table of operating points: it has no rows; make it: sgns frontier")
     try:
         return [Point.from_row(row) for row in rows]
     except UserError as error:

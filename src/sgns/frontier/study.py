@@ -11,7 +11,7 @@ import subprocess
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
 from mpm_warp import Frame, Scene, Solver, effects_for
+from mpm_warp.settings import build
 from sgns import __version__
 from sgns.config import UserError, parse_yaml
 from sgns.data.files import read_json, read_text, write_whole
@@ -30,6 +31,7 @@ from sgns.frontier.observation import Observation, read_observation
 from sgns.frontier.point import ERRORS, Point, core_time
 from sgns.numbers import elapsed
 from sgns.rollout import single_thread
+from sgns.settings import PointSettings, StudySceneSettings
 from sgns.simulate.scene import scene_from_config
 
 AXES = ("solver", "reduction", "surrogate")
@@ -59,29 +61,17 @@ def require_known(keys: Iterable[str], allowed: Collection[str], words: str) -> 
         raise UserError(f"{words} {wrong[0]!r}; allowed: {', '.join(allowed)}")
 
 
-@dataclass(frozen=True)
-class PointSettings:
-    """One entry of an axis in conf/study: what makes a point."""
+def point_settings(data: Any, where: str) -> PointSettings:
+    """An entry of conf/study.
 
-    axis: str
-    label: str
-    set: tuple[str, ...] = ()  # overrides: of `sgns simulate` for the solver, of `sgns train` for surrogates
-    paper: bool = False  # it is an operating point of the paper
-    centring: Any = None  # of a reduction
-    modes: Any = None  # of a reduction: the numbers r, a point each
-
-    @classmethod
-    def from_dict(cls, data: Any, where: str) -> PointSettings:
-        """From an entry of conf/study.
-
-        Raises:
-            UserError: it has no axis or no label, or a key that is not known.
-        """
-        if not isinstance(data, Mapping) or not data.get("axis") or not data.get("label"):
-            raise UserError(f"{where} holds {data!r}; every point needs axis and label, and set: [overrides]")
-        known = [field.name for field in fields(cls)]
-        require_known(data, known, f"{where}, {data['label']!r} has the unknown key")
-        return cls(**{**data, "set": tuple(map(str, data.get("set") or ()))})
+    Raises:
+        UserError: it has no axis or no label, or a key or value that is not allowed.
+    """
+    if not isinstance(data, Mapping) or not data.get("axis") or not data.get("label"):
+        raise UserError(f"{where} holds {data!r}; every point needs axis and label, and set: [overrides]")
+    found = build(PointSettings, dict(data), f"{where}, {data['label']!r}")
+    assert isinstance(found, PointSettings)
+    return found
 
 
 @dataclass(frozen=True)
@@ -118,12 +108,12 @@ class StudyScene:
     def reference(self) -> PointSettings:
         """The most accurate run."""
         entry = {"axis": "reference"} | dict(self.settings["reference"])
-        return PointSettings.from_dict(entry, f"study.scenes.{self.name}.reference")
+        return point_settings(entry, f"study.scenes.{self.name}.reference")
 
     def points(self, axis: str) -> list[PointSettings]:
         """Points of an axis, in the order in which they are measured."""
         where = f"study.scenes.{self.name}.{axis}"
-        found = [PointSettings.from_dict(entry, where) for entry in self.settings.get(axis) or ()]
+        found = [point_settings(entry, where) for entry in self.settings.get(axis) or ()]
         labels = [point.label for point in found]
         if twice := {label for label in labels if labels.count(label) > 1}:
             raise UserError(f"{where} has two points with the label {min(twice)!r}")
@@ -151,17 +141,23 @@ class Study:
             UserError: a scene lacks what it needs, or has a key that is not known.
         """
         scenes = settings.get("scenes")
-        if not isinstance(scenes, Mapping) or not scenes or not settings.get("name"):
+        if not isinstance(scenes, Mapping) or not scenes or not isinstance(settings.get("name"), str):
             raise UserError("study needs name and scenes; see conf/study/quick.yaml")
+        require_known(settings, ("name", "scenes"), "study has no key")
         needed = ("scene", "dataset", "cases", "reference")
         for name, scene in scenes.items():
             where = f"study.scenes.{name}"
             for key in needed:
                 if not isinstance(scene, Mapping) or not scene.get(key):
                     raise UserError(f"{where}.{key} is missing; see conf/study/quick.yaml")
-            require_known(scene, (*needed, "bands", *AXES), f"{where} has no key")
+            build(StudySceneSettings, scene, where)
             require_known(scene.get("bands") or (), ERRORS, f"{where}.bands has no key")
-        return cls(str(settings["name"]), tuple(StudyScene(n, s) for n, s in scenes.items()), folder)
+        study = cls(settings["name"], tuple(StudyScene(n, s) for n, s in scenes.items()), folder)
+        for one in study.scenes:
+            assert one.reference  # read now, not after hours
+            for axis in AXES:
+                one.points(axis)
+        return study
 
     def record(self) -> None:
         """Write what is asked for into the folder's study.yaml.

@@ -194,6 +194,13 @@ def load_surrogate(path: str | Path) -> Surrogate:
         basis = Basis.from_state(card["basis"] | tensors, where=str(path))
         surrogate = Surrogate(dynamics, basis, state["start_positions"], state["body_points"], card)
         surrogate.load_state_dict(state)
+        own = surrogate.state_dict()
+        if odd := [
+            name
+            for name, value in state.items()
+            if value.dtype.is_floating_point != own[name].is_floating_point()
+        ]:
+            raise ValueError(f"{odd[0]} holds {state[odd[0]].dtype}")
         if not 0.0 < surrogate.frame_rate < math.inf:
             raise ValueError(f"the frame rate is {surrogate.frame_rate} Hz")
         if not all(bool(value.isfinite().all()) for value in state.values() if value.is_floating_point()):

@@ -280,8 +280,8 @@ class Dynamics(nn.Module):
         """For `with_modes`."""
         if not is_whole(num_modes) or not 1 <= num_modes <= self.num_modes:
             raise UserError(
-                f"the {self.settings.kind} was trained with {self.num_modes} modes and cannot have {num_modes!r}; "
-                f"allowed: 1 to {self.num_modes}"
+                f"num_modes is {num_modes!r}; allowed: 1 to {self.num_modes}, with which the {self.settings.kind} was "
+                "trained"
             )
 
     def known_context(self, context: Tensor | None) -> Tensor:

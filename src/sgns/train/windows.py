@@ -110,8 +110,7 @@ class TrainingWindows:
         self.context = torch.as_tensor(np.stack([context_of(run.scene, context) for run in runs]))
         if len(self.targets) == 0:
             raise UserError(
-                f"the training runs are too short: to learn {horizon} step{'s' * (horizon > 1)} at once they need at "
-                f"least {horizon + 1} frames"
+                f"the training runs are too short for training.horizon={horizon}: they need {horizon + 1} frames"
             )
         # Windows of one batch have the same number of body nodes.
         nodes = self.body_nodes[self.of_run[self.targets]]

@@ -111,6 +111,24 @@ def test_files_of_settings_run_nothing(name, hostile) -> None:
     refuse(*with_file(FILES[name]))
 
 
+DOUBLED = "\n".join(f"b{i}: &b{i} [{', '.join([f'*b{i - 1}'] * 9)}]" for i in range(1, 15))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("scene: &s {a: *s}", "x.yaml is no file of settings: alias s has no value yet"),
+        (f"b0: &b0 [x]\n{DOUBLED}", "x.yaml is no file of settings: it stands for more than"),
+        ("- 1", "x.yaml is no file of settings: it holds no keys with values"),
+        ("a text", "x.yaml is no file of settings: it holds no keys with values"),
+        ("nosuch: 1", "nosuch: no such key; keys of sgns simulate: continue_from, dataset,"),
+    ],
+    ids=["of itself", "multiplies", "list", "text", "unknown key"],
+)
+def test_files_that_are_no_settings(text, words, hostile) -> None:
+    assert words in refused("simulate", *with_file(text))
+
+
 @pytest.mark.parametrize("name", ["callback made by a resolver", "log file", "environment", "launcher"])
 def test_files_of_settings_run_nothing_in_a_sweep(name, hostile) -> None:
     refuse(*with_file(FILES[name]), "-m", "seed=1,2")
@@ -187,7 +205,8 @@ def test_commands_of_a_launcher_are_taken_from_the_command_line_only(hostile) ->
     ids=str,
 )
 def test_what_stays_allowed(arguments, seeds, hostile, monkeypatch) -> None:
-    Path("conf/experiment/good.yaml").write_text("# @package _global_\nseed: 3\n")
+    shared = "model: {history: 3}"  # for sgns train
+    Path("conf/experiment/good.yaml").write_text(f"# @package _global_\nseed: 3\n{shared}\n")
     sweep = "hydra: {mode: MULTIRUN, sweeper: {params: {seed: '4,5'}}}"
     Path("conf/experiment/sweep.yaml").write_text(f"# @package _global_\nseed: 4\n{sweep}\n")
     found = []

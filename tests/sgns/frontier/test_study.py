@@ -184,8 +184,9 @@ def test_cases_are_held_out_runs_of_the_dataset() -> None:
         ({"scenes": {"cut": {"scene": "excavation"}}}, r"cut\.dataset is missing"),
         (
             {"scenes": {"cut": CUT | {"training": {}}}},
-            "scenes.cut has no key 'training'; allowed: scene, dataset",
+            "scenes.cut has no key 'training'; allowed: bands, cases",
         ),
+        ({"scenes": {"cut": CUT | {"cases": 5}}}, "study.scenes.cases is 5; it must be case: "),
         (
             {"scenes": {"cut": CUT | {"bands": {"force": 1}}}},
             "bands has no key 'force'; allowed: force_nrmse",
@@ -204,14 +205,13 @@ def test_a_study_that_lacks_something_is_refused(change: dict, line: str) -> Non
         ([{"label": "a"}], "needs axis and label"),
         (
             [{"axis": "r", "label": "a", "seconds": 4}],
-            "'a' has the unknown key 'seconds'; allowed: axis, label, set",
+            "'a' has no key 'seconds'; allowed: axis, centring, label",
         ),
     ],
 )
 def test_bad_points_are_refused(entries: list, line: str) -> None:
-    study = Study.from_settings(TINY | {"scenes": {"cut": CUT | {"solver": entries}}}, Path("x"))
     with pytest.raises(UserError, match=line):
-        study.scenes[0].points("solver")
+        Study.from_settings(TINY | {"scenes": {"cut": CUT | {"solver": entries}}}, Path("x"))
 
 
 def test_a_label_stands_for_one_setting(tmp_path: Path) -> None:

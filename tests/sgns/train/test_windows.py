@@ -145,7 +145,7 @@ def test_runs_shorter_than_the_horizon_are_left_out_and_named_if_all_are(data) -
     runs = data.runs("train")
     short = replace(runs[0], **{name: getattr(runs[0], name)[:3] for name in SERIES})
     assert len(TrainingWindows([short, runs[1]], 4, 3, "pose", horizon=4)) == 10
-    with pytest.raises(UserError, match="too short: to learn 4 steps at once they need at least 5 frames"):
+    with pytest.raises(UserError, match=r"too short for training\.horizon=4: they need 5 frames"):
         TrainingWindows([short], 4, 3, "pose", horizon=4)
 
 
