@@ -276,7 +276,8 @@ class MeshBody(Settings, Tool):
         try:
             digest = hashlib.blake2b(mesh_content(Path(self.file)), digest_size=8).hexdigest()
         except (OSError, ValueError) as error:
-            raise SceneError(f"tool.file: cannot read {self.file}: {error}") from None
+            words = getattr(error, "strerror", None) or error
+            raise SceneError(f"tool.file: cannot read {self.file}: {words}") from None
         if self.digest not in ("", digest):
             raise SceneError(
                 f"tool.file: {self.file} is not the file this scene was made with ({self.digest}, now {digest}); "

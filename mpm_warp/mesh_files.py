@@ -54,7 +54,9 @@ def read_mesh(file: Path) -> tuple[np.ndarray, np.ndarray, float | None]:
     """
     suffix = file.suffix.lower()
     if suffix not in _READERS:
-        raise SceneError(f"tool.file is {file}; allowed: {', '.join(f'*{s}' for s in _READERS)}")
+        raise SceneError(
+            f"tool.file is {file}; allowed: {', '.join(f'*{s}' for s in _READERS)}; export it as STL"
+        )
     try:
         found = _READERS[suffix](mesh_content(file))
         triangles = _triangles(found)

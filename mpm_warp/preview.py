@@ -154,8 +154,7 @@ def _of_poses(scene: Scene, times: np.ndarray, low: np.ndarray, touch: float | N
         place, remedy = "it stays beside the bin", "see scene.bed.size"
     else:
         place = f"its lowest point stays {_words(low.min())} above the surface"
-        remedy = (
-            "z = 0 is the surface and below it the z of a path is negative; scene.depth, which is positive, counts "
-            "from scene.clearance"
-        )
+        remedy = "z = 0 is the surface and below it the z of a path is negative"
+        if not len(times):
+            remedy = "scene.depth, which is positive, counts from scene.clearance above the surface"
     return [Odd(f"the tool never touches soil: {place}; {likely or remedy}", bool(likely))]

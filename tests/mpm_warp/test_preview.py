@@ -135,6 +135,11 @@ def test_walls_are_measured_once(monkeypatch):
     assert len(scene.displaced) and len(asked) == 7  # places in each triangle
 
 
+def test_a_plate_above_the_soil_is_told_what_its_depth_counts_from():
+    assert "never touches soil" in (found := Preview.of(Excavation(motion="rest")).warnings[-1])
+    assert found.endswith("scene.depth, which is positive, counts from scene.clearance above the surface")
+
+
 def test_where_the_walls_are_if_the_grid_does_not_fit_the_bin():
     (line,) = Preview.of(Column(bed=Bed(size=(0.61, 0.6, 0.15), spacing=0.02))).lines
     assert line.endswith("the soil fills 0.61 x 0.6 m, the walls stand 0.62 x 0.6 m apart")

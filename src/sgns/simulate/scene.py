@@ -96,7 +96,8 @@ def _rows_by_line(file: Path) -> dict[int, list[float]]:
     except csv.Error as error:
         raise UserError(f"scene.path: cannot read {file} after line {rows.line_num}: {error}") from None
     except (OSError, ValueError) as error:
-        raise UserError(f"scene.path: cannot read {file}: {error}") from None
+        words = getattr(error, "strerror", None) or error
+        raise UserError(f"scene.path: cannot read {file}: {words}") from None
     if first:
         raise UserError(f"scene.path: {file} is empty; it needs rows {','.join(_COLUMNS)}")
     return values

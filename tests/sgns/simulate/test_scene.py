@@ -245,6 +245,11 @@ def test_path_files_it_refuses(tmp_path, text, words):
         read_path(tmp_path / "path.csv")
 
 
+def test_a_path_file_that_is_not_there(tmp_path):
+    with pytest.raises(UserError, match=r"cannot read .*nix\.csv: No such file or directory$"):
+        read_path(tmp_path / "nix.csv")
+
+
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
