@@ -23,9 +23,14 @@ sys.path[1:1] = [str(HERE.parent), str(HERE.parents[1] / "support")]
 
 from common import read_rows  # noqa: E402
 
-from sgns_testing.wrong_inputs import every_case, good_cases, run_cases  # noqa: E402
+from sgns_testing.wrong_inputs import Case, every_case, good_cases, run_cases  # noqa: E402
 
 COLUMNS = ["command", "kind", "wrong input", "status", "seconds", "MB", "fault", "line"]
+
+
+def input_of(case: Case) -> str:
+    """As the table has it."""
+    return case.what.removeprefix(case.command).strip()[:100]
 
 
 def main() -> int:
@@ -35,8 +40,8 @@ def main() -> int:
     parser.add_argument("--table", type=Path, default=HERE / "wrong_inputs.csv")
     asked = parser.parse_args()
     known = [] if asked.fresh else read_rows(asked.table)
-    done = {f"{row['command']} {row['wrong input']}" for row in known}
-    cases = [one for one in [*good_cases(), *every_case()] if one.what not in done]
+    done = {(row["command"], row["wrong input"]) for row in known}
+    cases = [one for one in [*good_cases(), *every_case()] if (one.command, input_of(one)) not in done]
     folder = Path(tempfile.mkdtemp())
     faults = sum(bool(row["fault"]) for row in known)
     with asked.table.open("a" if known else "w", newline="", encoding="utf-8") as file:
@@ -44,10 +49,9 @@ def main() -> int:
         if not known:
             writer.writerow(COLUMNS)
         for one in run_cases(cases, folder):
-            what = one.case.what.removeprefix(one.case.command).strip()
             measured = [one.status, f"{one.seconds:.1f}", one.bytes >> 20, one.fault]
             line = one.line.removeprefix(f"sgns {one.case.command}: ")[:90] if one.status else ""
-            writer.writerow([one.case.command, one.case.kind, what[:100], *measured, line])
+            writer.writerow([one.case.command, one.case.kind, input_of(one.case), *measured, line])
             file.flush()
             faults += bool(one.fault)
             if one.fault:

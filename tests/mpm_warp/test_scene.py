@@ -160,6 +160,8 @@ REFUSED = {
         ({"headroom": 1e14}, r"bed.headroom is 10{14}.0 m .* at most 2e\+08 are allowed: lower bed.headroom"),
         ({"headroom": math.inf}, "bed.headroom is inf m"),
         ({"spacing": 2e-4, "particles_per_cell": 1e-4}, "nodes; .* larger bed.spacing"),
+        ({"seed": -1}, "bed.seed is -1; allowed: 0 to"),
+        ({"particles_per_cell": 1e-300}, "bed.particles_per_cell is 1e-300; it must be 1e-15 to"),
         ({"store_every": 2.5}, "bed.store_every is 2.5; it must be a whole number"),
         (
             {"size": (0.15, 0.2, 0.1), "spacing": 0.02, "walls": Walls(x="periodic")},

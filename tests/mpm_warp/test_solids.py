@@ -142,6 +142,9 @@ def test_what_is_no_solid_is_refused():
         closed_mesh(vertices, OUT[1:], "a.stl")
     with pytest.raises(SceneError, match="encloses no volume"):
         closed_mesh(vertices * [1, 1, 0], OUT, "a.stl")
+    for far in (1e300, np.nan):
+        with pytest.raises(SceneError, match=r"a corner of the mesh in a\.stl is not finite or beyond"):
+            closed_mesh(vertices * far, OUT, "a.stl")
     many = [((1.0, 1.0, 1.0), (2.0 * k, 0.0, 0.0), OUT) for k in range(1001)]
     with pytest.raises(SceneError, match="1001 separate parts"):
         closed_mesh(*boxes(*many), "a.stl")

@@ -143,6 +143,9 @@ HOSTILE: dict[str, list[Callable[[dict[str, Any], Touch], bytes]]] = {
     ],
     f"{UNREADABLE}.*overlap": [lambda good, _: overlapping()],
     "claims more values": [lambda good, _: with_weights(good, "surrogate.x", torch.zeros(1).expand(10**12))],
+    "holds torch.int32": [
+        lambda good, _: with_weights(good, name := max(good["state_dict"]), good["state_dict"][name].int())
+    ],
     "do not fit together": [
         lambda good, _, key=key: with_card(good, model=good["hyper_parameters"]["model"] | {key: 90})
         for key in ("message_passing_steps", "hidden_width", "history")

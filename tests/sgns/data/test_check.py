@@ -93,6 +93,9 @@ FAULTS = [
     (attribute("wall_time_s", np.nan), "wall_time_s is nan; it must be 0 s or more"),
     (attribute("scene", "blade: {width: [1], length: 1, thickness: 1}"), r"scene.blade.width is \[1\]"),
     (attribute("scene", "blade: plate"), "scene.blade is 'plate', not a group of keys"),
+    (attribute("scene", "bed: text"), "scene.bed.size is None, not three lengths"),
+    (attribute("scene", "bed: {size: [1, 2]}"), r"scene.bed.size is \[1, 2\], not three lengths"),
+    (attribute("scene", "bed: {size: [1, 2, x]}"), r"scene.bed.size\[2\] is 'x', not a finite number"),
     (attribute("frame_rate", "fast"), "'frame_rate' has the wrong type"),
     # the view
     (lambda file: file.pop("VTKHDF"), "/VTKHDF is missing"),

@@ -354,3 +354,9 @@ def test_arrays_whose_headers_are_damaged(tmp_path) -> None:
             read_arrays(tmp_path / "a.npz", "no list of tools", "make it again")
         except UserError as error:
             assert "\n" not in str(error)
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
+def test_a_folder_that_takes_no_files() -> None:
+    with pytest.raises(UserError, match=r"cannot write /proc/a: .*; choose another output"):
+        write_whole(Path("/proc/a"), "text")

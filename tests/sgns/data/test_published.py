@@ -40,6 +40,17 @@ def test_axes_signs_and_the_doubled_first_frame(tmp_path):
     assert run.context.shape == (2, 0)
 
 
+@pytest.mark.parametrize(
+    "text", ["[]", "{}", '{"dataset_split": "x"}', '{"dataset_split": {"valid": ["a"]}}']
+)
+def test_metadata_that_do_not_name_the_runs(tmp_path, text):
+    (tmp_path / "metadata.json").write_text(text)
+    with pytest.raises(
+        UserError, match=r"metadata\.json does not name the valid runs by their numbers; it needs"
+    ):
+        read_published(tmp_path)
+
+
 def test_wheel_runs_say_their_gravity_friction_and_load(tmp_path):
     # A wheel is predicted there (type 0); a force against its motion is positive there, a drawbar pull negative.
     frames = [[[0.38, 0.31, 0.195], [1.0, 2.0, 3.0]]] * 3

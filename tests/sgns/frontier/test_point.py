@@ -27,6 +27,7 @@ def test_points_come_back_from_a_table_to_five_digits(tmp_path: Path) -> None:
     ("content", "line"),
     [
         ("study,scene\nfull,cut\n", "lacks columns"),
+        ("study,scene,kind,axis,label\n", "it has no rows"),
         ("study,scene,kind,axis,label\nfull,cut,magic,dx,a\n", "allowed: solver"),
         ("study,scene,kind,axis,label,ratio\nfull,cut,solver,dx,a,fast\n", "ratio is 'fast'"),
         ("study,scene,kind,axis,label,ratio\nfull,cut,solver,dx,a,inf\n", "ratio is 'inf'"),
