@@ -66,7 +66,8 @@ def parse(command: str) -> tuple[str, list[str]]:
     name, rest = words[0], words[1:]
     if "--config-dir" in rest:  # settings of a person's own, which are not here
         place = rest.index("--config-dir")
-        rest = [word for word in (*rest[:place], *rest[place + 2 :]) if not word.startswith("experiment=")]
+        own = ("experiment=", "study=own")
+        rest = [word for word in (*rest[:place], *rest[place + 2 :]) if not word.startswith(own)]
     overrides = [word for word in rest if not word.startswith("-") and "=" in word]
     if name == "check":
         overrides.append("files=[run.h5]")

@@ -144,7 +144,17 @@ def advice(points: Sequence[Point], wish: Wish) -> list[str]:
     lines.append(
         f"  rests on study {point.study}, scene {point.scene}: errors against {against}; measured with {measured}"
     )
+    lines += [
+        f"  the table knows task={tasks(points)} in these beds and soils only; for another scene measure your own: "
+        "docs/guides/accuracy.md#measure-your-own",
+        "  whatever you choose, forces depend on the grid, mean draft by some 20 %: docs/limits.md",
+    ]
     return lines + ([f"  note: {point.note}"] if point.note else [])
+
+
+def tasks(points: Sequence[Point]) -> str:
+    """What the table knows."""
+    return ", ".join(dict.fromkeys(p.scene for p in points)) or "nothing"
 
 
 def called(point: Point) -> str:
@@ -183,9 +193,11 @@ def wished(cfg: Any, points: Sequence[Point]) -> Wish:
         UserError: a value is not allowed, nothing is asked for, or the table has no such scene.
     """
     asked = Advise.from_dict(cfg)
-    scenes = list(dict.fromkeys(p.scene for p in points))
-    if asked.task not in scenes:
-        raise UserError(f"task is {asked.task!r}; the table has {', '.join(scenes) or 'none'}")
+    if asked.task not in {p.scene for p in points}:
+        raise UserError(
+            f"task is {asked.task!r}; the table has {tasks(points)}; to measure another scene see "
+            "docs/guides/accuracy.md"
+        )
     given = ((key, value) for key, value in asked.error.to_dict().items() if value is not None)
     limits = {key: ERRORS[key][1] * value for key, value in given}
     if not limits and asked.time is None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -81,6 +82,12 @@ def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[f"{prefix}{key}"] = value
     return flat
+
+
+def of_dataset(overrides: Sequence[str]) -> list[str]:
+    """Those of a command's overrides with which the next command finds the same dataset, quoted for a shell."""
+    making = ("dataset.draw", "dataset.runs", "dataset.split", "dataset.change")
+    return [shlex.quote(one) for one in overrides if one.startswith("dataset") and not one.startswith(making)]
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:

@@ -1,4 +1,4 @@
-"""Numbers that a file, a person or a clock gives: refused in one line, or good to calculate with."""
+"""Numbers that a file, a person or a clock gives, refused in one line or good to calculate with; errors in words."""
 
 from __future__ import annotations
 
@@ -154,3 +154,30 @@ def elapsed(began: float, now: float) -> float:
     The clock of a virtual machine that was paused may stand still or go back.
     """
     return max(now - began, 1e-9)  # the clocks count in such steps
+
+
+# --- To a person: how good a prediction is --------------------------------------------------------------
+
+
+def counted(count: int, what: str) -> str:
+    """As in "1 run" or "2 runs"."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def error_words(soil: float, still: float, force: float, mean_force: float) -> str:
+    """Errors of soil [m] and force [NRMSE], each beside that of the plainest guess."""
+    return (
+        f"soil error {1e3 * soil:.3g} mm ({1e3 * still:.3g} mm if the soil did not move), force NRMSE {force:.3f} "
+        f"({mean_force:.3f} if it were always the mean force of the training runs)"
+    )
+
+
+def error_hint(soil: float, still: float, force: float, mean_force: float) -> str:
+    """What to do about a prediction that is no better than the plainest guess; empty where it is better."""
+    worse = []
+    if soil >= still:
+        worse.append("the soil is predicted no better than if nothing moved")
+    if force >= mean_force:
+        worse.append("the force is predicted no better than by the mean force of the training runs")
+    cures = "more training runs, training.max_steps (longer) and reduction.num_modes (more modes)"
+    return f"hint: {' and '.join(worse)}; what helps, most first: {cures}" if worse else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from PIL import Image
 
 from mpm_warp.scenes import sinkage
 from sgns.config import UserError
-from sgns.data.files import require_replaceable, whole_file
+from sgns.data.files import require_new, require_replaceable, whole_file
 from sgns.data.run import Run, columns, height_map, particle_spacing
 from sgns.evaluate.body_shape import body_silhouette
 from sgns.evaluate.figures import (
@@ -166,13 +167,8 @@ def picture_place(cfg: DictConfig, suffix: str) -> Path:
     Raises:
         UserError: it has another suffix, or is there and `cfg.overwrite` is false.
     """
-    path = Path(cfg.run).with_suffix(suffix) if cfg.output is None else Path(cfg.output)
-    if path.suffix.lower() != suffix:
-        raise UserError(
-            f"output is {path}; the picture is a {suffix} file: output={path.with_suffix(suffix)}"
-        )
-    if path.is_file() and not cfg.overwrite:
-        raise UserError(f"{path} is there already; choose another output, or replace it with overwrite=true")
+    path = Path(cfg.output or f"{os.path.splitext(cfg.run)[0]}{suffix}")
+    require_new(path, cfg.overwrite, "the picture", suffix)
     require_replaceable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     return path

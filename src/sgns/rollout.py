@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import shlex
 import time
@@ -18,6 +19,7 @@ from sgns.config import UserError, differences
 from sgns.data.files import only_here
 from sgns.data.run import frame_chunks
 from sgns.data.writer import RunWriter, require_new_run
+from sgns.model.checkpoint import read_checkpoint
 from sgns.numbers import elapsed
 
 if TYPE_CHECKING:
@@ -85,7 +87,7 @@ def write_rollout(
     if whole < len(rollout.latent):
         reason = (
             f"the rollout for {path.name} is not finite from frame {whole} on: the network is not stable on this "
-            "path; train longer, or use a checkpoint with a higher validation skill"
+            "path; train longer, or use a better checkpoint"
         )
         if whole == 0:
             raise UserError(reason)
@@ -184,6 +186,28 @@ def bed_differences(known: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     return "it knows " + ", ".join(named[:4]) + more
 
 
+def scene_groups(checkpoint: str | Path) -> dict[str, dict[str, Any]]:
+    """Groups of settings, `scene` and `material`, of the scene that a checkpoint was trained on.
+
+    What a person has to give is missing (???): the path of a body, and the mesh file of a tool, since no file may name
+    another one to be read.
+
+    Raises:
+        UserError: The checkpoint cannot be read.
+    """
+    scene = read_checkpoint(checkpoint)["hyper_parameters"].get("scene")
+    if not isinstance(scene, dict) or not isinstance(scene.get("material"), dict):
+        raise UserError(f"{checkpoint} does not say what its scene is; train again")
+    if "${" in json.dumps(scene):
+        raise UserError(f"{checkpoint} has a scene with values that stand for others; give scene=...")
+    tool = scene.get("tool")
+    if isinstance(tool, dict) and tool.get("shape") == "mesh":
+        scene = scene | {"tool": tool | {"file": "???", "digest": ""}}
+    if scene.get("path") is not None:
+        scene = scene | {"path": "???"}
+    return {"material": scene["material"], "scene": {k: v for k, v in scene.items() if k != "material"}}
+
+
 # What changes soil and force beside the path: named when it differs and the network is not told.
 _FIXED = "blade tool material gravity friction load diameter width friction_angle grousers damping".split()
 # Where a tool's mesh was read from; `digest` says which mesh it is.
@@ -253,9 +277,7 @@ def main(cfg: DictConfig) -> float:
         require_space(output.parent, run_cost(scene).size)
         timing = rollout_scene(simulator, scene, output, seed=cfg.seed, checkpoint=cfg.checkpoint)
     log.info("rolled out %d frames (%.3g s) into %s", scene.frame_count, timing.simulated, output)
-    log.info("wall seconds per simulated second: %.3g stepping with force", timing.inference_rate)
-    log.info(
-        "wall seconds per simulated second: %.3g with decoding and writing every frame", timing.complete_rate
-    )
+    rates = timing.inference_rate, timing.complete_rate
+    log.info("computing time of one simulated second: %.3g s; %.3g s with all particles written", *rates)
     log.info("to look at it: sgns plot %s", shlex.quote(str(output)))
     return timing.inference_rate

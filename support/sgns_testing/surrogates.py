@@ -100,4 +100,4 @@ def made_scores(name: str, total: float, frozen: float, force: float = 1.0, rate
     errors = VectorErrors.compare(truth, force * truth)
     mse = dict.fromkeys(("reduction", "network", "surface", "surface_frozen"), 1e-6)
     mse |= {"total": total, "frozen": frozen, "constant_velocity": 2.0 * frozen}
-    return Scores(name, 4, mse, errors, errors, errors, errors, rate)
+    return Scores(name, 4, mse, *[errors] * 6, rate)

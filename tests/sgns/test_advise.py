@@ -39,7 +39,8 @@ def test_the_fastest_that_is_good_enough_is_named_with_its_command() -> None:
     lines = answer("error.force=0.25")
     assert lines[0] == "use: solver, coarse"
     assert "sgns simulate scene=quick_excavation output=run.h5" in lines[1]
-    assert "study full" in lines[-1] and "the solver at finest" in lines[-1]
+    assert "study full" in lines[-3] and "the solver at finest" in lines[-3]
+    assert "task=cut in these beds and soils only" in lines[-2] and "depend on the grid" in lines[-1]
     surrogate = answer("error.force=0.4")
     assert surrogate[0] == "use: surrogate, r = 8"
     assert any("its training runs: force NRMSE 0.26" in line for line in surrogate)
@@ -101,7 +102,7 @@ def test_nothing_claims_to_be_better_than_the_reference_is_known() -> None:
 
 def test_surrogates_can_be_judged_against_their_training_runs() -> None:
     lines = answer("error.force=0.3", "against=training")
-    assert lines[0] == "use: surrogate, r = 8" and "over its test runs" in lines[-1]
+    assert lines[0] == "use: surrogate, r = 8" and "over its test runs" in lines[-3]
 
 
 @pytest.mark.parametrize(

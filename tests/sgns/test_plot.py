@@ -82,6 +82,8 @@ def test_a_picture_is_replaced_only_if_asked(run_file, command, suffix):
     command.main(settings(run_file, overwrite=True))
     with pytest.raises(UserError, match=rf"a \.{suffix} file: output=x\.{suffix}"):
         command.main(settings(run_file, output="x.jpg"))
+    with pytest.raises(UserError):
+        command.main(settings("."))
 
 
 @pytest.mark.parametrize("command", [plot, render])

@@ -37,6 +37,7 @@ class Command(NamedTuple):
             `overwrite=true`. None where finished work is kept and gone on from; files of output are looked after by
             the command, once it knows that the other settings are good.
         plain: keys that may be given as plain paths, in this order.
+        value: what `main` returns, as a column of a sweep's table.
     """
 
     module: str
@@ -45,6 +46,7 @@ class Command(NamedTuple):
     needs: tuple[str, ...] = ()
     result: str | None = None
     plain: tuple[str, ...] = ()
+    value: str | None = None
 
 
 COMMANDS = {
@@ -53,6 +55,7 @@ COMMANDS = {
         "simulate a scene or a dataset with the material point method",
         "file",
         ("output",),
+        value="wall_s_per_simulated_s",
     ),
     "reduce": Command(
         "sgns.reduction.reduce",
@@ -61,9 +64,15 @@ COMMANDS = {
         ("dataset.path",),
         "energy.csv",
     ),
-    "train": Command("sgns.train.command", "learn a simulator from a dataset", "folder", ("dataset.path",)),
+    "train": Command(
+        "sgns.train.command", "learn a simulator from a dataset", "folder", ("dataset.path",), value="skill"
+    ),
     "rollout": Command(
-        "sgns.rollout", "let a trained network play a scene", "file", ("checkpoint", "output")
+        "sgns.rollout",
+        "let a trained network play a scene",
+        "file",
+        ("checkpoint", "output"),
+        value="wall_s_per_simulated_s",
     ),
     "evaluate": Command(
         "sgns.evaluate.command",
@@ -71,11 +80,14 @@ COMMANDS = {
         "folder",
         ("dataset.path", "checkpoint"),
         "report.html",
+        value="skill",
     ),
     "frontier": Command(
         "sgns.frontier.command", "measure what accuracy costs in time; table, figures and page", "folder"
     ),
-    "advise": Command("sgns.advise", "name the setting that is good and fast enough", None),
+    "advise": Command(
+        "sgns.advise", "name the setting that is good and fast enough", None, value="wall_s_per_step"
+    ),
     "check": Command("sgns.data.check", "read run files through and list what is wrong with them", None),
     "plot": Command("sgns.plot", "one picture of a run", "file", ("run",), plain=("run", "output")),
     "render": Command("sgns.render", "a moving picture of a run", "file", ("run",), plain=("run", "output")),
@@ -156,21 +168,23 @@ def run_command(cfg: DictConfig) -> float | None:
     from hydra.core.hydra_config import HydraConfig
 
     from sgns.cli.settings import check_shared
+    from sgns.data.files import require_new
 
     hydra_cfg = HydraConfig.get()
     name = hydra_cfg.job.config_name
     assert name is not None and hydra_cfg.mode is not None
     in_sweep = hydra_cfg.mode.name == "MULTIRUN"
-    label = f"job {hydra_cfg.job.num} ({_one_line(hydra_cfg.job.override_dirname)}): " if in_sweep else ""
+    label = f"job {hydra_cfg.job.num} ({_one_line(','.join(hydra_cfg.overrides.task))}): " if in_sweep else ""
     try:
         _place_output(cfg, hydra_cfg, COMMANDS[name], in_sweep)
         check_shared(cfg, name, COMMANDS[name].needs)
-        _require_new(cfg, COMMANDS[name])
+        if (result := COMMANDS[name].result) is not None:
+            require_new(Path(cfg.output) / result, cfg.overwrite)
         return importlib.import_module(COMMANDS[name].module).main(cfg)
     except KeyboardInterrupt as stop:
         kept = _drop_empty_output(hydra_cfg)
         said = stop.said if isinstance(stop, Interrupted) else ""
-        said = said or _interruption(cfg, name, kept)
+        said = said or _interruption(cfg, name, kept, hydra_cfg.sweep.dir if in_sweep else cfg.output)
         raise _Stopped(f"{label}interrupted; {said}", _status(stop)) from None
     except Exception as error:
         if (line := _line_of(error)) is None:
@@ -203,7 +217,7 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
         # Not `hydra.main`: it takes no loader, and has flags of its own that run what they find in a file.
-        hydra.config_loader = CheckedLoader(hydra.config_loader, settings)
+        hydra.config_loader = CheckedLoader(hydra.config_loader, settings)  # type: ignore[assignment]
         if arguments.cfg is not None:
             _show_settings(hydra, command, arguments)
         elif arguments.info is not None:
@@ -213,7 +227,14 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
             sweep = arguments.multirun or (mode == RunMode.MULTIRUN and not arguments.run)
             require_few_jobs(settings if sweep else [])
             run, mode = (hydra.multirun, RunMode.MULTIRUN) if sweep else (hydra.run, RunMode.RUN)
-            run(command, task_function=run_command, overrides=[*settings, f"hydra.mode={mode.name}"])
+            done: Any = run(
+                command, task_function=run_command, overrides=[*settings, f"hydra.mode={mode.name}"]
+            )
+            # Other sweepers than Hydra's keep tables of their own.
+            if jobs := [job for batch in done or () for job in batch] if sweep else []:
+                from sgns.cli.help import end_sweep
+
+                end_sweep(jobs, COMMANDS[command].value)
 
 
 def _show_settings(hydra: Any, command: str, arguments: argparse.Namespace) -> None:
@@ -316,27 +337,15 @@ def _place_output(cfg: DictConfig, hydra_cfg: Any, command: Command, in_sweep: b
 
     A file with an absolute path keeps its place; only a folder with the job's number comes between.
     """
+    folder = Path(hydra_cfg.runtime.output_dir)
+    here = Path.cwd()
+    folder = folder.relative_to(here) if folder.is_relative_to(here) else folder
     if command.output == "folder":
-        folder = Path(hydra_cfg.runtime.output_dir)
-        here = Path.cwd()
-        cfg.output = str(folder.relative_to(here) if folder.is_relative_to(here) else folder)
+        cfg.output = str(folder)
     elif command.output == "file" and in_sweep and cfg.output is not None:
-        path = Path(cfg.output).expanduser()
-        if path.is_absolute():
-            cfg.output = str(path.parent / str(hydra_cfg.job.num) / path.name)
-        else:
-            cfg.output = str(Path(hydra_cfg.runtime.output_dir) / path)
-
-
-def _require_new(cfg: DictConfig, command: Command) -> None:
-    """Refuse to replace finished work that nobody asked to replace."""
-    if command.result is None or cfg.overwrite:
-        return
-    result = Path(cfg.output) / command.result
-    if result.is_file():
-        raise UserError(
-            f"{result} is there already; choose another output, or replace it with overwrite=true"
-        )
+        path = Path(cfg.output)
+        own = path.parent / str(hydra_cfg.job.num) / path.name if path.is_absolute() else folder / path
+        cfg.output = str(own)
 
 
 def _drop_empty_output(hydra_cfg: Any) -> bool:
@@ -360,9 +369,9 @@ def _drop_empty_output(hydra_cfg: Any) -> bool:
     return folder.exists()
 
 
-def _interruption(cfg: DictConfig, name: str, kept: bool) -> str:
+def _interruption(cfg: DictConfig, name: str, kept: bool, output: str) -> str:
     if COMMANDS[name].output == "folder" and kept:
-        return f"to go on, give the same command with output={cfg.output}"
+        return f"to go on, give the same command with output={output}"
     if COMMANDS[name].output == "folder" or cfg.get("dataset") is not None:
         return "what is complete is kept, and the same command goes on from there"
     return "nothing new is kept"

@@ -1,15 +1,21 @@
-"""What the command line says: help, lines in the terminal, and one line for wrong settings."""
+"""What the command line says: help, lines in the terminal, tables of sweeps, one line for wrong settings."""
 
 from __future__ import annotations
 
+import csv
 import difflib
+import io
+import json
 import logging
+import math
 import os
 import re
 import sys
+from collections.abc import Sequence
 from importlib.resources import files
+from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import yaml
 
@@ -135,6 +141,59 @@ def key_lines(command: str) -> list[str]:
 
 def _settings(command: str) -> dict:
     return yaml.safe_load(files("sgns.conf").joinpath(f"{command}.yaml").read_text(encoding="utf-8"))
+
+
+# --- The end of a sweep: what its jobs were given, how good and fast they are, and where ----------------
+
+
+def end_sweep(jobs: Sequence[Any], value: str | None) -> None:
+    """Print a table of Hydra's finished jobs, and write it as `sweep.csv` into the folder of the sweep.
+
+    Args:
+        jobs: In their order.
+        value: Name of what they return, if it is a number.
+    """
+    from sgns.data.files import write_whole  # loads Warp
+
+    given = [dict(one.partition("=")[::2] for one in job.overrides) for job in jobs]
+    varied = [key for key in given[0] if len({one.get(key) for one in given}) > 1]
+    rows = []
+    for job, settings in zip(jobs, given, strict=True):
+        row = {key: settings.get(key, "") for key in varied} | _found(job.cfg.get("output"))
+        rows.append(row if value is None else {**row, value: job.return_value})
+    table = [list(rows[0]), *([_short(cell) for cell in row.values()] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    own = jobs[0].hydra_cfg.hydra  # `sweep.dir` itself may hold a time
+    folder = Path(own.runtime.output_dir).parents[len(Path(own.sweep.subdir).parts) - 1]
+    file = Path(os.path.relpath(folder)) / "sweep.csv"
+    write_whole(file, text.getvalue())
+    lines = ["  ".join(map(str.ljust, line, widths)).rstrip() for line in table]
+    write_output("\n".join([*lines, f"as a table: {file}", ""]))
+
+
+def _found(output: str | None) -> dict[str, Any]:
+    """Errors, time and place of a job's result, as far as its files say them."""
+    if output is None:
+        return {}
+    folder = Path(output)
+    if (file := folder / "training.json").is_file():
+        found = json.loads(file.read_text(encoding="utf-8"))
+        soil, of, result = 1e3 * found.get("position_rmse", math.nan), found, folder / "best.ckpt"
+    elif (file := folder / "metrics.json").is_file():
+        of = json.loads(file.read_text(encoding="utf-8"))["aggregate"]
+        soil, result = of["rmse_total_mm"], folder
+    else:
+        return {"output": output}
+    errors = {"soil_error_mm": soil, "force_nrmse": of["force_nrmse"]}
+    return errors | ({"training_s": of["seconds"]} if "seconds" in of else {}) | {"output": str(result)}
+
+
+def _short(cell: Any) -> str:
+    return f"{cell:.4g}" if isinstance(cell, float) else "" if cell is None else str(cell)
 
 
 # --- Wrong settings: one line for what Hydra and OmegaConf say, with the key and what is allowed --------

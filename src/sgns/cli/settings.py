@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
@@ -15,9 +14,8 @@ from typing import Any, ClassVar
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
-from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
+from hydra.core.override_parser.types import ChoiceSweep, Override, QuotedString, RangeSweep
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.config_source import ConfigResult, ConfigSource
@@ -328,7 +326,7 @@ class ConfigDir(SearchPathPlugin):
             search_path.append("command-line", f"{OwnFiles.scheme()}://{ConfigDir.folder}")
 
 
-class CheckedLoader(ConfigLoader):
+class CheckedLoader:
     """Hydra's loader, which refuses settings that would run something.
 
     Hydra makes objects right after it has composed the settings, and calls nobody in between. A sweep's jobs are
@@ -351,41 +349,27 @@ class CheckedLoader(ConfigLoader):
         from_shell: bool = True,
         validate_sweep_overrides: bool = True,
     ) -> DictConfig:
-        overrides = self._with_scene(overrides, config_name)
         with suppress(HydraException):  # composing says what cannot be read
             require_options(overrides, ("hydra", *groups_of(config_name or "")))
-        return self._checked(
-            overrides,
-            lambda: self._loader.load_configuration(
-                config_name, overrides, run_mode, from_shell, validate_sweep_overrides
-            ),
+        how = (run_mode, from_shell, validate_sweep_overrides)
+        return self._composed(
+            config_name, overrides, lambda all_: self._loader.load_configuration(config_name, all_, *how)
         )
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
-        sweep_overrides = self._with_scene(sweep_overrides, master_config.hydra.job.config_name)
-        overrides = [*master_config.hydra.overrides.hydra, *sweep_overrides]
-        return self._checked(
-            overrides, lambda: self._loader.load_sweep_config(master_config, sweep_overrides)
+        return self._composed(
+            master_config.hydra.job.config_name,
+            sweep_overrides,
+            lambda all_: self._loader.load_sweep_config(master_config, all_),
         )
 
-    def _with_scene(self, overrides: list[str], config_name: str | None) -> list[str]:
-        """The scene of a dataset or a checkpoint put before the overrides, so that they can be of its keys."""
-        overrides = [*known_scene(config_name, overrides), *overrides]
-        datasets = [one for one in overrides if one.startswith("dataset=")]
-        if config_name != "simulate" or not datasets or any(one.startswith("scene=") for one in overrides):
-            return overrides
-        try:
-            own = [one for one in overrides if one.startswith("dataset.scene=")]
-            alone = self._loader.load_configuration("simulate", [*datasets[-1:], *own], RunMode.RUN)
-            scene = alone.dataset.get("scene")
-        except Exception:  # said where everything is composed
-            return overrides
-        return [f"scene={scene}", *overrides] if isinstance(scene, str) else overrides
-
-    def _checked(self, overrides: Sequence[str], compose: Callable[[], DictConfig]) -> DictConfig:
+    def _composed(
+        self, command: str | None, overrides: list[str], compose: Callable[[list[str]], DictConfig]
+    ) -> DictConfig:
         require_plain_overrides(overrides)
+        scene = self._scene(command, overrides)
         try:
-            cfg = compose()
+            cfg = compose([*scene, *overrides])
         except Exception as error:
             if isinstance(error, MemoryError) or describe(error) is not None:
                 raise
@@ -393,31 +377,57 @@ class CheckedLoader(ConfigLoader):
             raise UserError(
                 f"the settings cannot be put together: {type(error).__name__}: {error}"
             ) from error
+        # Nobody has typed these, and every job of a sweep finds its own.
+        cfg.hydra.overrides.task = cfg.hydra.overrides.task[len(scene) :]
         require_own_objects(cfg, self._typed)
         _expand_home(cfg)
         return cfg
 
-    def get_search_path(self) -> ConfigSearchPath:
-        return self._loader.get_search_path()
-
-    def get_sources(self) -> list[ConfigSource]:
-        return self._loader.get_sources()
-
-    def list_groups(self, parent_name: str) -> list[str]:
-        return self._loader.list_groups(parent_name)
-
-    def get_group_options(
-        self,
-        group_name: str,
-        results_filter: ObjectType | None = ObjectType.CONFIG,
-        config_name: str | None = None,
-        overrides: list[str] | None = None,
-    ) -> list[str]:
-        return self._loader.get_group_options(group_name, results_filter, config_name, overrides)
+    def _scene(self, command: str | None, overrides: list[str]) -> list[str]:
+        """What chooses the scene of a dataset or a checkpoint, to stand first: then overrides can be of its keys."""
+        try:
+            parsed = OverridesParser.create().parse_overrides(overrides)
+        except HydraException:  # composing says what is wrong
+            return []
+        given = {override.key_or_group: override for override in parsed}
+        if "scene" in given:
+            return []
+        if command == "rollout" and "experiment" not in given and (checkpoint := given.get("checkpoint")):
+            file = checkpoint.value()
+            if isinstance(file, ChoiceSweep):  # until each job has its own
+                first = file.list[0]
+                file = first.text if isinstance(first, QuotedString) else first
+            return _of_checkpoint(file, given)
+        if command == "simulate" and "dataset" in given:
+            try:
+                lines = [str(given[key].input_line) for key in ("dataset", "dataset.scene") if key in given]
+                alone = self._loader.load_configuration("simulate", lines, RunMode.RUN)
+                scene = alone.dataset.get("scene")
+            except Exception:  # said where everything is composed
+                return []
+            return [f"scene={scene}"] if isinstance(scene, str) else []
+        return []
 
     def compute_defaults_list(self, config_name: str | None, overrides: list[str], run_mode: RunMode) -> Any:
         require_plain_overrides(overrides)
         return self._loader.compute_defaults_list(config_name, overrides, run_mode)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # of an object that is not yet unpickled
+            raise AttributeError(name)
+        return getattr(self._loader, name)
+
+
+def _of_checkpoint(file: Any, given: Container[str]) -> list[str]:
+    """Overrides that choose scene and soil of a checkpoint, but for groups that are given."""
+    if not isinstance(file, str) or not file:  # said later
+        return []
+    from sgns.rollout import scene_groups  # loads torch: seconds
+
+    groups = scene_groups(os.path.expanduser(file))
+    for group, node in groups.items():
+        ConfigStore.instance().store(name="of_checkpoint", node=node, group=group, provider="sgns")
+    return [f"{group}=of_checkpoint" for group in groups if group not in given]
 
 
 def _expand_home(node: Any) -> None:
@@ -430,53 +440,6 @@ def _expand_home(node: Any) -> None:
             _expand_home(value)
         elif isinstance(value, str) and value.startswith("~"):
             node[key] = os.path.expanduser(value)
-
-
-# --- A rollout that names no scene plays the one of its checkpoint --------------------------------------
-
-_KNOWN = "of_checkpoint"
-
-
-def known_scene(command: str | None, overrides: Sequence[str]) -> list[str]:
-    """Overrides that choose scene and soil of the checkpoint, for a rollout that names no scene.
-
-    What a person has to give is left open: the path of a body, and the mesh file of a tool, since no file may name
-    another one to be read.
-
-    Raises:
-        UserError: The checkpoint cannot be read.
-    """
-    if command != "rollout":
-        return []
-    try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
-    except HydraException:  # composing says what is wrong
-        return []
-    given = {override.key_or_group: override for override in parsed}
-    checkpoint = given.get("checkpoint")
-    if checkpoint is None or checkpoint.is_sweep_override() or {"scene", "experiment"} & set(given):
-        return []
-    if (
-        not isinstance(value := checkpoint.value(), str)
-        or not Path(file := os.path.expanduser(value)).is_file()
-    ):
-        return []  # the command says so
-    from sgns.model.checkpoint import read_checkpoint
-
-    scene = read_checkpoint(file)["hyper_parameters"].get("scene")
-    if not isinstance(scene, dict) or not isinstance(scene.get("material"), dict):
-        raise UserError(f"{file} does not say what its scene is; train again")
-    if "${" in json.dumps(scene):
-        raise UserError(f"{file} has a scene with values that stand for others; give scene=...")
-    tool = scene.get("tool")
-    if isinstance(tool, dict) and tool.get("shape") == "mesh":
-        scene = scene | {"tool": tool | {"file": "???", "digest": ""}}
-    if scene.get("path") is not None:
-        scene = scene | {"path": "???"}
-    groups = {"material": scene["material"], "scene": {k: v for k, v in scene.items() if k != "material"}}
-    for group, node in groups.items():
-        ConfigStore.instance().store(name=_KNOWN, node=node, group=group, provider="sgns")
-    return [f"{group}={_KNOWN}" for group in groups if group not in given]
 
 
 # --- The settings that mean the same in every command, checked before any work is done ------------------

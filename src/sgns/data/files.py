@@ -64,6 +64,18 @@ def require_replaceable(*paths: Path) -> None:
             raise UserError(f"cannot write {path}: it is {what}")
 
 
+def require_new(path: Path, overwrite: bool, what: str = "", suffix: str = "") -> None:
+    """Refuse the name of an output that lacks the suffix of what it is, or that is taken, unless `overwrite` is true.
+
+    Raises:
+        UserError: says which name to give, or what to do.
+    """
+    if path.suffix.lower() != suffix and suffix:
+        raise UserError(f"output is {path}; {what} is a {suffix} file: output={path.with_suffix(suffix)}")
+    if path.is_file() and not overwrite:
+        raise UserError(f"{path} is there already; choose another output, or replace it with overwrite=true")
+
+
 def _file_type(path: Path) -> int | None:
     """What the name itself stands for, as in `stat`; None for nothing, or where that cannot be asked."""
     try:

@@ -20,7 +20,7 @@ import yaml
 from mpm_warp import State
 from sgns import __version__
 from sgns.config import UserError
-from sgns.data.files import require_replaceable
+from sgns.data.files import require_new, require_replaceable
 from sgns.data.hdf5 import BROKEN, NewFile
 from sgns.data.run_file import (
     FORMAT,
@@ -106,10 +106,7 @@ def require_new_run(path: Path, overwrite: bool) -> None:
         UserError: says what is there.
     """
     require_run_place(path)
-    if path.suffix.lower() != ".h5":
-        raise UserError(f"output is {path}; a run is a .h5 file: output={path.with_suffix('.h5')}")
-    if path.is_file() and not overwrite:
-        raise UserError(f"{path} is there already; choose another output, or replace it with overwrite=true")
+    require_new(path, overwrite, "a run", ".h5")
 
 
 def require_run_place(path: Path) -> None:

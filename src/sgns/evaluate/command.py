@@ -51,7 +51,7 @@ from sgns.evaluate.results import (
     write_tables,
 )
 from sgns.model.features import is_wheel
-from sgns.numbers import elapsed
+from sgns.numbers import counted, elapsed, error_hint, error_words
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout
 from sgns.settings import ModelSettings, model_settings
@@ -279,23 +279,23 @@ def log_summary(evaluation: Evaluation, report: Path) -> None:
     total, timing = evaluation.total, evaluation.timing
     if warning := seen_warning(evaluation):
         log.warning("%s", warning)
+    soil, still = (1e-3 * total.rmse_mm(name) for name in ("total", "frozen"))
+    errors = soil, still, total.force.overall_nrmse, total.mean_force.overall_nrmse
     lines = [
-        f"{len(evaluation.runs)} {evaluation.split} runs of {evaluation.dataset}",
-        f"position: RMSE {total.rmse_mm('total'):.3g} mm (reduction alone {total.rmse_mm('reduction'):.3g}, frozen "
-        f"{total.rmse_mm('frozen'):.3g}); skill {total.skill():.3f} against frozen, "
-        f"{total.skill('constant_velocity'):.3f} against constant velocity",
-        f"force: NRMSE {total.force.overall_nrmse:.3f} (mean force of the training split: "
-        f"{total.mean_force.overall_nrmse:.3f}); {forward_name(evaluation)} MAE {total.force.mae[0]:.3g} N, vertical "
-        f"MAE {total.force.mae[2]:.3g} N",
-        f"wall seconds per simulated second, measured in turn on one thread: network along a path {timing.rollout:.3g} "
-        f"(all particles decoded {timing.decoded:.3g}), pose by pose {timing.stepped:.3g}; solver {timing.solver:.3g}",
+        f"{counted(len(evaluation.runs), f'{evaluation.split} run')} of {evaluation.dataset}: {error_words(*errors)}",
+        f"no soil error can be below {total.rmse_mm('reduction'):.3g} mm with {counted(evaluation.num_modes, 'mode')}",
+        f"mean absolute error of the force: {forward_name(evaluation)} {total.force.mae[0]:.3g} N, vertical "
+        f"{total.force.mae[2]:.3g} N",
+        f"computing time of one simulated second, on one thread: network along a path {timing.rollout:.3g} s (all "
+        f"particles decoded {timing.decoded:.3g} s), pose by pose {timing.stepped:.3g} s; solver {timing.solver:.3g} s",
     ]
     if full := evaluation.full_space:
         lines.append(
             f"the same network on every particle: {full.rollout:.3g} s per simulated second, {full.training_step:.3g} "
             f"s per training step of {full.batch_size} samples"
         )
-    for line in [*lines, f"report: {report}"]:
+    hint = error_hint(*errors)
+    for line in [*lines, *([hint] if hint else []), f"report: {report}"]:
         log.info("%s", line)
 
 

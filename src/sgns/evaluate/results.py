@@ -32,6 +32,9 @@ from sgns.simulator import Simulator
 
 POSITION_ERRORS = ("reduction", "network", "total", "frozen", "constant_velocity")
 SURFACE_ERRORS = ("surface", "surface_frozen")
+VECTOR_ERRORS = ("force", "torque", "mean_force", "mean_torque", "contact", "contact_mean")
+CONTACT_SHARE = 0.01
+"""Of a run's largest force: with less of it the tool does not touch the soil."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,8 @@ class Scores:
     torque: VectorErrors  # errors of the torque about the centre of mass [N m]
     mean_force: VectorErrors  # errors of the mean force of the training split [N]
     mean_torque: VectorErrors  # errors of the mean torque of the training split [N m]
+    contact: VectorErrors  # as `force`, over the frames in contact [N]
+    contact_mean: VectorErrors  # there, of the true run's own mean: no constant is better [N]
     solver_rate: float  # wall seconds per simulated second of the solver; NaN if not recorded
     # mean-square distance of the body from its true place [m²]; 0 where its path was given
     body_mse: float = 0.0
@@ -73,6 +78,8 @@ class Scores:
         row |= {f"{name}_abs_mpe_percent": float(sizes[axis]) for name, axis in FORCE_COMPONENTS.items()}
         for prefix, errors in (("", self.torque), ("mean_torque_", self.mean_torque)):
             row |= columns(errors, TORQUE_COMPONENTS, prefix, "torque", "Nm")
+        row["contact_force_nrmse"] = self.contact.overall_nrmse
+        row["contact_mean_force_nrmse"] = self.contact_mean.overall_nrmse
         row |= {"body_rmse_mm": 1e3 * math.sqrt(self.body_mse), "sinkage_mae_mm": 1e3 * self.sinkage_mae}
         row["solver_wall_s_per_s"] = self.solver_rate
         return row
@@ -107,6 +114,8 @@ def run_scores(
     """
     force, torque = truth.force[history:], truth.torque[history:]
     simulated, wall = float(truth.time[-1] - truth.time[0]), truth.wall_time_s
+    size = np.linalg.norm(force, axis=1)
+    touching = ~(size < CONTACT_SHARE * size.max())  # all, where there is no force
     return Scores(
         name=name,
         frames=len(positions.time),
@@ -115,6 +124,8 @@ def run_scores(
         torque=VectorErrors.compare(torque, prediction.torque[history:]),
         mean_force=VectorErrors.compare(force, mean_force),
         mean_torque=VectorErrors.compare(torque, mean_torque),
+        contact=VectorErrors.compare(force[touching], prediction.force[history:][touching]),
+        contact_mean=VectorErrors.compare(force[touching], force[touching].mean(axis=0)),
         solver_rate=float(wall) / simulated if wall else math.nan,
         body_mse=body.mse,
         sinkage_mae=body.sinkage_mae,
@@ -136,10 +147,7 @@ def aggregate(runs: Sequence[Scores], name: str = "all runs") -> Scores:
         name=name,
         frames=sum(run.frames for run in runs),
         mse={key: float(np.mean([run.mse[key] for run in runs])) for key in first.mse},
-        force=pooled("force"),
-        torque=pooled("torque"),
-        mean_force=pooled("mean_force"),
-        mean_torque=pooled("mean_torque"),
+        **{name: pooled(name) for name in VECTOR_ERRORS},
         solver_rate=mean_of_known([run.solver_rate for run in runs]),
         body_mse=float(np.mean([run.body_mse for run in runs])),
         sinkage_mae=mean_of_known([run.sinkage_mae for run in runs]),

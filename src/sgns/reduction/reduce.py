@@ -22,7 +22,7 @@ from sgns.data.dataset import SPLITS, Dataset
 from sgns.data.files import only_here, parse_json, require_replaceable, whole_file
 from sgns.data.hdf5 import BROKEN, new_hdf5, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
-from sgns.numbers import require_shapes
+from sgns.numbers import counted, require_shapes
 from sgns.reduction.basis import Basis, ReductionCurves, reconstruction_curve, reduction_curves
 from sgns.reduction.pca import IncrementalPCA, checked_device
 from sgns.settings import ReductionSettings
@@ -83,7 +83,11 @@ def choose_modes(basis: Basis, settings: Mapping[str, Any], validation: Sequence
         )
         values = 1e3 * np.sqrt(curve)
         key, unit, sign, change = "tolerance", " mm", "≤", "raise"
-        what = f"RMSE on {len(validation)} validation runs" if validation else "RMSE on the training runs"
+        what = (
+            f"RMSE on {counted(len(validation), 'validation run')}"
+            if validation
+            else "RMSE on the training runs"
+        )
     else:
         values = np.asarray(getattr(basis, settings["choose"])())
         key, unit, sign, change = "share", "", "≥", "lower"
@@ -237,7 +241,7 @@ def modes_to_use(basis: Basis, settings: Mapping[str, Any], validation: Sequence
     asked = settings["num_modes"]
     if asked == "auto":
         chosen, reason = choose_modes(basis, settings, validation)
-        log.info("reduction.num_modes=auto: %d modes; %s", chosen, reason)
+        log.info("reduction.num_modes=auto: %s; %s", counted(chosen, "mode"), reason)
         return chosen
     if asked > basis.num_modes:
         raise UserError(

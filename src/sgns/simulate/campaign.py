@@ -368,6 +368,8 @@ def _split(grids: list[list[str]], shares: tuple[float, ...], rng: np.random.Gen
             part[names[index]] = (
                 "validation" if rank < validation else "test" if rank < validation + test else "train"
             )
+    if len(grids) > 1 and "train" not in part.values():  # a few runs of many grids
+        return _split([[name for names in grids for name in names]], shares, rng)
     return {name: part[name] for names in grids for name in names}
 
 

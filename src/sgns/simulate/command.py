@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from mpm_warp import Preview, Scene
-from sgns.config import Interrupted, UserError
+from sgns.config import Interrupted, UserError, of_dataset
 from sgns.data.files import only_here
 from sgns.data.run import Run
 from sgns.data.writer import require_new_run, stopped_path
@@ -78,6 +78,8 @@ def main(cfg: DictConfig) -> float | None:
         batch = 1 if cfg.device == "cpu" else cfg.solver.batch
         share = {"shard": cfg.shard, "shards": cfg.shards}
         simulate_campaign(campaign, device=cfg.device, batch=batch, limits=limits, **share)
+        if cfg.shards == 1:
+            log.info("next: sgns train %s", " ".join(of_dataset(HydraConfig.get().overrides.task)))
         return None
     if (cfg.shard, cfg.shards) != (0, 1):
         raise UserError("shard and shards divide the runs of a dataset; give dataset=... or leave them out")

@@ -27,7 +27,7 @@ from mpm_warp.solver import run_concurrently
 from sgns.config import Interrupted, UserError, flattened, heeded_signals
 from sgns.data.files import file_lock, remove_abandoned
 from sgns.data.run import Run
-from sgns.numbers import elapsed
+from sgns.numbers import counted, elapsed
 from sgns.settings import Limits
 from sgns.simulate.campaign import (
     Campaign,
@@ -111,7 +111,7 @@ def simulate_campaign(
         raise UserError(
             f"{len(failed)} of {len(missing)} runs could not be made (the others are); the first is {name}: {message}"
         )
-    log.info("the %d runs are in %s, what each is in runs.csv; next: sgns train", len(missing), campaign.path)
+    log.info("%s made in %s; what each is: runs.csv", counted(len(missing), "run"), campaign.path)
 
 
 def compile_kernels(campaign: Campaign, names: list[str], device: str) -> None:

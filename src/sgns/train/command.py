@@ -10,19 +10,23 @@ from __future__ import annotations
 import json
 import logging
 import math
+import shlex
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import OmegaConf
 
 import sgns
-from sgns.config import UserError, differences, flattened
+from sgns.config import UserError, differences, flattened, of_dataset
 from sgns.data.files import only_here, require_replaceable, write_whole
 from sgns.model.checkpoint import SUMMARY, read_checkpoint, read_summary
+from sgns.numbers import counted, error_hint, error_words
 from sgns.reduction.reduce import ReducedDataset, reduce_dataset
 from sgns.settings import model_settings, training_settings
 from sgns.train import Fit, Task
@@ -59,7 +63,7 @@ def main(cfg: DictConfig) -> float:
     else:
         dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
         reduced = reduce_dataset(dataset, cfg.reduction, device=cfg.device)
-    return train(
+    skill = train(
         reduced,
         num_modes=reduced.num_modes,
         model=plain["model"],
@@ -70,6 +74,22 @@ def main(cfg: DictConfig) -> float:
         start_from=cfg.checkpoint,
         provenance={"preset": plain["preset"]["name"], "dataset": plain["dataset"]["name"]},
     )
+    if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.RUN:  # a sweep ends with a table
+        for line in next_commands(output / "best.ckpt", reduced, HydraConfig.get().overrides.task):
+            log.info("%s", line)
+    return skill
+
+
+def next_commands(checkpoint: Path, reduced: ReducedDataset, given: Sequence[str]) -> list[str]:
+    """What to type after a training with these overrides."""
+    file = f"checkpoint={shlex.quote(str(checkpoint))}"
+    lines = [f"next: sgns evaluate {' '.join([*of_dataset(given), file])}"]
+    scene = reduced.runs("train")[0].scene
+    if "bed" in scene:  # published runs have no particles
+        own = ["scene.path=path.csv"] * (scene.get("path") is not None)
+        own += ["scene.tool.file=tool.stl"] * ((scene.get("tool") or {}).get("shape") == "mesh")
+        lines.append(f"      sgns rollout {' '.join([file, *own])} output=new.h5")
+    return lines
 
 
 @quiet_writer()
@@ -130,7 +150,7 @@ def train(
         resumed = what_is_there(output, asked, how.resume)
         if resumed == "complete":
             summary = read_summary(output)
-            log.info("%s is complete: validation skill %.3f", output, summary["skill"])
+            log.info("%s is complete; training.resume=false trains anew", output)
             return float(summary["skill"])
 
         output.mkdir(parents=True, exist_ok=True)
@@ -169,8 +189,11 @@ def train(
         logger.finalize("success")
         summary = {**fitted.about, **metrics, "seconds": round(fitted.seconds, 1)}
         write_whole(output / SUMMARY, json.dumps(summary, indent=2) + "\n")
-        runs = f"{len(validation_runs)} validation runs"
-        log.info("trained in %.0f s; %s: %s; %s", fitted.seconds, runs, score.words(), output / "best.ckpt")
+        words = score.words() if math.isnan(score.position_rmse) else error_words(*score.errors)
+        runs = counted(len(validation_runs), "validation run")
+        log.info("trained in %.0f s; on %s: %s; %s", fitted.seconds, runs, words, output / "best.ckpt")
+        if hint := error_hint(*score.errors):
+            log.info("%s", hint)
         return score.skill
 
 

@@ -55,23 +55,26 @@ class RolloutScore(NamedTuple):
     """1 - sum of squared position errors / that of a soil that stays as it is after d true frames [1]."""
     skill_at_rest: float
     skill_in_subspace: float  # the same of the modes only
-    position_rmse: (
-        float  # RMS per axis [m]; NaN where only modes are known: then `skill` is that in the subspace
-    )
+    # RMS per axis [m]; NaN where only modes are known: then `skill` is that in the subspace
+    position_rmse: float
+    still_rmse: float  # the same of a soil that stays as it is after d true frames
     force_nrmse: float  # RMS of the force error's length / RMS of the force's length [1]
+    mean_force_nrmse: float  # the same of the training runs' mean force
     force_nrmse_at_rest: float
     body_rmse: float  # RMS distance between predicted and true body nodes [m]; 0 for a prescribed body
     force: Tensor  # predicted from d true frames [N], shape (B, T, 3), zero in the history
 
+    @property
+    def errors(self) -> tuple[float, float, float, float]:
+        """Of the soil [m] and of soil that stays as it is, of the force [NRMSE] and of the mean force."""
+        return self.position_rmse, self.still_rmse, self.force_nrmse, self.mean_force_nrmse
+
     def words(self) -> str:
         """The main numbers."""
-        if math.isnan(self.position_rmse):
-            soil = f"skill in the subspace {self.skill:.3f} (from rest {self.skill_at_rest:.3f})"
+        if not math.isnan(self.position_rmse):
+            soil = f"soil error {1e3 * self.position_rmse:.3g} mm"
         else:
-            soil = (
-                f"position error {1e3 * self.position_rmse:.3g} mm, skill {self.skill:.3f} (in the subspace alone "
-                f"{self.skill_in_subspace:.3f}, from rest {self.skill_at_rest:.3f})"
-            )
+            soil = f"soil in the modes {self.skill:.3f} (1: perfect, 0: as if nothing moved)"
         return f"{soil}, force NRMSE {self.force_nrmse:.3f}"
 
 
@@ -140,12 +143,16 @@ class ValidationRollouts:
                 self.squares(part - self.latent) for part in (given[:, -1:], latent, at_rest)
             )
             all_frozen = frozen + self.unseen_way
+            entries = len(self.names) * self.coordinates
+            mean_force = dynamics.force.mean.to(self.force).expand_as(self.force)
             return RolloutScore(
                 1 - (error + self.unseen) / all_frozen,
                 1 - (error_at_rest + self.unseen) / all_frozen,
                 1 - error / frozen,
-                ((error + self.unseen) / (len(self.names) * self.coordinates)) ** 0.5,
+                ((error + self.unseen) / entries) ** 0.5,
+                (all_frozen / entries) ** 0.5,
                 self.force_error(force),
+                self.force_error(mean_force),
                 self.force_error(force_at_rest),
                 self.body_error(body) if dynamics.predicts_body else 0.0,
                 force,
@@ -280,11 +287,9 @@ class RolloutValidation(L.Callback):
             step,
         )
         logger.experiment.add_figure("force/validation", force_figure(self.rollouts, score), step)
-        losses = ", ".join(
-            f"{k} {float(trainer.callback_metrics[f'loss/{k}']):.3g}" for k in ("change", "force")
-        )
+        loss = float(trainer.callback_metrics["loss/total"])
         steps = self.settings.max_steps
-        log.info("step %d of %d: loss %s; validation: %s", step, steps, losses, score.words())
+        log.info("step %d of %d: loss %.3g; on validation runs: %s", step, steps, loss, score.words())
         if score.skill > self.best or not (self.output / "best.ckpt").exists():
             self.best = score.skill
             trainer.save_checkpoint(self.output / "best.ckpt")
@@ -301,18 +306,31 @@ class RolloutValidation(L.Callback):
 
 
 class StepProgress(L.Callback):
-    """Moves a bar over all optimisation steps on; Lightning's own goes by epochs."""
+    """Moves a bar over all optimisation steps on, since Lightning's own goes by epochs; says once how long it takes."""
+
+    SAID_AFTER = 10.0
+    """How long steps are timed before that [s]."""
 
     def __init__(self, bar: tqdm) -> None:
         self.bar = bar
+        self._begin: tuple[int, float] | None = None
+        self._said = False
 
     def on_train_start(self, trainer: L.Trainer, *_: Any) -> None:
         """Where a resumed training stands."""
         self.bar.initial = self.bar.n = trainer.global_step
 
-    def on_train_batch_end(self, *_: Any) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
         """One step further."""
         self.bar.update()
+        step, now = trainer.global_step, time.perf_counter()
+        if self._begin is None:  # the first step is slower than the others
+            self._begin = step, now
+        first, begin = self._begin
+        if not self._said and now - begin >= self.SAID_AFTER:
+            self._said = True
+            rate = (step - first) / (now - begin)
+            log.info("%.3g steps a second: about %.2g min more", rate, (self.bar.total - step) / rate / 60)
 
 
 def logger_of(trainer: L.Trainer) -> TensorBoardLogger:

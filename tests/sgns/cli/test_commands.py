@@ -142,7 +142,12 @@ def test_every_option_of_every_group_composes(command: str) -> None:
         (["rollout"], ["missing for checkpoint", "checkpoint=..."]),
         (["rollout", "checkpoint=null"], ["checkpoint is null"]),
         (["rollout", "checkpoint=best.ckpt", "scene=quick_excavation"], ["no checkpoint at best.ckpt"]),
-        (["rollout", "checkpoint=a.ckpt", "solver.precision=float64"], ["solver: no such key"]),
+        (
+            ["rollout", "checkpoint=a.ckpt", "scene=wheel", "solver.precision=float64"],
+            ["solver: no such key"],
+        ),
+        (["rollout", "checkpoint=a.ckpt", "scene.slip=0.3"], ["no checkpoint at a.ckpt"]),
+        (["rollout", "-m", "checkpoint=a.ckpt,b.ckpt", "scene.slip=0.3"], ["no checkpoint at a.ckpt"]),
         (["evaluate", "checkpoint=a.ckpt", "dataset=null"], ["dataset is null; allowed: ", "quick"]),
         (["simulate", "experiment=x"], ["experiment=x: --config-dir is missing"]),
         (["evaluate", "checkpoint=a.ckpt", "~dataset"], ["dataset is missing", "allowed:", "quick"]),
@@ -202,8 +207,23 @@ def test_the_solver_says_what_is_wrong(empty_folder: Path) -> None:
 
 def test_a_job_of_a_sweep_says_what_is_wrong(empty_folder: Path) -> None:
     result = call_fake("if cfg.seed == 2: raise UserError('bad')", "-m", "seed=1,2,3", "output=sweep")
-    assert_one_line(result, "sgns train: job 1 (output=sweep,seed=2): bad\n")
+    assert_one_line(result, "sgns train: job 1 (seed=2,output=sweep): bad\n")
     assert {path.name for path in Path("sweep").iterdir()} == {"multirun.yaml", "0"}
+
+
+def test_a_sweep_ends_with_a_table(empty_folder: Path) -> None:
+    body = """import json; from pathlib import Path
+    found = {"position_rmse": 0.002 * cfg.seed, "force_nrmse": 0.3, "seconds": 4.0}
+    Path(cfg.output, "training.json").write_text(json.dumps(found))
+    return 0.5"""
+    result = call_fake(body, "-m", "seed=1,2", "device=cpu", "output=sweep")
+    assert result.returncode == 0, result.stderr
+    names = ["seed", "soil_error_mm", "force_nrmse", "training_s", "output", "skill"]
+    rows = [[str(n), str(2.0 * n), "0.3", "4.0", f"sweep/{n - 1}/best.ckpt", "0.5"] for n in (1, 2)]
+    assert [row.split(",") for row in Path("sweep/sweep.csv").read_text().splitlines()] == [names, *rows]
+    *_, head, one, two, last = (line.split() for line in result.stdout.splitlines())
+    assert head == names and last[-1] == "sweep/sweep.csv"
+    assert [one, two] == [[c.removesuffix(".0") for c in row] for row in rows]
 
 
 def test_wrong_key_in_a_sweep(empty_folder: Path) -> None:
@@ -276,20 +296,27 @@ def test_log_lines(empty_folder: Path) -> None:
     assert (result.stdout, result.stderr) == ("3 s\nwarning: slow\n", "")
 
 
+@pytest.mark.parametrize("sweep", [[], ["-m", "seed=1,2"]], ids=["alone", "in a sweep"])
 @pytest.mark.parametrize("written", [True, False], ids=["something written", "nothing written"])
-def test_an_interruption_says_how_to_go_on(written: bool, empty_folder: Path) -> None:
+def test_an_interruption_says_how_to_go_on(written: bool, sweep: list[str], empty_folder: Path) -> None:
     write = "open(cfg.output + '/last.ckpt', 'w').close(); " if written else ""
     body = write + "import time; print('ready', flush=True); time.sleep(60)"
     # A shell's background job, such as a CI's, ignores the signal, and so would what it starts.
     heeding = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n" + FAKE
-    command = [sys.executable, "-c", heeding, body, "train", "output=here"]
+    command = [sys.executable, "-c", heeding, body, "train", *sweep, "output=here"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    assert process.stdout is not None
+    while process.stdout.readline() != "ready\n":
+        assert process.poll() is None
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert said.count("\n") == 1 and said.startswith("sgns train: interrupted; ")
-    assert ("output=here" in said) == written == Path("here").exists()
+    assert said.count("\n") == 1 and said.startswith("sgns train: ") and "interrupted; " in said
+    assert (
+        said.endswith("with output=here\n")
+        == written
+        == (Path("here") / ("0" if sweep else "last.ckpt")).exists()
+    )
 
 
 @pytest.mark.parametrize("streams", ["2>&-", ">&-", "<&- >&- 2>&-", "2>&1 | true", "> /dev/full"])

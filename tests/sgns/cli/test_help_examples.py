@@ -116,6 +116,37 @@ def test_a_rollout_plays_the_scene_of_its_checkpoint(folder: Path) -> None:
         os.chdir(before)
 
 
+def test_a_command_ends_with_the_next_one(empty_folder: Path) -> None:
+    dataset = ["dataset=quick", "dataset.path=data/a b"]
+    made = call("simulate", *dataset, "dataset.runs=3", "scene.start=0.5", *SMALL)
+    assert made.stdout.endswith("next: sgns train dataset=quick 'dataset.path=data/a b'\n"), made.stderr
+    for _ in range(2):  # also when nothing is left to do
+        trained = call("train", *dataset, *TRAIN, "output=one")
+        done = trained.stdout
+        assert trained.returncode == 0, trained.stderr
+        checkpoint = "checkpoint=one/best.ckpt"
+        for words in (["evaluate", *map(shlex.quote, dataset), checkpoint], ["rollout", checkpoint]):
+            assert f"sgns {' '.join(words)}" in done
+    *_, one, other = (shlex.split(line.partition("sgns ")[2]) for line in done.splitlines())
+    for command in (one, other):
+        assert call(*command).returncode == 0
+
+
+def test_a_sweep_over_checkpoints_plays_the_scene_of_each(folder: Path) -> None:
+    shutil.copytree(folder / "outputs/first", folder / "outputs/second", dirs_exist_ok=True)
+    checkpoints = [f"outputs/{name}/best.ckpt" for name in ("first", "second")]
+    sweep = ["-m", f"checkpoint={','.join(checkpoints)}", "scene.depth=0.03", "output=swept.h5"]
+    done = sgns(folder, "rollout", *sweep, "hydra.sweep.dir=swept")
+    assert done.returncode == 0, done.stderr
+    assert "of_checkpoint" not in done.stdout
+    for number in range(2):
+        with Run(folder / f"swept/{number}/swept.h5") as run:
+            assert run.scene == scene_from_config(composed(*SMALL, "scene.depth=0.03")).to_dict()
+    rows = [line.split(",") for line in (folder / "swept/sweep.csv").read_text().splitlines()]
+    assert rows[0] == ["checkpoint", "output", "wall_s_per_simulated_s"]
+    assert [row[0] for row in rows[1:]] == checkpoints
+
+
 def test_finished_work_is_replaced_only_when_asked(folder: Path) -> None:
     cut = ["simulate", *SMALL, "output=cut.h5"]
     rollout = ["rollout", "checkpoint=outputs/first/best.ckpt", "output=cut.h5"]

@@ -120,16 +120,25 @@ def test_perfect_network_is_limited_by_the_reduction_alone(dataset, basis, tmp_p
     assert again.total.row() == pytest.approx(result.total.row(), nan_ok=True)
     with caplog.at_level("INFO"):
         evaluate_module.log_summary(result, tmp_path / "report.html")
-    for words in ("frozen", "mean force of the training split", "report.html"):
+    for words in (
+        "if the soil did not move",
+        "mean force of the training runs",
+        "no soil error can be below",
+        "report.html",
+    ):
         assert words in caplog.text
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
-def test_frozen_network_has_no_skill(dataset, tmp_path):
+def test_frozen_network_has_no_skill(dataset, tmp_path, caplog):
     # With nearly all variance in the subspace, a network that freezes is the frozen baseline.
     basis = fitted(dataset.runs("train"), 10)
     result = evaluate(simulator(dataset, basis, mistake=frozen_latent), dataset, tmp_path)
     assert result.total.skill() == pytest.approx(0.0, abs=0.05)
+    worse = replace(result, total=replace(result.total, mse=result.total.mse | {"frozen": 0.0}))
+    with caplog.at_level("INFO"):
+        evaluate_module.log_summary(worse, tmp_path / "report.html")
+    assert "hint: the soil is predicted no better than if nothing moved; what helps" in caplog.text
 
 
 def test_network_that_always_answers_the_mean_equals_the_baseline(dataset, basis, tmp_path):

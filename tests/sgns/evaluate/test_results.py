@@ -7,10 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sgns.evaluate.metrics import PositionErrors
 from sgns.evaluate.results import (
     Evaluation,
     aggregate,
     example_row,
+    run_scores,
     seen_before,
     typical_and_worst,
     write_csv,
@@ -36,6 +38,25 @@ def test_typical_and_worst_by_position_and_force():
     assert chosen((1.0, 0.5), (2.0, nothing), (1.1, 0.4)) == ["2", "1"]
     assert chosen((0.0, 0.0), (0.0, 0.0)) == ["0", "0"]
     assert chosen((math.inf, 0.3), (2.0, 0.2), (2.1, 0.3))[1] == "0"
+
+
+def test_force_in_contact_leaves_rest_out():
+    force = np.zeros((8, 3))
+    force[4:, 0] = [-90.0, -110.0, -90.0, -110.0]
+    guess = SimpleNamespace(force=np.full((8, 3), [-80.0, 0.0, 0.0]))
+    time = np.arange(8) / 60.0
+    truth = SimpleNamespace(time=time, force=force, torque=force, wall_time_s=None)
+    guess.torque = guess.force
+    errors = PositionErrors(time[2:], *[np.full(6, 1e-6)] * 7)
+    row = run_scores("a", errors, truth, guess, 2, guess.force[0], np.zeros(3)).row()
+    rms = math.sqrt(90.0**2 + 110.0**2)
+    assert row["contact_force_nrmse"] == pytest.approx(math.sqrt(10.0**2 + 30.0**2) / rms)
+    assert row["contact_mean_force_nrmse"] == pytest.approx(math.sqrt(2.0) * 10.0 / rms)
+    assert row["force_nrmse"] == pytest.approx(0.605, abs=1e-3)  # at rest there was no force
+    still = SimpleNamespace(time=time, force=0.0 * force, torque=force, wall_time_s=None)
+    assert math.isnan(
+        run_scores("a", errors, still, guess, 2, guess.force[0], np.zeros(3)).row()["contact_force_nrmse"]
+    )
 
 
 def test_aggregate_by_hand(tmp_path):

@@ -92,7 +92,9 @@ def test_several_grids_are_joined(tmp_path):
         {"motion": ["curved"], "depth": [0.02, 0.04]},
         {"motion": ["ramp"], "depth": [0.02], "speed": [0.1, 0.2]},
     ]
-    scenes = campaign(tmp_path, draw=grids, runs=None).scenes.values()
+    planned = campaign(tmp_path, draw=grids, runs=None)
+    assert sorted(planned.split.values()) == ["test", "train", "train", "validation"]  # of two runs each
+    scenes = planned.scenes.values()
     assert sorted((s.motion, s.depth, s.speed) for s in scenes) == [
         ("curved", 0.02, 0.1), ("curved", 0.04, 0.1), ("ramp", 0.02, 0.1), ("ramp", 0.02, 0.2)
     ]  # fmt: skip

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,11 +24,12 @@ from sgns.data.dataset import Dataset
 from sgns.data.run import Run
 from sgns.evaluate.command import evaluate
 from sgns.model.checkpoint import load_surrogate
-from sgns.model.dynamics import Path
+from sgns.model.dynamics import Path, Standardiser
 from sgns.reduction.reduce import reduce_dataset
 from sgns.settings import TrainingSettings
 from sgns.simulator import Simulator
 from sgns.train import lightning_module as module
+from sgns.train import validation
 from sgns.train.command import main, train
 from sgns.train.validation import ValidationRollouts
 from sgns_testing.commands import TRAIN, environment
@@ -146,6 +148,7 @@ class Known(torch.nn.Linear):
     def __init__(self, *answers) -> None:
         super().__init__(1, 1)
         self.answers = answers
+        self.force = Standardiser(torch.zeros(3), torch.ones(3))
 
     def unroll(self, latent, body, context):
         pad = body.position.shape[1] - self.answers[0].shape[1]
@@ -166,7 +169,20 @@ def test_the_training_says_the_error_of_the_report(data, trained, tmp_path, capl
     assert summary["skill_in_subspace"] > skill
     with caplog.at_level("INFO"):
         run(data, tmp_path / "again", max_steps=1, validate_every=1)
-    assert re.search(r"position error [\d.]+ mm, skill -?[\d.]+ \(in the subspace alone", caplog.text)
+    number = r"[\d.e+]+"
+    soil = rf"on 2 validation runs: soil error {number} mm \({number} mm if the soil did not move\)"
+    force = rf"force NRMSE {number} \({number} if it were always the mean force"
+    assert re.search(f"{soil}, {force}", caplog.text)
+
+
+def test_a_score_holds_the_plainest_guesses(data) -> None:
+    rollouts = ValidationRollouts(data.runs("validation"), 4, 3, "pose", basis=data.basis)
+    still = rollouts.latent.clone()
+    still[:, 3:] = still[:, 2:3]
+    guessed = Known(still, torch.full_like(rollouts.force, 2.0))
+    guessed.force = Standardiser(torch.full((3,), 2.0), torch.ones(3))
+    soil, frozen, force, mean_force = rollouts.measure(guessed).errors
+    assert soil == pytest.approx(frozen, rel=1e-3) and frozen > 0.0 and force == pytest.approx(mean_force)
 
 
 def test_more_modes_are_compared_in_full_space(data) -> None:
@@ -184,7 +200,7 @@ def test_more_modes_are_compared_in_full_space(data) -> None:
     # Where there are no particles, as in published data, it says so.
     alone = ValidationRollouts([replace(one, path=None) for one in runs], 2, 3, "pose", basis=data.basis)
     found = alone.measure(Known(alone.latent, alone.force))
-    assert np.isnan(found.position_rmse) and found.words().startswith("skill in the subspace 1.000")
+    assert np.isnan(found.position_rmse) and found.words().startswith("soil in the modes 1.000 (1: perfect")
 
 
 def reconstruction_of(runs, basis) -> float:
@@ -383,3 +399,13 @@ def test_a_cluster_s_signal_ends_it_as_ctrl_c_does(begin_in_a_job, tmp_path, num
     assert process.returncode == 128 + number
     assert said == "sgns train: interrupted; to go on, give the same command with output=out\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "out"]  # no checkpoint of Lightning's
+
+
+def test_it_says_once_how_long_it_takes(monkeypatch, caplog) -> None:
+    clock = itertools.count(0.0, 4.0)  # a step takes 4 s
+    monkeypatch.setattr(validation.time, "perf_counter", lambda: next(clock))
+    progress = validation.StepProgress(validation.tqdm(total=33, disable=True))
+    with caplog.at_level("INFO"):
+        for step in range(1, 11):
+            progress.on_train_batch_end(SimpleNamespace(global_step=step))
+    assert caplog.messages == ["0.25 steps a second: about 1.9 min more"]
