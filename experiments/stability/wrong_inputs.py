@@ -57,7 +57,7 @@ def main() -> int:
             if one.fault:
                 print(one.fault, "|", one.case.what[:200], "|", one.said[-500:])
     shutil.rmtree(folder)
-    print(f"{len(done) + len(cases)} inputs, {faults} faults")
+    print(f"{len(known) + len(cases)} inputs, {faults} faults")
     return min(faults, 1)
 
 
