@@ -51,7 +51,7 @@ def test_yaml_of_settings(empty_folder, good, nothing_long) -> None:
         (["train", "model.hidden_width=10000", "model.hidden_layers=100"], "about 6e+10 weights; at most"),
         (["train", "device=meta"], "device is 'meta', which holds no numbers"),
         (
-            ["rollout", "checkpoint=a.ckpt", "rate_independent=nope"],
+            ["rollout", "checkpoint=a.ckpt", "scene=excavation", "rate_independent=nope"],
             "rate_independent is 'nope'; allowed: true, false",
         ),
     ],
