@@ -196,7 +196,9 @@ def few_frames(**training: Any) -> tuple[float, str]:
 
 def horizon_too_long() -> tuple[float, str]:
     return unsaid(
-        lambda: train_synthetic(synthetic_data(), new_folder(), horizon=200), "200 steps", "201 frames"
+        lambda: train_synthetic(synthetic_data(), new_folder(), horizon=200),
+        "training.horizon=200",
+        "201 frames",
     )
 
 
@@ -241,9 +243,7 @@ def unfit_checkpoint() -> tuple[float, str]:
 
 
 def wrong_modes() -> tuple[float, str]:
-    return unsaid(
-        lambda: Simulator.load(synthetic_network(), num_modes=5), "4 modes", "cannot have 5", "1 to 4"
-    )
+    return unsaid(lambda: Simulator.load(synthetic_network(), num_modes=5), "num_modes is 5", "1 to 4")
 
 
 MEASURES = {

@@ -58,7 +58,7 @@ def test_a_mesh_scene_survives_plain_data_with_its_mesh(tmp_path):
     """Data that a mesh was read for may come from any file, and open none."""
     file = write_obj(tmp_path / "box.obj", box_corners((0.06, 0.1, 0.1)), BOX_FACES)
     scene = Body(bed=BED, tool=MeshBody(file=str(file)), path=path(0.2, 0.1))
-    with pytest.raises(SceneError, match="does not come with these data"):
+    with pytest.raises(SceneError, match="a mesh, which these data do not hold"):
         Scene.from_dict(scene.to_dict())
     data = scene.to_dict()
     data["tool"].pop("digest")
