@@ -54,7 +54,7 @@ class Preview:
         touching = np.flatnonzero((low < 0.0) & over)
         touch = float(times[touching[0]]) if len(touching) else None
         reach = np.stack([outline.min(axis=0), outline.max(axis=0)]) - body.path_point
-        found = [odd_size(outline, scene.bed.size, scene.open_sides), *_of_path(scene, low, touch)]
+        found = [odd_size(body, scene.bed.size, scene.open_sides), *_of_path(scene, low, touch)]
         odd = [one for one in found if one]
         warnings += [one.words for one in odd]
         if len(scene.displaced):

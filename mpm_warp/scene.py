@@ -333,7 +333,7 @@ class Scene(Settings):
     def _check_thickness(self, body: Tool, what: str) -> None:
         """A body must be thick enough for soil to be inside before it is pushed out."""
         if body.half_thickness + self.contact_distance < HOLDS * self.bed.spacing:
-            odd = odd_size(body.outline(), self.bed.size, self.open_sides)
+            odd = odd_size(body, self.bed.size, self.open_sides)
             remedy = odd.words if odd else "use a smaller bed.spacing (at most half the thickness is good)"
             raise SceneError(
                 f"{what} of {2.0 * body.half_thickness:g} m is too thin for a grid of {self.bed.spacing:g} m: "
@@ -360,7 +360,7 @@ class Scene(Settings):
                 allowed = (f"0 to {lx:g} m", f"0 to {ly:g} m", f"at least {-lz:g} m")[axis]
                 if self._path and (unit := place_unit(np.array(self._path)[:, 1:4], self.bed.size)):
                     remedy = f"the path's positions look like {unit} and are taken as metres"
-                elif odd := odd_size(outline, self.bed.size, self.open_sides):
+                elif odd := odd_size(body, self.bed.size, self.open_sides):
                     remedy = odd.words
                 raise SceneError(
                     f"{what} leaves the bin at {times[some[pose]]:.3f} s: {'xyz'[axis]} = {at:.4f} m, "

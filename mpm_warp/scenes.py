@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import field, fields, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -160,10 +160,10 @@ class Body(Scene):
 
     def warnings(self) -> list[str]:
         found, h = super().warnings(), self.bed.spacing
-        if odd_size(self.tool.outline(), self.bed.size, self.open_sides):
+        if odd_size(self.tool, self.bed.size, self.open_sides):
             return found  # which is another matter
         thickness = thinnest(self.tool, 2.0 * h)
-        if thickness < 2.0 * h:
+        if thickness < 1.999 * h:  # in single precision
             found.append(
                 f"the tool's thinnest part is {1e3 * thickness:.3g} mm, {thickness / h:.2g} grid spacings; below 2 the "
                 "soil on its two sides feels each other: use a smaller bed.spacing"
@@ -235,6 +235,7 @@ class Wheel(Scene):
     height is free. The mass is load / gravity, so that the weight is the load; of a load over time, its largest.
     """
 
+    _notes: ClassVar[tuple[str, ...]] = ()  # of settings that others go before
     name: str = "wheel"
     kind: str = "wheel"
     bed: Bed = field(
@@ -293,6 +294,7 @@ class Wheel(Scene):
             raise SceneError(f"scene.gravity is {self.gravity} m/s^2; a wheel needs more than 0")
         if isinstance(self.load, tuple):
             object.__setattr__(self, "load", _as_loads(self.load))
+        notes: list[str] = []
         mass = self.axle.mass
         if not LEAST_MASS <= mass <= MOST_MASS:
             raise SceneError(
@@ -302,7 +304,12 @@ class Wheel(Scene):
         if self.travel_speed is not None:
             slow, fast = sorted((self.rim_speed, self.travel_speed))
             slip = 1.0 - slow / fast if fast > 0.0 else 0.0
-            object.__setattr__(self, "slip", -slip if self.travel_speed > self.rim_speed else slip)
+            slip = -slip if self.travel_speed > self.rim_speed else slip
+            if self.slip not in (type(self).slip, slip):
+                notes.append(
+                    f"scene.slip {self.slip:g} is not used: travel_speed and rim_speed make it {slip:.3g}"
+                )
+            object.__setattr__(self, "slip", slip)
         elif self.rim_speed == 0.0:
             raise SceneError(
                 "scene.rim_speed is 0.0 m/s; a wheel needs more than 0, or scene.travel_speed if it is locked"
@@ -316,8 +323,16 @@ class Wheel(Scene):
         except SceneError as error:
             raise SceneError(str(error).replace("tool.", "scene.")) from None
         if self.friction_angle is not None:
-            material = replace(self.material, friction_angle=self.friction_angle)
+            other, static = self.material.friction_angle, self.material.static_friction
+            if other not in (None, self.friction_angle):
+                static = Material.static_friction  # what is there follows from the other angle
+                notes.append(
+                    f"material.friction_angle {other:g} is not used: scene.friction_angle {self.friction_angle:g} goes "
+                    "before it; set scene.friction_angle=null to use it"
+                )
+            material = replace(self.material, friction_angle=self.friction_angle, static_friction=static)
             object.__setattr__(self, "material", material)
+        object.__setattr__(self, "_notes", tuple(notes))
         self._check_thickness(self.body, "a wheel's width")
         self._check_fits()
 
@@ -364,7 +379,12 @@ class Wheel(Scene):
         return sinkage(vars(self), poses)
 
     def warnings(self) -> list[str]:
-        found = super().warnings()
+        found = [*super().warnings(), *self._notes]
+        if self.friction_angle is not None:
+            found = [
+                one.replace("material.friction_angle=null", "scene.friction_angle=null") for one in found
+            ]
+            found = [one.replace("because material.friction", "because scene.friction") for one in found]
         if self.grousers and self.grouser_thickness < self.bed.spacing:
             found.append(
                 f"the grousers are {self.grouser_thickness / self.bed.spacing:.2f} grid spacings thick; below 1 the "

@@ -115,6 +115,7 @@ def thickening(body: Tool, contact_distance: float, spacing: float) -> np.ndarra
 
 
 _LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
+_SHORT = {"millimetres": "mm", "centimetres": "cm", "inches": "in"}
 _TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 _LONG = 50.0
 """What is so many times longer or shorter than what it belongs to, is odd."""
@@ -123,32 +124,34 @@ _CLOCK = 1e8
 
 
 class Odd(NamedTuple):
-    """What is odd about numbers, and whether nobody can mean it: then another unit explains them."""
+    """What is odd about numbers, and whether nobody can mean it."""
 
     words: str
     sure: bool = False
 
 
-def odd_size(outline: np.ndarray, size: tuple[float, float, float], open_sides: bool) -> Odd | None:
-    """What is odd about a tool with surface points (k, 3) in a bin of `size` [m]; None if nothing is. With
-    `open_sides` it may be wider than the bin. One up to ten times as long as the bin may have a long handle."""
+def odd_size(body: Tool, size: tuple[float, float, float], open_sides: bool) -> Odd | None:
+    """What is odd about a tool in a bin of `size` [m]; None if nothing is. With `open_sides` it may be wider than the
+    bin. One up to ten times as long as the bin may have a long handle."""
     kept = [0, 2] if open_sides else [0, 1, 2]
-    side, room = float(np.ptp(outline, axis=0)[kept].max()), max(size[axis] for axis in kept)
+    side, room = float(np.ptp(body.outline(), axis=0)[kept].max()), max(size[axis] for axis in kept)
     if room / _LONG <= side <= room:
         return None
     way = "longer than" if side > room else "less than 1/50 of"
     found = f"the tool is {side:.3g} m long, {way} the bin ({room:g} m)"
-    likely = _likely(_LENGTHS, lambda scale: room / _LONG <= scale * side <= room)
+    taken = next((name for name, short in _SHORT.items() if short == getattr(body, "unit", "m")), "metres")
+    metres = _LENGTHS.get(taken, 1.0)
+    likely = _likely(_LENGTHS, lambda scale: room / _LONG <= scale / metres * side <= room)
     if likely:
         words = (
-            f"{found}: its numbers look like {likely} and are taken as metres (of a mesh: scene.tool.unit)"
+            f"{found}: its numbers look like {likely} and are taken as {taken} (of a mesh: scene.tool.unit)"
         )
         return Odd(words, side > 10.0 * room)
     if room / _LONG <= 1e3 * side <= room:
         return Odd(
             f"{found}: it was made a thousand times too small (of a mesh: scene.tool.unit, scale)", True
         )
-    return Odd(f"{found}; lengths are in metres")
+    return Odd(f"{found}; lengths are in metres", side > 10.0 * room)
 
 
 def place_unit(places: np.ndarray, size: tuple[float, float, float]) -> str:

@@ -484,3 +484,18 @@ def test_poses_hold_the_computed_height(driven):
     assert poses[-1, 2] < planned[-1, 2]
     middle = np.array([f.body_points.mean(axis=0) for f in frames])
     np.testing.assert_allclose(middle, poses[:, :3], atol=1e-9)
+
+
+def test_a_wheel_says_which_of_two_settings_it_does_not_use():
+    assert not wheel().warnings()
+    [words] = wheel(material=Material(friction_angle=40.0), friction_angle=37.0).warnings()
+    assert "material.friction_angle 40 is not used: scene.friction_angle 37" in words
+    [words] = wheel(material=Material(static_friction=0.38), friction_angle=37.0).warnings()
+    assert (
+        "because scene.friction_angle 37 degrees (tan)" in words and "set scene.friction_angle=null" in words
+    )
+    [words] = wheel(slip=0.4, rim_speed=0.1, travel_speed=0.1).warnings()
+    assert "scene.slip 0.4 is not used: travel_speed and rim_speed make it 0" in words
+    scene = wheel(material=Material(friction_angle=40.0), friction_angle=37.0, slip=0.4, travel_speed=0.1)
+    assert not Scene.from_dict(scene.to_dict()).warnings()
+    assert wheel(material=Material(friction_angle=40.0), friction_angle=None).material.friction_angle == 40.0
