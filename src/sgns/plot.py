@@ -31,8 +31,9 @@ from sgns.evaluate.figures import (
     new_figure,
     png,
     styled,
+    worth_showing,
 )
-from sgns.evaluate.metrics import NEGLIGIBLE_SHARE, forward_force
+from sgns.evaluate.metrics import named_forces, named_torques
 from sgns.evaluate.views import COLOUR_BAR, common_scales, draw_body, nice, side_views, view_times
 from sgns.model.features import is_wheel
 
@@ -113,23 +114,17 @@ def surface_figure(run: Any, frame: int, start: np.ndarray) -> Figure:
 def curves(run: Run) -> list[Panel]:
     """Forces and torques worth mentioning, and the sinkage of a wheel, through time."""
     name, colour = ("simulated (MPM)", TRUTH) if run.producer == "mpm" else ("network", NETWORK)
-    forward, sign = forward_force(run.scene)
-    force, torque = run.force, run.torque
-    names = [
-        (f"{forward} [N]", "lateral Fy [N]", "vertical Fz [N]"),
-        ("roll Tx [N m]", "pitch Ty [N m]", "yaw Tz [N m]"),
-    ]
+    forces, torques = named_forces(run.scene, run.force), named_torques(run.scene, run.torque)
     parts = []
-    for labels, values in zip(names, (force * [sign, 1.0, 1.0], torque), strict=True):
-        largest = np.abs(values).max(axis=0)
-        shown = largest > NEGLIGIBLE_SHARE * largest.max()  # the others are zero by symmetry
-        parts += [(labels[axis], values[:, axis]) for axis in np.flatnonzero(shown)]
+    for (names, values), unit in ((forces, "N"), (torques, "N m")):
+        shown = np.flatnonzero(worth_showing(values))  # the others are zero by symmetry
+        parts += [(f"{names[axis]} [{unit}]", values[:, axis]) for axis in shown]
     if not parts:
-        parts = [(f"{forward} [N]", sign * force[:, 0])]
+        parts = [(f"{forces[0][0]} [N]", forces[1][:, 0])]
     if is_wheel(run.scene):
         parts.append(("sinkage [mm]", 1e3 * sinkage(run.scene, run.pose)))
     # A small component is drawn as small as it is beside the largest force.
-    least = 0.1 * float(np.ptp(force, axis=0).max())
+    least = 0.1 * float(np.ptp(forces[1], axis=0).max())
     return [
         Panel(label, [Curve(name, run.time, values, colour)], least_height=least if "[N]" in label else 0.0)
         for label, values in parts

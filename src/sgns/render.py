@@ -19,7 +19,7 @@ from tqdm import tqdm
 from sgns.data.files import whole_file
 from sgns.data.run import Run
 from sgns.evaluate.figures import NETWORK, STYLE, TRUTH, new_figure
-from sgns.evaluate.metrics import forward_force
+from sgns.evaluate.metrics import named_forces
 from sgns.evaluate.views import Scales, common_scales, draw_view
 from sgns.plot import picture_place, require_finite
 
@@ -100,8 +100,9 @@ def draw_chart(figure: Figure, runs: Mapping[str, Run], frame: int) -> None:
     """The forward force through time, on the right of a picture."""
     height = figure.get_figheight()
     axis = figure.add_axes((4.6 / WIDTH, 0.55 / height, 2.05 / WIDTH, (height - 0.9) / height))
-    label, sign = forward_force(next(iter(runs.values())).scene)
-    values = {title: sign * run.force[:, 0] for title, run in runs.items()}
+    named = {title: named_forces(run.scene, run.force) for title, run in runs.items()}
+    label = next(iter(named.values()))[0][0].replace("\n", " ")
+    values = {title: force[:, 0] for title, (_, force) in named.items()}
     for title, run in runs.items():
         colour = TRUTH if run.producer == "mpm" else NETWORK
         axis.plot(run.time[: frame + 1], values[title][: frame + 1], color=colour, label=title)

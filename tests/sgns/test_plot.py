@@ -43,8 +43,15 @@ def test_panels_show_units_and_the_sinkage_of_a_wheel(tmp_path):
         labels = [panel.label for panel in plot.curves(run)]
     assert labels[0] == "drawbar pull Fx [N]" and labels[-1] == "sinkage [mm]"
     assert all(label.endswith("]") for label in labels)
-    with Run(make_run(tmp_path / "turned.h5", n=100, scene=WHEEL | {"slip_angle": 30.0})) as run:
-        assert plot.curves(run)[0].label == "forward Fx [N]"
+
+
+def test_a_turned_wheel_has_the_forces_and_the_torque_of_its_own_axes(tmp_path):
+    with Run(make_run(tmp_path / "run.h5", n=100, scene=WHEEL | {"slip_angle": 30.0})) as run:
+        panels = {panel.label.split("\n")[0]: panel for panel in plot.curves(run)}
+        table = run.forces()
+    for name, column in (("drawbar pull", "pull"), ("lateral force", "lateral"), ("drive torque", "drive")):
+        assert panels[name].curves[0].values == pytest.approx(table[column].to_numpy())
+    assert panels["lateral force"].label == "lateral force\n(along axle) [N]"
 
 
 def test_a_moving_picture_plays_in_real_time(run_file, tmp_path):

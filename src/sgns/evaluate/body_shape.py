@@ -23,12 +23,12 @@ def body_corners(run: Any, frame: int) -> np.ndarray:
     """Points [m] of the body at a frame, shape (k, 3), world frame.
 
     The corners of the scene's blade, points along the rims of its wheel, the vertices of the mesh that the run holds,
-    else the recorded body points. Of all but the mesh, the body is their convex hull.
+    else the recorded body points. Of all but the mesh, the body is their convex hull, and a wheel's `grousers`.
     """
     scene = run.scene
     blade = scene.get("blade")
     if is_wheel(scene) and "width" in scene:
-        rim = np.insert(circle(float(scene["diameter"]), 24), 1, 0.5 * float(scene["width"]), axis=1)
+        rim = np.insert(circle(float(scene["diameter"]), 64), 1, 0.5 * float(scene["width"]), axis=1)
         corners = np.concatenate([rim, rim * [1.0, -1.0, 1.0]])
     elif isinstance(blade, Mapping):
         corners = (CUBE - 0.5) * np.array([blade["thickness"], blade["width"], blade["length"]], float)
@@ -39,28 +39,65 @@ def body_corners(run: Any, frame: int) -> np.ndarray:
     return in_world_frame(run.pose[[frame]], corners)[0]
 
 
+def grousers(run: Any, frame: int) -> np.ndarray:
+    """Corners [m] of a wheel's grousers at a frame, shape (g, 8, 3), world frame: boxes from the axis to their tips."""
+    scene = run.scene
+    count = int(scene.get("grousers") or 0) if is_wheel(scene) else 0
+    if not count:
+        return np.empty((0, 8, 3))
+    tip = 0.5 * float(scene["diameter"]) + float(scene["grouser_height"])
+    size = np.array([tip, scene["width"], scene["grouser_thickness"]], float)
+    x, y, z = ((CUBE - [0.0, 0.5, 0.5]) * size).T  # of the first one, along the body's +x
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None]  # from +x towards +z
+    c, s = np.cos(angle), np.sin(angle)
+    bars = np.stack([c * x - s * z, np.broadcast_to(y, (count, 8)), s * x + c * z], axis=-1)
+    return in_world_frame(run.pose[[frame]], bars.reshape(-1, 3))[0].reshape(bars.shape)
+
+
 def body_triangles(run: Any, frame: int) -> np.ndarray:
     """Triangles that the body is made of at a frame [m], shape (t, 3, 3), world frame; none where there is no body."""
     corners = body_corners(run, frame)
     if is_mesh(run):
         return simpler(corners[run.mesh[1]])
-    return hull_triangles(corners) if len(corners) else np.empty((0, 3, 3))
+    if not len(corners):
+        return np.empty((0, 3, 3))
+    return np.concatenate([hull_triangles(part) for part in (corners, *grousers(run, frame))])
+
+
+def body_cut(run: Any, frame: int, y: float) -> np.ndarray:
+    """The cut of a mesh with the plane at `y` [m] at a frame: its sides as x and z of two ends, shape (k, 2, 2).
+
+    Their ends follow each other around the cut; there are none of a body that is no mesh.
+    """
+    if not is_mesh(run):
+        return np.empty((0, 2, 2))
+    corners = body_corners(run, frame)[run.mesh[1]]
+    following = np.roll(corners, -1, axis=1)
+    height, height_following = corners[..., 1] - y, following[..., 1] - y
+    above, above_following = height >= 0.0, height_following >= 0.0
+    ends = []
+    for crossing in (above & ~above_following, ~above & above_following):  # one each per triangle that is cut
+        share = height[crossing] / (height[crossing] - height_following[crossing])
+        ends.append(corners[crossing] + share[:, None] * (following[crossing] - corners[crossing]))
+    return np.stack(ends, axis=1)[..., [0, 2]]
 
 
 def body_silhouette(run: Any, frame: int, axes: tuple[int, int] = (0, 2)) -> list[np.ndarray]:
     """Polygons (k, 2) [m] whose union is the body seen along the axis that is not in `axes`; from the side by default.
 
-    The circle of the scene's wheel if that is not turned, the triangles of a mesh, else the hull of the body's corners.
+    The circle of the scene's wheel if that is not turned, the triangles of a mesh, else the hull of the body's corners;
+    and a wheel's grousers.
     """
+    bars = [hull(bar[:, axes]) for bar in grousers(run, frame)]
     if is_wheel(run.scene) and axes == (0, 2) and not run.scene.get("slip_angle"):
-        return [run.pose[frame, [0, 2]] + circle(float(run.scene["diameter"]), 64)]
+        return [run.pose[frame, [0, 2]] + circle(float(run.scene["diameter"]), 64), *bars]
     if is_mesh(run):
         seen = body_triangles(run, frame)[..., axes]
         first, second = seen[:, 1] - seen[:, 0], seen[:, 2] - seen[:, 0]
         facing = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] > 0.0  # the far side covers the same
         return list(seen[facing])
     corners = body_corners(run, frame)
-    return [hull(corners[:, axes])] if len(corners) else []
+    return [hull(corners[:, axes]), *bars] if len(corners) else []
 
 
 def is_mesh(run: Any) -> bool:

@@ -27,7 +27,8 @@ from sgns.evaluate.metrics import (
     NEGLIGIBLE_SHARE,
     ParticleErrors,
     PositionErrors,
-    forward_force,
+    named_forces,
+    named_torques,
 )
 from sgns.model.features import is_wheel
 
@@ -247,24 +248,26 @@ def compared(
     return panels
 
 
-def worth_showing(truth: Any, prediction: Any, name: str) -> np.ndarray:
-    """Which components of force or torque are not next to none beside the largest, shape (3,)."""
-    runs = [run for run in (truth, prediction) if run is not None]
-    largest = np.abs(np.concatenate([getattr(run, name) for run in runs])).max(axis=0)
+def worth_showing(*values: np.ndarray) -> np.ndarray:
+    """Which components of forces or torques (T, 3) are not next to none beside the largest, shape (3,)."""
+    largest = np.abs(np.concatenate(values)).max(axis=0)
     return largest > NEGLIGIBLE_SHARE * largest.max()
 
 
 def force_panels(truth: Any, prediction: Any, history: int, mean_force: np.ndarray) -> list[Panel]:
     """Forward, lateral (where there is any worth mentioning) and vertical force; for a wheel also its sinkage.
     Arguments as in `compared`."""
-    forward, sign = forward_force(prediction.scene)
-    labels, signs = (f"{forward} [N]", "lateral Fy [N]", "vertical Fz [N]"), np.array([sign, 1.0, 1.0])
+    names, mean = named_forces(prediction.scene, mean_force)
     runs = (truth, prediction, history)
-    panels = compared(labels, lambda run: signs * run.force, *runs, signs * mean_force)
+
+    def read(run: Any) -> np.ndarray:
+        return named_forces(run.scene, run.force)[1]
+
+    panels = compared([f"{name} [N]" for name in names], read, *runs, mean)
     # A small component is drawn as small as it is beside the largest.
     ranges = [float(np.ptp(curve.values)) for panel in panels for curve in panel.curves if len(curve.values)]
     panels = [replace(panel, least_height=SMALLEST_PANEL * max(ranges, default=0.0)) for panel in panels]
-    if not worth_showing(truth, prediction, "force")[1]:
+    if not worth_showing(*(read(run) for run in runs[:2] if run is not None))[1]:
         del panels[1]
     if is_wheel(prediction.scene):
         panels += compared(["sinkage [mm]"], lambda run: 1e3 * sinkage(run.scene, run.pose)[:, None], *runs)
@@ -273,9 +276,13 @@ def force_panels(truth: Any, prediction: Any, history: int, mean_force: np.ndarr
 
 def torque_panels(truth: Any, prediction: Any, history: int, mean_torque: np.ndarray) -> list[Panel]:
     """Torque about the axes about which there is any worth mentioning. Arguments as in `compared`."""
-    labels = ("roll Tx [N m]", "pitch Ty [N m]", "yaw Tz [N m]")
-    panels = compared(labels, lambda run: run.torque, truth, prediction, history, mean_torque)
-    shown = worth_showing(truth, prediction, "torque")
+    names, mean = named_torques(prediction.scene, mean_torque)
+
+    def read(run: Any) -> np.ndarray:
+        return named_torques(run.scene, run.torque)[1]
+
+    panels = compared([f"{name} [N m]" for name in names], read, truth, prediction, history, mean)
+    shown = worth_showing(*(read(run) for run in (truth, prediction) if run is not None))
     return [panel for panel, worth in zip(panels, shown, strict=True) if worth]
 
 

@@ -10,17 +10,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mpm_warp.scenes import along_and_across
 from mpm_warp.settings import short_repr
 from sgns.config import UserError
 from sgns.data.run import SurfaceGrid, frame_chunks, height_map
 from sgns.model.features import is_wheel
 
 
-def forward_force(scene: Mapping[str, Any]) -> tuple[str, float]:
-    """Name of the forward force and the sign that F_x is reported with."""
-    if is_wheel(scene):
-        return "forward Fx" if scene.get("slip_angle") else "drawbar pull Fx", 1.0
-    return "draft −Fx", -1.0
+def named_forces(scene: Mapping[str, Any], force: np.ndarray) -> tuple[tuple[str, str, str], np.ndarray]:
+    """Forces (..., 3), world frame, as pictures show them, with their names: forward, lateral, vertical.
+
+    Of a turned wheel along its heading and its axle, of a tool that is no wheel the draft.
+    """
+    if not is_wheel(scene):
+        return ("draft −Fx", "lateral Fy", "vertical Fz"), force * [-1.0, 1.0, 1.0]
+    if not scene.get("slip_angle"):
+        return ("drawbar pull Fx", "lateral Fy", "vertical Fz"), force
+    names = "drawbar pull\n(along heading)", "lateral force\n(along axle)", "vertical Fz"
+    return names, along_and_across(scene, force)
+
+
+def named_torques(scene: Mapping[str, Any], torque: np.ndarray) -> tuple[tuple[str, str, str], np.ndarray]:
+    """Torques (..., 3), world frame, as pictures show them, with their names; as in `named_forces`."""
+    if is_wheel(scene) and scene.get("slip_angle"):
+        names = "torque about\nheading", "drive torque\n(about axle)", "yaw Tz"
+        return names, along_and_across(scene, torque)
+    return ("roll Tx", "pitch Ty", "yaw Tz"), torque
 
 
 # Both runs are files of the same kind and are read in chunks of frames, so memory does not grow with the length

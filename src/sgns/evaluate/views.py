@@ -11,14 +11,24 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import PolyCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 
 from sgns.data.run import Run, frame_chunks, particle_spacing
-from sgns.evaluate.body_shape import CUBE, DepthBuffer, body_silhouette, body_triangles, project
+from sgns.evaluate.body_shape import (
+    CUBE,
+    DepthBuffer,
+    body_cut,
+    body_silhouette,
+    body_triangles,
+    is_mesh,
+    project,
+)
 from sgns.evaluate.figures import (
     BASELINE,
     DPI,
@@ -33,6 +43,7 @@ from sgns.model.features import distance, markers
 from sgns.reduction.basis import Basis
 
 STEEL = "#4d5a66"
+BEHIND = "#dde2e6"  # of what is not in the slice that is shown
 # Resting soil looks like sand; the faster, the darker: legible without colour as well.
 SPEED = LinearSegmentedColormap.from_list("speed", ["#e9dcc3", "#e3b565", "#c9693a", "#8a2a55", "#33103f"])
 # No error looks like the paper; the larger, the darker.
@@ -77,15 +88,33 @@ def draw_force(
     )
 
 
-def draw_body(axis: Axes, silhouette: Sequence[np.ndarray]) -> None:
-    """The union of polygons as one shape: their black edges below, their faces above."""
-    faces: dict[str, Any] = {"facecolors": STEEL, "edgecolors": STEEL, "linewidths": 0.8}
+def draw_body(
+    axis: Axes, silhouette: Sequence[np.ndarray], face: str = STEEL, edge: str = "black", zorder: float = 3.0
+) -> None:
+    """The union of polygons as one shape: their edges below, their faces above."""
+    faces: dict[str, Any] = {"facecolors": face, "edgecolors": face, "linewidths": 0.8}
     if all(len(polygon) < 3 for polygon in silhouette):  # seen edge-on
-        faces = {"edgecolors": STEEL, "linewidths": 3.0}
+        faces = {"edgecolors": face, "linewidths": 3.0}
     axis.add_collection(
-        PolyCollection(silhouette, edgecolors="black", linewidths=2.2, zorder=3), autolim=False
+        PolyCollection(silhouette, edgecolors=edge, linewidths=2.2, zorder=zorder), autolim=False
     )
-    axis.add_collection(PolyCollection(silhouette, zorder=3.1, **faces), autolim=False)
+    axis.add_collection(PolyCollection(silhouette, zorder=zorder + 0.1, **faces), autolim=False)
+
+
+def draw_cut(axis: Axes, sides: np.ndarray) -> None:
+    """The cut of a mesh, filled, from its sides (k, 2, 2); see `body_cut`."""
+    if not len(sides):
+        return
+    # A triangle between each side and one point: where the sides go around a place, the triangles add up to not zero.
+    fan = np.concatenate([sides, np.broadcast_to(sides[:1, :1], (len(sides), 2, 2))], axis=1)
+    codes = np.tile(np.array([Path.MOVETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]), len(sides))
+    filled = PathPatch(
+        Path(fan.reshape(-1, 2), codes), facecolor=STEEL, linewidth=0.0, snap=False, zorder=3.0
+    )
+    axis.add_artist(filled)
+    axis.add_collection(
+        LineCollection(list(sides), colors="black", linewidths=1.1, zorder=3.1), autolim=False
+    )
 
 
 # --- A slice near mid-width at some moments of one or more runs -----------------------------------------
@@ -128,6 +157,7 @@ class Scales(NamedTuple):
     """What makes several side views comparable."""
 
     chosen: np.ndarray  # which particles lie near mid-width, shape (n,)
+    middle: float  # y of mid-width [m]
     speed: Normalize  # range of the colours [m/s]
     arrow: float  # length of a force arrow [m/N]
     x_limits: tuple[float, float]  # of the picture [m]
@@ -161,7 +191,8 @@ def common_scales(runs: Sequence[Any], frames: Sequence[int], start: np.ndarray)
     disc = spacing
     if chosen.sum() == MOST_PARTICLES:  # they take the room of those left out
         disc = max(disc, math.sqrt(3.0 * (high[0] - low[0]) * (high[2] - low[2]) / MOST_PARTICLES))
-    return Scales(chosen, speed, arrow, x_limits, (low[2] - 1.5 * spacing, top), disc)
+    middle = 0.5 * float(low[1] + high[1])
+    return Scales(chosen, middle, speed, arrow, x_limits, (low[2] - 1.5 * spacing, top), disc)
 
 
 def speeds(run: Any, frame: int, chosen: np.ndarray) -> np.ndarray:
@@ -202,7 +233,10 @@ def side_views(
 
 
 def draw_view(axis: Axes, title: str, run: Any, frame: int, scales: Scales, width: float) -> None:
-    """One run at one frame in a view so many inches wide."""
+    """One run at one frame in a view so many inches wide.
+
+    A mesh is cut at mid-width, as the soil is: what is beside the cut is pale, behind the soil.
+    """
     inches = width / np.ptp(scales.x_limits)  # per metre
     # Diameter of a particle [points].
     disc = max(1.4, 0.98 * scales.disc * 72.0 * inches)
@@ -211,7 +245,11 @@ def draw_view(axis: Axes, title: str, run: Any, frame: int, scales: Scales, widt
     x, _, z = run.positions(frame)[0, scales.chosen][order].T
     axis.scatter(x, z, c=speed[order], s=disc**2, cmap=SPEED, norm=scales.speed, linewidths=0.0)
     silhouette = body_silhouette(run, frame)
-    draw_body(axis, silhouette)
+    if is_mesh(run):
+        draw_body(axis, silhouette, BEHIND, STEEL, zorder=0.5)
+        draw_cut(axis, body_cut(run, frame, scales.middle))
+    else:
+        draw_body(axis, silhouette)
     force = run.force[frame, [0, 2]]
     size = float(np.linalg.norm(force)) * scales.arrow
     if size > 0.0 and silhouette:

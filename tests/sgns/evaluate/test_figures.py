@@ -187,6 +187,23 @@ def test_a_force_along_an_axis_without_any_is_left_out(truth, prediction):
     assert labels(0.0, forward=0.0) == ["draft", "vertical"]
 
 
+def test_a_turned_wheel_is_compared_along_its_heading_and_its_axle(tmp_path):
+    """The forces of two wheels that were turned by 90° are those of the world, the other way round."""
+    scene = WHEEL | {"slip_angle": 90.0}
+    run = Run(make_run(tmp_path / "run.h5", frames=20, n=60, scene=scene))
+    force = np.array([3.0, 2.0, 1.0]) * np.linspace(0.0, 1.0, 20)[:, None]
+    wheel = SimpleNamespace(time=run.time, force=force, torque=force, scene=run.scene, pose=run.pose)
+    panels = force_panels(wheel, wheel, HISTORY, np.array([3.0, 2.0, 1.0]))
+    labels = ["drawbar pull\n(along heading) [N]", "lateral force\n(along axle) [N]", "vertical Fz [N]"]
+    assert [panel.label for panel in panels[:3]] == labels
+    for panel, last in zip(panels, (2.0, -3.0, 1.0), strict=False):
+        assert [curve.values[-1] for curve in panel.curves] == pytest.approx([last] * 3)
+    drive = torque_panels(wheel, wheel, HISTORY, np.zeros(3))[1]
+    assert drive.label == "drive torque\n(about axle) [N m]"
+    assert curves(drive)["network"].values[-1] == pytest.approx(-3.0)
+    pixels(history_figure(panels))
+
+
 def test_wheel_has_drawbar_pull_and_its_own_sinkage(tmp_path):
     runs = [
         Run(make_run(tmp_path / f"{seed}.h5", frames=20, n=60, seed=seed, scene=WHEEL)) for seed in (1, 2)
@@ -212,7 +229,7 @@ def test_path_without_truth(prediction):
 def test_torque_about_axes_without_any_is_left_out(truth, prediction):
     (pitch,) = torque_panels(truth, prediction, HISTORY, np.zeros(3))
     assert pitch.label == "pitch Ty [N m]"
-    still = SimpleNamespace(time=np.arange(8.0), torque=np.zeros((8, 3)))
+    still = SimpleNamespace(time=np.arange(8.0), torque=np.zeros((8, 3)), scene={})
     assert torque_panels(still, still, HISTORY, np.zeros(3)) == []
 
 

@@ -5,7 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.colors import Normalize, to_rgb
+from scipy.spatial import ConvexHull
 
+from mpm_warp.poses import rotation_matrices
 from mpm_warp.scenes import Wheel, sinkage
 from sgns import plot
 from sgns.data.run import Run, particle_spacing
@@ -15,16 +18,22 @@ from sgns.evaluate.body_shape import (
     MOST_TRIANGLES,
     DepthBuffer,
     body_corners,
+    body_cut,
     body_silhouette,
     body_triangles,
+    grousers,
     hull,
     hull_triangles,
     project,
     simpler,
 )
 from sgns.evaluate.views import (
+    BEHIND,
     LEAST_SPEED,
     MOST_PARTICLES,
+    SPEED,
+    STEEL,
+    Scales,
     common_scales,
     draw_view,
     latent_path,
@@ -249,6 +258,26 @@ def test_a_turned_wheel_is_from_the_side_as_wide_as_it_is_thick():
         assert np.ptp(body_silhouette(run, 0, axes)[0], axis=0) == pytest.approx(size)
 
 
+@pytest.mark.parametrize("slip_angle", [0.0, 30.0])
+def test_grousers_are_drawn_at_their_angle_down_to_the_sinkage(slip_angle):
+    shape = {"grousers": 4, "grouser_height": 0.01, "grouser_thickness": 0.004}
+    scene = Wheel(diameter=0.2, width=0.08, slip_angle=slip_angle, **shape)
+    run = SimpleNamespace(scene=scene.to_dict(), pose=scene.body_poses())
+    outline = np.concatenate(body_silhouette(run, 0))
+    assert outline[:, 1].min() == pytest.approx(-scene.sinkage(run.pose)[0])
+    corners = body_triangles(run, 0).reshape(-1, 3)
+    assert (corners[:, 2].min(), np.ptp(corners[:, 2])) == pytest.approx((outline[:, 1].min(), 0.22))
+
+    frame = int(np.argmax(scene.times() > scene.settle)) + 5  # it has turned a little
+    (first, second, *_), axes = grousers(run, frame), rotation_matrices(run.pose[frame, 3:])
+    own = (first - run.pose[frame, :3]) @ axes
+    assert np.abs(axes - rotation_matrices(run.pose[0, 3:])).max() > 0.01
+    assert own.min(axis=0) == pytest.approx([0.0, -0.04, -0.002])
+    assert own.max(axis=0) == pytest.approx([0.11, 0.04, 0.002])
+    own = (second - run.pose[frame, :3]) @ axes
+    assert own[:, 2].max() == pytest.approx(0.11)  # at the body's +z
+
+
 def test_a_blade_is_its_box(pair):
     run = pair[0]
     corners = body_corners(run, 3)
@@ -280,6 +309,50 @@ def test_a_mesh_that_is_not_convex_is_drawn_as_it_is():
     assert body_triangles(run, 0) == pytest.approx(vertices[triangles] + REST[0, :3])
     assert shape_area(body_silhouette(run, 0)) == pytest.approx(7.0)  # its hull: 9
     assert shape_area(body_silhouette(run, 0, (0, 1))) >= 3.0 - 1e-9
+
+
+def test_the_cut_of_a_mesh_goes_around_its_walls():
+    vertices, triangles = u_profile()
+    run = SimpleNamespace(scene={"kind": "body"}, pose=REST, mesh=(vertices, triangles))
+    start, end = body_cut(run, 0, 0.7).swapaxes(0, 1)
+    enclosed = 0.5 * (start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0]).sum()
+    assert abs(enclosed) == pytest.approx(7.0)
+    assert len(body_cut(run, 0, 1.3)) == len(body_cut(run, 0, 0.1)) == 0  # it lies beside
+
+
+def test_a_view_shows_what_is_between_the_walls_of_a_mesh(pair):
+    """A U with a plate on one side, as a bucket with a cheek: where the cheek is, one sees the soil before it."""
+    vertices, triangles = u_profile()
+    cheek = 0.5 * CUBE * [6.0, 0.2, 6.0] + [0.0, 0.9, 0.0]
+    hidden = ConvexHull(cheek)
+    faces = hidden.simplices.copy()
+    normals = np.cross(*(cheek[faces[:, k]] - cheek[faces[:, 0]] for k in (1, 2)))
+    inwards = np.einsum("ij,ij->i", normals, hidden.equations[:, :3]) < 0.0
+    faces[inwards] = faces[inwards][:, ::-1]
+    mesh = 0.1 * np.concatenate([vertices, cheek]), np.concatenate([triangles, faces + len(vertices)])
+    run = SimpleNamespace(
+        scene={"kind": "body"},
+        pose=np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]),
+        mesh=mesh,
+        force=np.zeros((1, 3)),
+        time=np.zeros(1),
+        positions=lambda frame: np.array([[[0.25, 0.05, 0.15]]]),
+        velocities=lambda frame: np.zeros((1, 1, 3)),
+    )
+    scales = Scales(np.array([True]), 0.05, Normalize(0.0, 1.0), 0.0, (0.0, 0.3), (0.0, 0.3), 0.02)
+    figure = figures.new_figure(3.0, 3.0, None)
+    axis = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    draw_view(axis, "", run, 0, scales, 3.0)
+    picture = pixels(figure)
+    height, width = picture.shape[:2]
+    for place, colour in (
+        ((0.25, 0.05), STEEL),
+        ((0.05, 0.15), STEEL),
+        ((0.15, 0.15), BEHIND),
+        ((0.25, 0.15), SPEED(0.0)),
+    ):
+        column, row = round(place[0] / 0.3 * width), round((1.0 - place[1] / 0.3) * height)
+        assert picture[row, column, :3] == pytest.approx(to_rgb(colour), abs=0.01)
 
 
 def test_a_mesh_of_very_many_triangles_is_made_simpler_and_looks_the_same():
