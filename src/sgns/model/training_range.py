@@ -134,10 +134,9 @@ class TrainingRange:
         """Whether a position of some poses (T, 7) is far outside, but would not be if it was in millimetres."""
         low, high = (np.array(side[:3]) for side in self._box)
 
-        def inside(place: np.ndarray) -> np.ndarray:
-            return ((low <= place) & (place <= high)).all(axis=1)
-
-        return bool((~inside(poses[:, :3]) & inside(1e-3 * poses[:, :3])).any())
+        place = poses[:, :3]
+        inside, fits = (((low <= p) & (p <= high)).all(axis=1) for p in (place, 1e-3 * place))
+        return bool((~inside & fits).any())
 
     def excess(
         self,
