@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 
 TABLE = Path(str(files("sgns.frontier").joinpath("table.csv")))  # that ships with the package
 STEP = 1.0 / 60.0  # simulated time of one step: what `time` is the wall time of [s]
+_FAR_ABOVE = 10.0  # an error so many times the largest of the table is likely meant in another unit
 # Key of `error` → column, what one of its units is of the key's, and words. Lengths are metres in settings.
 ERRORS = {
     "force": ("force_nrmse", 1.0, "force NRMSE", ""),
@@ -76,18 +77,15 @@ def chosen(points: Sequence[Point], wish: Wish) -> tuple[Point, bool]:
     Raises:
         UserError: no point of the scene has the errors asked for.
     """
+    named = [
+        p for p in points if usable(p) and not (p.kind == "surrogate" and p.note)
+    ]  # the note: what it leaves out
     candidates = [
-        p
-        for p in points
-        if p.scene == wish.scene
-        and usable(p)
-        and not (p.kind == "surrogate" and p.note)  # the note says what the command leaves out
-        and not math.isnan(wish.excess(p) + wish.step_time(p))
+        p for p in named if p.scene == wish.scene and not math.isnan(wish.excess(p) + wish.step_time(p))
     ]
     if not candidates:
         raise UserError(
-            f"no operating point of task={wish.scene} has all the numbers asked for; its kinds of error are "
-            f"in points.csv"
+            f"no operating point of task={wish.scene} has all the numbers asked for; {_kinds(named, wish)}"
         )
     good = [p for p in candidates if wish.excess(p) <= 1.0]
     if not good:
@@ -96,6 +94,22 @@ def chosen(points: Sequence[Point], wish: Wish) -> tuple[Point, bool]:
         return min(good, key=wish.step_time), True
     with_force = [p for p in good if not math.isnan(wish.error(p, "force"))] or good
     return min(with_force, key=lambda p: (wish.error(p, "force"), wish.step_time(p))), True
+
+
+def _kinds(points: Sequence[Point], wish: Wish) -> str:
+    """Which kinds of error a scene's points have, and which other scenes have those asked for."""
+
+    def having(key: str) -> list[str]:
+        found = (p.scene for p in points if not math.isnan(getattr(p, wish.column(key))))
+        return list(dict.fromkeys(found))
+
+    kinds = ", ".join(f"error.{key}" for key in ERRORS if wish.scene in having(key)) or "no error"
+    hints = [f"it has {kinds}"]
+    for key in wish.limits:
+        if wish.scene not in (scenes := having(key)):
+            there = " or ".join(f"task={scene}" for scene in scenes) or "no task"
+            hints.append(f"error.{key} is known of {there}")
+    return "; ".join(hints)
 
 
 def advice(points: Sequence[Point], wish: Wish) -> list[str]:
@@ -127,6 +141,14 @@ def advice(points: Sequence[Point], wish: Wish) -> list[str]:
         elif low < high:
             said += f" ({low:.3g} to {high:.3g} from case to case)"
         lines.append(said if limit is None else f"{said}, asked for {limit:.3g}{unit}")
+        largest = max(
+            (error for p in points if not math.isnan(error := wish.error(p, key))), default=math.inf
+        )
+        if limit is not None and unit and limit > _FAR_ABOVE * largest:
+            lines.append(
+                f"    errors are given in metres, the largest of the table is {largest:.3g}{unit}: "
+                f"for {limit / 1e3:g} mm give error.{key}={limit / 1e6:g}"
+            )
         if limit is not None and limit < band:
             lines.append(
                 f"    the reference itself is only known to {band:g}{unit}: nothing can be shown to be better"

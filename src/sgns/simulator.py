@@ -32,7 +32,8 @@ from sgns.model.training_range import FAR, Excess
 from sgns.numbers import check_pose, check_poses, elapsed, finite_array, first_pose, is_whole, real_array
 from sgns.reduction.basis import Basis
 
-# Every so many steps it is looked at whether the tool is far outside the training range.
+# Every step it is looked at whether the tool's place and way are far outside the training range; the rest, such as its
+# orientation, takes longer and is looked at every so many steps.
 _LOOK_EVERY = 30
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
 _SETTLING = 0.5
@@ -308,7 +309,8 @@ class Simulator:
         self._shown = [shown, (pose, latent[0, -1].cpu().numpy().copy())]
         self._frame += 1
         state = self._state()
-        if self._frame % _LOOK_EVERY == 1:
+        known = self._surrogate.training_range
+        if not self._warned and (self._frame % _LOOK_EVERY == 1 or known.far(shown[0], pose)):
             self._look(self._frame - 1, np.stack([shown[0], pose]), self._points, self._context)
         return state
 
@@ -317,14 +319,18 @@ class Simulator:
         if self._warned:
             return
         latent = np.zeros((len(poses), self.num_modes, 3))
-        found = self._surrogate.training_range.excess(poses, points, latent, context, of="the tool's")
+        known = self._surrogate.training_range
+        found = known.excess(poses, points, latent, context, of="the tool's")
         if found is None or not found.largest > FAR:
             return
         self._warned, worst = True, int(found.amount.argmax())
+        unit = (
+            "; positions look like millimetres and are taken as metres" if known.in_millimetres(poses) else ""
+        )
         warnings.warn(
             f"at frame {begin + worst} {found.quantity[worst]} is {found.amount[worst]:.2g} times its training range "
-            "outside of it: force and soil are a guess there (`outside` of every state and rollout says how far; this "
-            "line comes once)",
+            f"outside of it{unit}: force and soil are a guess there (`outside` of every state and rollout says how "
+            "far; this line comes once)",
             stacklevel=3,
         )
 

@@ -118,6 +118,21 @@ def test_bad_input_gives_one_line(overrides: list[str], line: str) -> None:
         answer(*overrides)
 
 
+def test_an_error_that_a_task_does_not_have_is_told_with_the_task_that_has_it() -> None:
+    wheel = replace(POINTS[1], scene="wheel", sinkage_error_mm=2.0)
+    line = r"it has error\.force, error\.position; error\.sinkage is known of task=wheel$"
+    with pytest.raises(UserError, match=line):
+        answer("error.sinkage=0.002", more=[wheel])
+    with pytest.raises(UserError, match=r"error\.sinkage is known of no task$"):
+        answer("error.sinkage=0.002")
+
+
+def test_an_error_that_was_likely_meant_in_millimetres_is_told() -> None:
+    lines = answer("error.position=4")
+    assert any("errors are given in metres" in line and "give error.position=0.004" in line for line in lines)
+    assert not any("metres" in line for line in answer("error.position=0.01"))
+
+
 def test_the_command_reads_a_table_of_one_s_own(tmp_path: Path) -> None:
     write_points(tmp_path / "points.csv", POINTS)
     cfg = OmegaConf.create(asked("error.force=0.25", f"table='{tmp_path / 'points.csv'}'"))

@@ -221,6 +221,27 @@ def test_a_step_far_outside_is_told_once(trained) -> None:
         simulator.step(pose)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda place: place + np.eye(3)[1], r"displacement per frame \(y\) is \S+ times"),
+        (
+            lambda place: 1e3 * place,
+            "outside of it; positions look like millimetres and are taken as metres: ",
+        ),
+    ],
+    ids=["aside", "millimetres"],
+)
+def test_a_step_far_outside_is_told_when_it_comes(trained, change, words) -> None:
+    simulator, path = trained.simulator("pose"), trained.run.pose[:8].copy()
+    path[6, :3] = change(path[6, :3])
+    stepped(simulator, path[:6])
+    with pytest.warns(UserWarning, match=f"at frame 6 .*{words}") as caught:
+        simulator.step(path[6])
+    simulator.step(path[7])
+    assert len(caught) == 1 and ("millimetres" in str(caught[0].message)) == ("millimetres" in words)
+
+
 @pytest.mark.parametrize("kind", ["pose", "points"])
 def test_nothing_runs_away_far_from_everything(trained, kind) -> None:
     simulator, path = trained.simulator(kind), trained.run.pose.repeat(50, axis=0)

@@ -20,6 +20,7 @@ from mpm_warp.poses import in_body_frame, rotation_matrices
 from sgns.config import UserError, parse_yaml
 from sgns.data.files import one_line
 from sgns.data.hdf5 import BROKEN, own_dataset, own_object, own_view
+from sgns.data.run import Run
 from sgns.data.run_file import (
     PRODUCERS,
     SERIES,
@@ -47,6 +48,8 @@ QUATERNION_TOLERANCE = 1e-5
 """How far a quaternion's length may be from 1."""
 INTERVAL_TOLERANCE = 1e-2
 """How far the time between frames may be from 1 / frame_rate, as a share of it."""
+# How the reason begins of a run that was ended from outside: nothing is wrong with it.
+_INTERRUPTED = ("interrupted by ", "its process ended")
 _SCENE_NUMBERS = (
     "depth speed rake diameter width grouser_height slip slip_angle friction_angle gravity".split()
 )
@@ -54,7 +57,8 @@ _BLADE_NUMBERS = ("thickness", "width", "length")
 
 
 def check_run(path: str | os.PathLike[str]) -> list[str]:
-    """Everything that is wrong with a run file, in words; an empty list means it is good.
+    """Everything that is wrong with a run file, in words; an empty list means it is good. So is one that was
+    interrupted and can be gone on with.
 
     Reads every dataset, a frame of soil at a time.
     """
@@ -75,7 +79,7 @@ def check_run(path: str | os.PathLike[str]) -> list[str]:
                 problems += check(file)
             except BROKEN as error:
                 problems.append(f"the file is damaged ({one_line(error)})")
-    return problems
+    return problems or _state_problems(path)
 
 
 def _check_h5md(file: h5py.File) -> Iterator[str]:
@@ -146,8 +150,34 @@ def scene_problems(scene: Mapping[str, Any]) -> list[str]:
 
 
 def _check_stopped(file: h5py.File) -> Iterator[str]:
-    if (reason := read_attributes(file).get(STOPPED)) is not None:
+    reason = read_attributes(file).get(STOPPED)
+    if reason is not None and not one_line(reason).startswith(_INTERRUPTED):
         yield f"the run stopped after {len(series(file, 'position'))} good frames: {one_line(reason)}"
+
+
+def _state_problems(path: str | os.PathLike[str]) -> list[str]:
+    """Why an interrupted run cannot be gone on with."""
+    try:
+        with Run(path) as run:
+            if run.stopped is None or not run.stopped.startswith(_INTERRUPTED):
+                return []
+            frames, last = run.frame_count, run.state.frame
+    except UserError as error:
+        return [str(error)]
+    if last == frames - 1:
+        return []
+    return [f"it holds {frames} frames but the state of frame {last}; repeat the run"]
+
+
+def _verdict(path: Path) -> str:
+    """What a file without a problem is."""
+    with Run(path) as run:
+        if run.stopped is None:
+            return "good"
+        duration = run.scene.get("duration")
+        length = duration * run.frame_rate if isinstance(duration, (int, float)) else math.nan
+        total = f" of {round(length) + 1}" if math.isfinite(length) else ""
+        return f"unfinished: {run.frame_count}{total} frames, good; the same `sgns simulate` goes on"
 
 
 def _check_times(file: h5py.File) -> Iterator[str]:
@@ -331,7 +361,7 @@ def main(cfg: DictConfig) -> float:
             for problem in problems:
                 log.info("%s", problem if str(path) in problem else f"{path}: {problem}")
         else:
-            log.info("%s: good", path)
+            log.info("%s: %s", path, _verdict(path))
     if bad:
         raise UserError(
             f"{bad} of {len(files)} files checked {'is' if bad == 1 else 'are'} not good; see above"

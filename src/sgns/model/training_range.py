@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ FAR = 0.5
 # A component that varies less than the others of its quantity is given this share of their range as its own.
 _FLOOR = 0.1
 _AXES = ("x", "y", "z")
+_POSITION = "the tool's position"
+_DISPLACEMENT = "the tool's displacement per frame"
 _POINTS = "the number of the tool's points"
 _SOIL = "the soil's state"
 
@@ -109,6 +112,32 @@ class TrainingRange:
         low, high = (side[_SOIL] for side in (self.low, self.high))
         return low - margin * widths(low, high), high + margin * widths(low, high)
 
+    @cached_property
+    def _box(self) -> tuple[list[float], list[float]]:
+        """Smallest and largest x, y, z of the tool, and of its displacement per frame, that are not far outside [m]."""
+        low, high = np.full(6, -np.inf), np.full(6, np.inf)
+        for first, name in ((0, _POSITION), (3, _DISPLACEMENT)):
+            if name in self.low:
+                margin = FAR * widths(self.low[name], self.high[name])
+                low[first : first + 3] = self.low[name] - margin
+                high[first : first + 3] = self.high[name] + margin
+        return low.tolist(), high.tolist()
+
+    def far(self, before: np.ndarray, pose: np.ndarray) -> bool:
+        """Whether a tool's position or its displacement from one pose (7,) to the next is far outside: what of `excess`
+        takes microseconds."""
+        (a, b, c), (x, y, z) = before[:3].tolist(), pose[:3].tolist()
+        values = x, y, z, x - a, y - b, z - c
+        return any(v < low or v > high for v, low, high in zip(values, *self._box, strict=True))
+
+    def in_millimetres(self, poses: np.ndarray) -> bool:
+        """Whether a position of some poses (T, 7) is far outside, but would not be if it was in millimetres."""
+        low, high = (np.array(side[:3]) for side in self._box)
+
+        place = poses[:, :3]
+        inside, fits = (((low <= p) & (p <= high)).all(axis=1) for p in (place, 1e-3 * place))
+        return bool((~inside & fits).any())
+
     def excess(
         self,
         poses: np.ndarray,
@@ -145,11 +174,11 @@ def quantities(
     with np.errstate(invalid="ignore"):  # of a soil that is not finite
         velocity = np.diff(latent, axis=0, prepend=latent[:1])
     return {
-        "the tool's position": place,
+        _POSITION: place,
         "the tool's lowest point": heights[:, None],
         _POINTS: np.full((len(place), 1), float(points.shape[1])),
         "the tool's orientation": track.orientation[:, 0].numpy(),
-        "the tool's displacement per frame": moved[:, :3],
+        _DISPLACEMENT: moved[:, :3],
         "the tool's rotation per frame": moved[:, 3:],
         _SOIL: latent,
         "the soil's velocity": velocity,

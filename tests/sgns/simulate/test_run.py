@@ -277,6 +277,21 @@ def test_the_same_command_goes_on_and_another_is_refused_by_key(interrupted, tmp
         assert one.content_hash == two.content_hash
 
 
+def test_an_interrupted_run_is_listed_as_unfinished_unless_it_cannot_go_on(interrupted, tmp_path):
+    assert sgns(tmp_path, "simulate", *SMALL, "output=run.h5").returncode == 128 + signal.SIGTERM
+    words = f"run.stopped.h5: unfinished: {LAST + 1} of 13 frames, good; the same `sgns simulate` goes on\n"
+    found = sgns(tmp_path, "check", ".")
+    assert found.returncode == 0 and found.stdout.endswith(words), found.stderr
+    with h5py.File(tmp_path / "run.stopped.h5", "r+") as file:
+        file["state"].attrs["frame"] = 1
+    found = sgns(tmp_path, "check", ".")
+    assert found.returncode == 2 and "4 frames but the state of frame 1; repeat the run" in found.stdout
+    with h5py.File(tmp_path / "run.stopped.h5", "r+") as file:
+        del file["state"]
+    (problem,) = check_run(tmp_path / "run.stopped.h5")
+    assert "holds no state to go on from" in problem
+
+
 def test_an_interrupted_sweep_or_continuation_says_how_its_run_goes_on(interrupted, tmp_path):
     done = sgns(tmp_path, "simulate", *SMALL, "-m", "scene.rake=5.0", f"output={tmp_path}/run.h5")
     kept, output = tmp_path / "0/run.stopped.h5", tmp_path / "0/run.h5"
