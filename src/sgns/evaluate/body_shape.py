@@ -22,13 +22,12 @@ CELLS = 64
 def body_corners(run: Any, frame: int) -> np.ndarray:
     """Points [m] of the body at a frame, shape (k, 3), world frame.
 
-    The corners of the scene's blade, points along the rims of its wheel, the vertices of the mesh that the run holds,
-    else the recorded body points. Of all but the mesh, the body is their convex hull, and a wheel's `grousers`.
+    The corners of the scene's blade, points along the rims of its wheel or cylinder, the vertices of the mesh that the
+    run holds, else the recorded body points. Of all but the mesh, the body is their convex hull and the `grousers`.
     """
-    scene = run.scene
-    blade = scene.get("blade")
-    if is_wheel(scene) and "width" in scene:
-        rim = np.insert(circle(float(scene["diameter"]), 64), 1, 0.5 * float(scene["width"]), axis=1)
+    blade, drum = run.scene.get("blade"), cylinder(run.scene)
+    if drum:
+        rim = np.insert(circle(float(drum["diameter"]), 64), 1, 0.5 * float(drum["width"]), axis=1)
         corners = np.concatenate([rim, rim * [1.0, -1.0, 1.0]])
     elif isinstance(blade, Mapping):
         corners = (CUBE - 0.5) * np.array([blade["thickness"], blade["width"], blade["length"]], float)
@@ -39,14 +38,22 @@ def body_corners(run: Any, frame: int) -> np.ndarray:
     return in_world_frame(run.pose[[frame]], corners)[0]
 
 
+def cylinder(scene: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Where a scene has the sizes of its wheel or cylinder; empty without one."""
+    if is_wheel(scene):
+        return scene if "width" in scene else {}
+    tool = scene.get("tool")
+    return tool if isinstance(tool, Mapping) and tool.get("shape") == "cylinder" else {}
+
+
 def grousers(run: Any, frame: int) -> np.ndarray:
-    """Corners [m] of a wheel's grousers at a frame, shape (g, 8, 3), world frame: boxes from the axis to their tips."""
-    scene = run.scene
-    count = int(scene.get("grousers") or 0) if is_wheel(scene) else 0
+    """Corners [m] of the grousers at a frame, shape (g, 8, 3), world frame: boxes from the axis to their tips."""
+    drum = cylinder(run.scene)
+    count = int(drum.get("grousers") or 0)
     if not count:
         return np.empty((0, 8, 3))
-    tip = 0.5 * float(scene["diameter"]) + float(scene["grouser_height"])
-    size = np.array([tip, scene["width"], scene["grouser_thickness"]], float)
+    tip = 0.5 * float(drum["diameter"]) + float(drum["grouser_height"])
+    size = np.array([tip, drum["width"], drum["grouser_thickness"]], float)
     x, y, z = ((CUBE - [0.0, 0.5, 0.5]) * size).T  # of the first one, along the body's +x
     angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None]  # from +x towards +z
     c, s = np.cos(angle), np.sin(angle)
@@ -86,7 +93,7 @@ def body_silhouette(run: Any, frame: int, axes: tuple[int, int] = (0, 2)) -> lis
     """Polygons (k, 2) [m] whose union is the body seen along the axis that is not in `axes`; from the side by default.
 
     The circle of the scene's wheel if that is not turned, the triangles of a mesh, else the hull of the body's corners;
-    and a wheel's grousers.
+    and the grousers.
     """
     bars = [hull(bar[:, axes]) for bar in grousers(run, frame)]
     if is_wheel(run.scene) and axes == (0, 2) and not run.scene.get("slip_angle"):

@@ -278,6 +278,14 @@ def test_grousers_are_drawn_at_their_angle_down_to_the_sinkage(slip_angle):
     assert own[:, 2].max() == pytest.approx(0.11)  # at the body's +z
 
 
+def test_a_cylinder_on_a_path_is_drawn_as_a_wheel():
+    shape = {"grousers": 4, "grouser_height": 0.01, "grouser_thickness": 0.004}
+    tool = {"shape": "cylinder", "diameter": 0.2, "width": 0.08} | shape
+    run = SimpleNamespace(scene={"kind": "body", "tool": tool}, pose=REST, mesh=None)
+    assert np.ptp(np.concatenate(body_silhouette(run, 0)), axis=0) == pytest.approx(0.22)
+    assert np.linalg.norm(body_silhouette(run, 0)[0] - REST[0, [0, 2]], axis=1) == pytest.approx(0.1)
+
+
 def test_a_blade_is_its_box(pair):
     run = pair[0]
     corners = body_corners(run, 3)
