@@ -278,7 +278,7 @@ def _composition(error: ConfigCompositionException) -> str:
 
 
 def _unknown_key(cause: ConfigAttributeError | ConfigKeyError) -> str:
-    from omegaconf import DictConfig
+    from omegaconf import DictConfig, OmegaConf
 
     key = str(cause.full_key)
     parent = cause.parent_node
@@ -291,6 +291,15 @@ def _unknown_key(cause: ConfigAttributeError | ConfigKeyError) -> str:
     siblings = sorted(str(other) for other in parent.keys() if other != "hydra")
     where = key.rpartition(".")[0]
     line = f"{key}: no such key; "
+    if f"{key}.".startswith("scene.tool."):
+        kind = OmegaConf.select(parent._get_root(), "scene.kind")
+        has = {"excavation": "a plate, scene.blade", "wheel": "a wheel"}.get(kind, "no tool")
+        has = (
+            f"scene.tool has the keys {', '.join(siblings)}"
+            if where == "scene.tool"
+            else f"the {kind} scene has {has}"
+        )
+        return f"{line}{has}; for a mesh: scene=body scene/tool=mesh scene.tool.file=..."
     if near:
         line += f"did you mean {' or '.join(near[:3])}? "
     return line + _allowed(f"keys of {where}" if where else "keys", name, siblings)

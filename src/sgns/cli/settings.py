@@ -371,6 +371,8 @@ class CheckedLoader:
         try:
             cfg = compose([*scene, *overrides])
         except Exception as error:
+            if (whole := _of_grids(overrides, error)) != overrides:
+                return self._composed(command, whole, compose)
             if isinstance(error, MemoryError) or describe(error) is not None:
                 raise
             # Composing runs nothing of ours: what goes wrong there is in the settings.
@@ -384,19 +386,30 @@ class CheckedLoader:
         return cfg
 
     def _scene(self, command: str | None, overrides: list[str]) -> list[str]:
-        """What chooses the scene of a dataset or a checkpoint, to stand first: then overrides can be of its keys."""
+        """What chooses the scene of a dataset or a checkpoint, to stand first: then overrides can be of its keys.
+
+        A sweep's own settings are composed before those of its jobs: with the first option of each group it is over.
+        """
+        parser = OverridesParser.create()
         try:
-            parsed = OverridesParser.create().parse_overrides(overrides)
+            parsed = parser.parse_overrides(overrides)
         except HydraException:  # composing says what is wrong
             return []
-        given = {override.key_or_group: override for override in parsed}
+        first = [
+            f"{one.key_or_group}={_first(sweep)}"
+            for one in parsed
+            if isinstance(sweep := one.value(), ChoiceSweep) and options_of(one.key_or_group)
+        ]
+        given = {override.key_or_group: override for override in [*parsed, *parser.parse_overrides(first)]}
+        return [*first, *self._chosen(command, given)]
+
+    def _chosen(self, command: str | None, given: dict[str, Override]) -> list[str]:
         if "scene" in given:
             return []
         if command == "rollout" and "experiment" not in given and (checkpoint := given.get("checkpoint")):
             file = checkpoint.value()
             if isinstance(file, ChoiceSweep):  # until each job has its own
-                first = file.list[0]
-                file = first.text if isinstance(first, QuotedString) else first
+                file = _first(file)
             return _of_checkpoint(file, given)
         if command == "simulate" and "dataset" in given:
             try:
@@ -416,6 +429,34 @@ class CheckedLoader:
         if name.startswith("_"):  # of an object that is not yet unpickled
             raise AttributeError(name)
         return getattr(self._loader, name)
+
+
+def _first(sweep: ChoiceSweep) -> Any:
+    first = sweep.list[0]
+    return first.text if isinstance(first, QuotedString) else first
+
+
+def _of_grids(overrides: list[str], error: Exception) -> list[str]:
+    """The overrides with `dataset.draw` in place of the dataset's own, where composing failed since only one of the two
+    is a list of grids.
+
+    Raises:
+        UserError: One is of a key of that list.
+    """
+    if "Cannot merge DictConfig with ListConfig" in f"{error.__cause__}":
+        return [
+            part
+            for one in overrides
+            for part in (("~dataset.draw", f"+{one}") if one.startswith("dataset.draw=") else (one,))
+        ]
+    for one in overrides if isinstance(error, ValueError) else ():
+        if found := re.match(r"\+*dataset\.draw\.([^\d=][^=]*)=(.*)", one):
+            key, values = found.groups()
+            raise UserError(
+                f"dataset.draw.{key}: this dataset draws from a list of grids; give the keys to draw together, "
+                f"as in 'dataset.draw={{{key}: {values}, ...}}'"
+            ) from error
+    return overrides
 
 
 def _of_checkpoint(file: Any, given: Container[str]) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,36 @@ def base_scene(settings: dict[str, Any]) -> dict[str, Any]:
     return plain(cfg.scene) | {"material": plain(cfg.material)}
 
 
+def require_undrawn(settings: dict[str, Any], overrides: Sequence[str]) -> None:
+    """Refuse overrides of what every run of a campaign draws: they would have no effect.
+
+    Raises:
+        UserError: The line names the key.
+    """
+    draw = settings.get("draw")
+    grids = [one for one in (draw if isinstance(draw, list) else [draw]) if isinstance(one, dict)]
+    for key in (override.lstrip("+").partition("=")[0] for override in overrides):
+        drawn = [
+            values
+            for grid in grids
+            for name, values in grid.items()
+            if key in (f"scene.{name}", name) or key.startswith((f"scene.{name}.", f"{name}."))
+        ]
+        if drawn and len(drawn) == len(grids):
+            count = len(
+                {
+                    str(value)
+                    for values in drawn
+                    for value in (values if isinstance(values, list) else [values])
+                }
+            )
+            name = key.removeprefix("scene.")
+            raise UserError(
+                f"{key} has no effect: dataset={settings['name']} draws it ({count} values); leave it out, or give "
+                f"what is to be drawn, as in 'dataset.draw={{{name}: [...], ...}}'"
+            )
+
+
 def main(cfg: DictConfig) -> float | None:
     """Simulate `cfg.scene` into `cfg.output`, or the campaign `cfg.dataset`.
 
@@ -71,6 +102,7 @@ def main(cfg: DictConfig) -> float | None:
             raise UserError(
                 "dataset.where picks among runs that are there; to simulate fewer change dataset.draw"
             )
+        require_undrawn(settings, HydraConfig.get().overrides.task)
         campaign = plan(settings, base_scene(settings), asked, cfg.solver.precision, cfg.seed)
         limits = Limits.from_dict(plain(cfg.limits))
         for line in warning_summary(campaign.scenes, limits.any_unit):

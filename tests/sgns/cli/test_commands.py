@@ -111,6 +111,28 @@ def test_every_option_of_every_group_composes(command: str) -> None:
         (["train", "foo=1"], ["foo: no such key", "keys: checkpoint, dataset, device"]),
         (["train", "reduction.num_mode=3"], ["did you mean reduction.num_modes"]),
         (["train", "num_modes=3"], ["did you mean reduction.num_modes"]),
+        (
+            ["simulate", "scene.tool.file=a.obj"],
+            [
+                "scene.tool: no such key; the excavation scene has a plate",
+                "scene=body scene/tool=mesh scene.tool.file=",
+            ],
+        ),
+        (
+            ["simulate", "scene=body", "scene.tool.file=a.obj"],
+            ["scene.tool.file: no such key; scene.tool has the keys friction", "scene/tool=mesh"],
+        ),
+        (
+            ["simulate", "dataset=quick", "scene.depth=0.05"],
+            [
+                "scene.depth has no effect: dataset=quick draws it (4 values)",
+                "'dataset.draw={depth: [...], ...}'",
+            ],
+        ),
+        (
+            ["simulate", "dataset=quick", "dataset.draw.depth=[0.02,0.05]"],
+            ["a list of grids", "'dataset.draw={depth: [0.02,0.05], ...}'"],
+        ),
         (["train", "dataset=nope"], ["dataset=nope", "allowed:", "quick"]),
         (["train", "scene=excavation"], ["no group 'scene'"]),
         (["train", "reduction"], ["cannot read 'reduction'", "key=value"]),
@@ -230,6 +252,26 @@ def test_wrong_key_in_a_sweep(empty_folder: Path) -> None:
     assert_one_line(
         call("train", "-m", "reduction.num_mode=1,2", "output=x"), "did you mean reduction.num_modes"
     )
+
+
+def test_a_sweep_over_groups_takes_the_keys_of_their_options(empty_folder: Path) -> None:
+    for words in (
+        ["dataset=quick,quick_wheel", "dataset.runs=4"],
+        ["scene=wheel,quick_wheel", "scene.load=80"],
+    ):
+        done = call("simulate", "-m", *words, "limits.disk=1e-9")
+        assert "limits.disk is 1e-09 GB" in done.stderr, done.stderr
+
+
+def test_one_grid_or_several_are_drawn_whichever_the_dataset_has(empty_folder: Path) -> None:
+    for name, draw, keys in (
+        ("quick", "{depth: [0.04, 0.06, 0.08]}", "depth"),
+        ("quick_wheel", "[{slip: [0.2, 0.3]}, {load: [60, 80]}]", "slip,load"),
+    ):
+        where = [f"dataset={name}", f"dataset.path={name}", "dataset.runs=null"]
+        done = call("simulate", *where, f"dataset.draw={draw}", "limits.disk=1e-9")
+        assert "limits.disk is 1e-09 GB" in done.stderr, done.stderr
+        assert Path(name, "runs.csv").read_text().startswith(f"run,split,{keys}\n")
 
 
 def test_a_bug_keeps_its_traceback(empty_folder: Path) -> None:
