@@ -169,7 +169,7 @@ def advice(points: Sequence[Point], wish: Wish) -> list[str]:
     lines += [
         f"  the table knows task={tasks(points)} in these beds and soils only; for another scene measure your own: "
         "docs/guides/accuracy.md#measure-your-own",
-        "  whatever you choose, forces depend on the grid, mean draft by some 20 %: docs/limits.md",
+        "  whatever you choose, forces depend on the grid (draft by some 20 %, a wheel's pull more): docs/limits.md",
     ]
     return lines + ([f"  note: {point.note}"] if point.note else [])
 

@@ -49,8 +49,8 @@ MOST_COLUMNS = 500
 
 def main(cfg: DictConfig) -> None:
     """Draw the run `cfg.run` into the PNG file `cfg.output`."""
-    path = picture_place(cfg, ".png")
     with Run(cfg.run) as run:
+        path = picture_place(cfg, ".png")
         page = run_page(run)
     with whole_file(path) as hidden:
         page.save(hidden, format="png")

@@ -40,8 +40,8 @@ COLOURS = 48
 
 def main(cfg: DictConfig) -> None:
     """Draw the run `cfg.run` into the GIF file `cfg.output`."""
-    path = picture_place(cfg, ".gif")
     with Run(cfg.run) as run:
+        path = picture_place(cfg, ".gif")
         who = "simulated (MPM)" if run.producer == "mpm" else "network"
         speed, end = moving_picture({who: run}, path), run.time[-1]
     pace = "in real time" if speed == 1.0 else f"{speed:.2g} times as fast as real"

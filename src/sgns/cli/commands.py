@@ -131,7 +131,9 @@ def main() -> int:
 def _run(arguments: list[str]) -> int:
     name = "sgns"
     try:
-        if not arguments or arguments[0] in ("--help", "-h", "help"):
+        if arguments[:1] == ["help"]:
+            arguments = [*arguments[1:2], "--help"]
+        if not arguments or arguments[0] in ("--help", "-h"):
             write_output(_help())
             return 0
         if arguments[0] == "--version":

@@ -60,8 +60,8 @@ class Dataset:
         missing = [run for s in SPLITS for run in dataset.runs(s) if not os.path.exists(run)]
         if missing:
             raise UserError(
-                f"runs of {path} are missing: {len(missing)}, the first is {missing[0].name}; finish the dataset: "
-                f"sgns simulate dataset={dataset.name}"
+                f"runs of {path} are missing: {len(missing)}, the first is {missing[0].name}; finish the dataset "
+                f"with the command that began it: sgns simulate dataset={dataset.name} dataset.path={path} ..."
             )
         return dataset
 

@@ -270,7 +270,7 @@ class Run:
 
     def _dataset(self, name: str, part: str = "value") -> h5py.Dataset:
         if not self._file:
-            raise ValueError(f"{self.path} is closed")
+            raise UserError(f"{self.path} is closed; read it inside its `with`, or open it again")
         return series(self._file, name, part)
 
     def _whole(self, name: str, part: str = "value") -> np.ndarray:

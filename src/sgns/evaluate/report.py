@@ -67,6 +67,8 @@ def quantity(value: float | None) -> str:
 
 def describe(scene: Mapping[str, Any]) -> str:
     """What the paper lists of a blade's or a wheel's scene, in a few words; empty for other scenes."""
+    if scene.get("motion") == "path":
+        return "on a path of its own"  # its depth, speed and rake are not used
     if all(key in scene for key in ("depth", "speed", "rake", "motion")):
         depth, speed, rake, motion = (scene[key] for key in ("depth", "speed", "rake", "motion"))
         return f"{100 * depth:.3g} cm deep, {100 * speed:.3g} cm/s, rake {rake:.3g}°, {motion} motion"
@@ -370,7 +372,9 @@ def new_path(evaluation: Evaluation, path: Path) -> FigureGroup:
     """Side views and force of a path that was never simulated."""
     name, caption = path.stem, "Predicted soil at mid-width, coloured by speed, and the predicted force."
     with Run(path) as run:
-        frames, words = view_times(run, 1), describe(run.scene) or name
+        frames = view_times(run, 1)
+        outside = run.extra.get("outside_training_words")
+        words = (describe(run.scene) or name) + (f"; {outside}" if outside else "")
         figures = seen_from_the_side(evaluation, {NETWORK: run}, frames, f"new_side_{name}", name, caption)
         panels = force_panels(None, run, min(1, run.frame_count - 1), evaluation.mean_force)
     caption = "Frame means; dashed: the mean of the training runs."

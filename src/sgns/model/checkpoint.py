@@ -145,6 +145,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         UserError: Missing, truncated, or not a checkpoint of this project, or of a newer one.
     """
     path = Path(path)
+    if (inside := path / "best.ckpt").is_file():
+        raise UserError(f"{path} is a folder; use checkpoint={inside}")
     if not path.is_file():
         raise UserError(
             f"no checkpoint at {path}; train one with: sgns train output=<folder>, then use "

@@ -64,7 +64,8 @@ def test_help_lists_every_command_quickly() -> None:
     start = time.perf_counter()
     result = call_process("--help")
     assert time.perf_counter() - start < 5  # no torch, no warp: a fraction of a second on an idle machine
-    assert result.returncode == 0 and call_process().stdout == result.stdout
+    assert result.returncode == 0 and call_process().stdout == call_process("help").stdout == result.stdout
+    assert call_process("help", "check").stdout == call_process("check", "--help").stdout != result.stdout
     for name, command in COMMANDS.items():
         assert f"  {name} " in result.stdout and command.summary in result.stdout
 

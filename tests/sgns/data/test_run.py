@@ -47,7 +47,7 @@ def test_a_closed_run_keeps_what_was_read(tmp_path):
         force = run.force
     np.testing.assert_array_equal(run.force, force)
     assert run.scene and run.producer == "mpm"
-    with pytest.raises(ValueError, match="is closed"):
+    with pytest.raises(UserError, match="is closed; read it inside"):
         run.positions()
 
 

@@ -214,6 +214,7 @@ def test_description_and_file_name():
     turned = wheel | {"slip_angle": 60.0, "load": [[0.0, 1.0], [1.0, 2.0]]}
     assert describe(turned).startswith("15 cm wheel, load over time, slip 40 %, slip angle 60°, friction")
     assert describe({"kind": "bed"}) == ""
+    assert describe(scene | {"motion": "path"}) == "on a path of its own"
     assert picture("../a b/ü.h5", "", "", Figure()).name == "-a-b-h5"
 
 

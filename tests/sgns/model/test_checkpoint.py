@@ -57,3 +57,9 @@ def test_what_is_wrong_with_it_is_said(trained_briefly, tmp_path, line, spoil) -
     torch.save(content, tmp_path / "bad.ckpt")
     with pytest.raises(UserError, match=line):
         load_surrogate(tmp_path / "bad.ckpt")
+
+
+def test_a_folder_with_a_checkpoint_is_told_which_file_to_name(tmp_path) -> None:
+    (tmp_path / "best.ckpt").touch()
+    with pytest.raises(UserError, match=r"is a folder; use checkpoint=.*best\.ckpt"):
+        load_surrogate(tmp_path)
