@@ -152,3 +152,9 @@ def test_a_checkpoints_scene_with_a_mesh_says_where_the_mesh_is():
     data["tool"]["digest"] = "0123"
     with pytest.raises(SceneError, match=r"from a run: Scene.from_dict\(run.scene, run.mesh\)"):
         Scene.from_dict(data)
+
+
+def test_a_tool_that_comes_to_the_floor_is_told():
+    assert not any("floor" in words for words in Preview.of(cut(depth=0.1, duration=1.5, speed=0.1)).warnings)
+    [words] = Preview.of(cut(depth=0.15, duration=1.5, speed=0.1)).warnings
+    assert "mm above the floor, less than one grid spacing" in words
