@@ -211,7 +211,7 @@ def scene_groups(checkpoint: str | Path) -> dict[str, dict[str, Any]]:
 # What changes soil and force beside the path: named when it differs and the network is not told.
 _FIXED = "blade tool material gravity friction load diameter width friction_angle grousers damping".split()
 # Where a tool's mesh was read from; `digest` says which mesh it is.
-_ORIGIN_OF_MESH = ("tool.file", "tool.scale", "tool.unit", "tool.centre")
+_ORIGIN_OF_MESH = {"tool.file", "tool.scale", "tool.unit", "tool.centre"}
 # What follows from a number that a network may be told.
 _FOLLOWING = {"friction_angle": ("static_friction", "limit_friction")}
 
@@ -220,11 +220,14 @@ def unlearned(known: Mapping[str, Any], asked: Mapping[str, Any], told: Sequence
     """What a scene asked for changes in the known one, a training run's, that neither the path nor the keys that the
     network is told can tell it: `key value (trained with value)` for every such key of `_FIXED`."""
     covered = {name for key in told for name in (key.split(".")[-1], *_FOLLOWING.get(key, ()))}
+    changed = differences(known, asked)
+    # Another unit with another scale may be the same size.
+    same_size = _ORIGIN_OF_MESH - ({"tool.scale"} if "tool.unit" not in changed else set())
     return [
-        f"{key} {b} (trained with {a})"
-        for key, (a, b) in differences(known, asked).items()
+        "another mesh than in training" if key == "tool.digest" else f"{key} {b} (trained with {a})"
+        for key, (a, b) in changed.items()
         if key.split(".")[0] in _FIXED
-        and key not in _ORIGIN_OF_MESH
+        and key not in same_size
         and key.split(".")[-1] not in covered
         and None not in (a, b)
     ]

@@ -161,6 +161,11 @@ def test_changes_that_the_network_cannot_feel_are_named():
     soil = {"friction_angle": 30.0, "material": {"static_friction": 0.577}}
     other = {"friction_angle": 37.0, "material": {"static_friction": 0.754}}
     assert len(unlearned(soil, other)) == 2 and unlearned(soil, other, ["friction_angle"]) == []
+    # The same mesh in another size, and the same size from numbers in another unit.
+    mesh = {"tool": {"digest": "a", "unit": "cm", "scale": 1.0}}
+    assert unlearned(mesh, {"tool": mesh["tool"] | {"scale": 0.7}}) == ["tool.scale 0.7 (trained with 1.0)"]
+    assert unlearned(mesh, {"tool": mesh["tool"] | {"unit": "mm", "scale": 10.0}}) == []
+    assert unlearned(mesh, {"tool": mesh["tool"] | {"digest": "b"}}) == ["another mesh than in training"]
 
 
 def test_a_rollout_holds_the_mesh_of_its_tool(simulator, tmp_path):
