@@ -50,7 +50,8 @@ def main() -> int:
             writer.writerow(COLUMNS)
         for one in run_cases(cases, folder):
             measured = [one.status, f"{one.seconds:.1f}", one.bytes >> 20, one.fault]
-            line = one.line.removeprefix(f"sgns {one.case.command}: ")[:90] if one.status else ""
+            line = one.line.removeprefix(f"sgns {one.case.command}: ").replace(f"{folder}/", "")
+            line = line[:90] if one.status else ""
             writer.writerow([one.case.command, one.case.kind, input_of(one.case), *measured, line])
             file.flush()
             faults += bool(one.fault)

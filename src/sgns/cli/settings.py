@@ -373,7 +373,7 @@ class CheckedLoader:
         except Exception as error:
             if (whole := _of_grids(overrides, error)) != overrides:
                 return self._composed(command, whole, compose)
-            if isinstance(error, MemoryError) or describe(error) is not None:
+            if isinstance(error, (MemoryError, UserError)) or describe(error) is not None:
                 raise
             # Composing runs nothing of ours: what goes wrong there is in the settings.
             raise UserError(
