@@ -133,7 +133,6 @@ class TrainingRange:
     def in_millimetres(self, poses: np.ndarray) -> bool:
         """Whether a position of some poses (T, 7) is far outside, but would not be if it was in millimetres."""
         low, high = (np.array(side[:3]) for side in self._box)
-
         place = poses[:, :3]
         inside, fits = (((low <= p) & (p <= high)).all(axis=1) for p in (place, 1e-3 * place))
         return bool((~inside & fits).any())
