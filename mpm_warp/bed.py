@@ -193,6 +193,8 @@ def _reading_order(points: np.ndarray, radius: float) -> np.ndarray:
 
 PADDING = 3
 """Grid cells outside the bin, so that the nodes around a particle at a wall exist."""
+_LONG = 20.0
+"""A bin of that length [m] was likely given in millimetres, if its grid is too large."""
 MOST_PARTICLES = 20_000_000
 MOST_NODES = 200_000_000
 """Of the grid; both far beyond what has been computed, and short of what ends in an error or never ends."""
@@ -230,13 +232,18 @@ class Bed(Settings):
         super().__post_init__()
         if not 0 < self.spacing <= min(self.size) / 2:
             raise SceneError(
-                f"bed.spacing is {self.spacing} m; allowed: above 0, at most half the bin's smallest side"
+                f"bed.spacing is {self.spacing} m; allowed: above 0, at most half the bin's smallest side "
+                f"({min(self.size) / 2:g} m); lengths are in metres"
             )
         particles = math.prod(s / self.spacing for s in self.size) * self.particles_per_cell
         if not particles <= MOST_PARTICLES:
             raise SceneError(
-                f"the bed would hold {particles:.2g} particles; at most {MOST_PARTICLES:g} are allowed: use a larger "
-                "bed.spacing, a smaller bed.size or fewer bed.particles_per_cell"
+                f"the bed would hold {particles:.2g} particles; at most {MOST_PARTICLES:g} are allowed: "
+                + (
+                    f"bed.size is {list(self.size)}, in metres: was it given in millimetres?"
+                    if max(self.size) >= _LONG
+                    else "use a larger bed.spacing, a smaller bed.size or fewer bed.particles_per_cell"
+                )
             )
         height, margin = self.size[2] + self.headroom, 2.0 * PADDING + 2.0
         floor = math.prod(s / self.spacing + margin for s in self.size[:2])

@@ -62,6 +62,7 @@ class Material(Settings):
         gt=0,
         lt=90,
         words="; allowed: above 0 and below 90 degrees, or null for material.static_friction",
+        radians_below=1.6,
     )
     friction_map: Literal["sin", "tan", "triaxial"] = setting(
         "tan", "mu_s of the angle: tan (simple shear), sin (plane strain) or triaxial (compression)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from .bed import PADDING
 from .poses import rotation_matrices
 from .scene import Scene
+from .settings import likely_radians
 from .tool_geometry import Odd, odd_size, odd_times, place_unit
 
 
@@ -42,7 +44,7 @@ class Preview:
     @staticmethod
     def of(scene: Scene) -> Preview:
         """Of a scene; takes milliseconds."""
-        body, warnings = scene.body, scene.warnings()
+        body, warnings = scene.body, [*_radians(scene), *scene.warnings()]
         if body is None:
             return Preview(warnings=tuple(warnings), lines=tuple(_bin(scene)))
         times = scene.passing_times()
@@ -111,6 +113,18 @@ def _words(length: float) -> str:
     return f"{1e3 * length:.3g} mm" if length < 1.0 else f"{length:.3g} m"
 
 
+def _radians(scene: Scene) -> list[str]:
+    """A line for each angle that looks like one in radians."""
+    found = {f"scene.{name}": value for name, value in likely_radians(scene).items()}
+    for name, value in likely_radians(scene.material).items():
+        if getattr(scene, name, None) is None:  # else the scene's own goes before it
+            found[f"material.{name}"] = value
+    return [
+        f"{key} is {value:g} degrees, which looks like radians; angles are in degrees: {key}={math.degrees(value):.3g}"
+        for key, value in found.items()
+    ]
+
+
 def _bin(scene: Scene) -> list[str]:
     """Where the walls are if the grid does not fit the bin."""
     bed, h = scene.bed, scene.bed.spacing
@@ -163,4 +177,6 @@ def _of_poses(scene: Scene, times: np.ndarray, low: np.ndarray, touch: float | N
         remedy = "z = 0 is the surface and below it the z of a path is negative"
         if not len(times):
             remedy = "scene.depth, which is positive, counts from scene.clearance above the surface"
+            if low.min() > max(scene.bed.size):
+                remedy = "lengths are in metres"
     return [Odd(f"the tool never touches soil: {place}; {likely or remedy}", bool(likely))]

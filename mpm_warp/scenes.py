@@ -72,7 +72,9 @@ class Excavation(Scene):
         0.05, "the motion reaches this far below the tip's starting height", "m", ge=0, le=1e3
     )
     speed: float = setting(0.10, "forward speed", "m/s", gt=0, le=1e4)
-    rake: float = setting(10.0, "angle of the plate from vertical, tip leading", "degrees", ge=-60, le=60)
+    rake: float = setting(
+        10.0, "angle of the plate from vertical, tip leading", "degrees", ge=-60, le=60, radians_below=1.0
+    )
     motion: Literal["curved", "ramp", "rest", "path"] = setting("curved", "of the tip")
     start: float = setting(0.10, "where the tip starts" + _SHARE, ge=0, le=1, note=_SHARE)
     clearance: float = setting(
@@ -99,7 +101,10 @@ class Excavation(Scene):
                 f"scene.path is given but scene.motion is {self.motion!r}; use scene.motion=path"
             )
         self._check_thickness(self.blade, "blade.thickness")
-        self._check_inside(self.blade, "the plate", "change scene.depth, speed, start, duration or the path")
+        remedy = "change scene.depth, speed, start, duration or the path"
+        if self.depth > max(self.bed.size):
+            remedy = f"scene.depth is {self.depth:g} m; lengths are in metres"
+        self._check_inside(self.blade, "the plate", remedy)
 
     @property
     def body(self) -> Plate:
@@ -277,7 +282,9 @@ class Wheel(Scene):
         ge=-90,
         le=90,
     )
-    friction_angle: float | None = setting(37.0, "of the soil; None: material.friction_angle", "degrees")
+    friction_angle: float | None = setting(
+        37.0, "of the soil; None: material.friction_angle", "degrees", radians_below=1.6
+    )
     settle: float = setting(1.0, "time at rest under the load before driving; recorded like the rest", "s")
     damping: float = setting(5.0, "force against the vertical velocity per mass of the wheel", "1/s", ge=0)
     bilateral: bool = setting(  # type: ignore[misc]  # a kind of scene makes it a setting

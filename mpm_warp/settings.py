@@ -52,6 +52,8 @@ class Setting:
     """Follows the range in an error, to say why it is so."""
     words: str = ""
     """Stands after the value in an error, in place of unit, range and note."""
+    radians_below: float = 0.0
+    """An angle [degrees] that is smaller, but not 0, was likely given in radians."""
 
     @property
     def range(self) -> str:
@@ -199,6 +201,13 @@ def build(cls: type[Settings], data: Any, where: str, make: Callable[..., Any] |
         else:
             values[key] = build(_chosen(groups, value, place), value, place)
     return (make or cls)(**values)
+
+
+def likely_radians(group: Settings) -> dict[str, float]:
+    """The angles [degrees] of a group, by name, that were likely given in radians."""
+    known = _fields_of(type(group))
+    values = {name: getattr(group, name) for name, one in known.items() if one.setting.radians_below}
+    return {name: v for name, v in values.items() if v and abs(v) < known[name].setting.radians_below}
 
 
 def _groups(kind: Any) -> list[Any]:

@@ -5,7 +5,20 @@ import re
 import numpy as np
 import pytest
 
-from mpm_warp import Bed, Body, Box, Column, Excavation, MeshBody, Preview, Scene, SceneError, Walls, Wheel
+from mpm_warp import (
+    Bed,
+    Body,
+    Box,
+    Column,
+    Excavation,
+    Material,
+    MeshBody,
+    Preview,
+    Scene,
+    SceneError,
+    Walls,
+    Wheel,
+)
 from mpm_warp.kernels.signed_distance import wall_kernel
 from sgns_testing.meshes import box_corners, box_triangles
 from sgns_testing.scenes import cut
@@ -158,3 +171,44 @@ def test_a_tool_that_comes_to_the_floor_is_told():
     assert not any("floor" in words for words in Preview.of(cut(depth=0.1, duration=1.5, speed=0.1)).warnings)
     [words] = Preview.of(cut(depth=0.15, duration=1.5, speed=0.1)).warnings
     assert "mm above the floor, less than one grid spacing" in words
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: cut(rake=0.35), "scene.rake is 0.35 degrees, which looks like radians; .*: scene.rake=20.1"),
+        (lambda: cut(rake=-0.5), "scene.rake is -0.5 .* scene.rake=-28.6"),
+        (lambda: cut(material=Material(friction_angle=0.65)), "material.friction_angle is 0.65 .*=37.2"),
+        (lambda: Column(material=Material(friction_angle=0.65)), "material.friction_angle is 0.65 .*=37.2"),
+        (lambda: Wheel(friction_angle=0.65), "scene.friction_angle is 0.65 degrees"),
+        (
+            lambda: Wheel(friction_angle=None, material=Material(friction_angle=0.65)),
+            "material.friction_angle is 0.65",
+        ),
+        (lambda: cut(rake=0.0), None),
+        (lambda: cut(rake=3.8), None),
+        (lambda: Wheel(slip_angle=0.5), None),  # small ones are usual
+        (lambda: Column(tilt=0.5), None),
+    ],
+)
+def test_an_angle_that_looks_like_radians_is_told(make, words):
+    found = [line for line in Preview.of(make()).warnings if "radians" in line]
+    assert len(found) == (words is not None) and (not words or re.search(words, found[0])), found
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Bed(size=(300.0, 200.0, 100.0)), r"bed.size is \[300.0, .*, in metres: .* millimetres\?"),
+        (lambda: Bed(spacing=20.0), r"half the bin's smallest side \(0.075 m\); lengths are in metres"),
+        (lambda: cut(depth=50.0), "leaves the bin .*; scene.depth is 50 m; lengths are in metres"),
+    ],
+)
+def test_a_refused_length_in_millimetres_is_told(make, words):
+    with pytest.raises(SceneError, match=words):
+        make()
+
+
+def test_a_plate_far_above_the_soil_is_told_that_lengths_are_metres():
+    [words] = [line for line in Preview.of(cut(clearance=6.65)).warnings if "never touches" in line]
+    assert words.endswith("; lengths are in metres")
