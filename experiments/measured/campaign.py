@@ -26,7 +26,7 @@ from common import read_rows, scene_of
 from conditions import SLIPS, SMALL, TRAVEL, Condition, cmu, ding
 
 from mpm_warp import Effects, Scene, Solver
-from mpm_warp.scenes import along_and_across
+from mpm_warp.motions import along_and_across
 
 OURS = Path(__file__).parent / "ours.csv"
 FASTEST_RIM = 0.3  # a faster one would throw soil, which the trials' do not [m/s]

@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from omegaconf import DictConfig
 from PIL import Image
 
-from mpm_warp.scenes import sinkage
+from mpm_warp.motions import sinkage
 from sgns.config import UserError
 from sgns.data.files import require_new, require_replaceable, whole_file
 from sgns.data.run import Run, columns, height_map, particle_spacing

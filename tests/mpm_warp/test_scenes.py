@@ -23,9 +23,9 @@ from mpm_warp import (
 from mpm_warp.discretisation import asymmetry
 from mpm_warp.effects import expected_flow
 from mpm_warp.limits import PhysicalLimits, top_body_speed
+from mpm_warp.motions import along_and_across, curved, ramp
 from mpm_warp.poses import about_y, rotate, sampled_poses
 from mpm_warp.rigid_body import stable_step
-from mpm_warp.scenes import along_and_across, curved, ramp
 from sgns_testing.scenes import UNDAMPED, BlockBed, block, cut
 from sgns_testing.solvers import momenta
 

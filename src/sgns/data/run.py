@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 
 from mpm_warp import State
-from mpm_warp.scenes import along_and_across
+from mpm_warp.motions import along_and_across
 from sgns.config import UserError, parse_yaml
 from sgns.data.files import one_line
 from sgns.data.hdf5 import BROKEN, own_attribute, own_dataset, own_object

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mpm_warp.scenes import along_and_across
+from mpm_warp.motions import along_and_across
 from mpm_warp.settings import short_repr
 from sgns.config import UserError
 from sgns.data.run import SurfaceGrid, frame_chunks, height_map

@@ -8,8 +8,9 @@ import pytest
 from matplotlib.colors import Normalize, to_rgb
 from scipy.spatial import ConvexHull
 
+from mpm_warp.motions import sinkage
 from mpm_warp.poses import rotation_matrices
-from mpm_warp.scenes import Wheel, sinkage
+from mpm_warp.scenes import Wheel
 from sgns import plot
 from sgns.data.run import Run, particle_spacing
 from sgns.evaluate import figures
