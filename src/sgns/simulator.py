@@ -32,8 +32,8 @@ from sgns.model.training_range import FAR, Excess
 from sgns.numbers import check_pose, check_poses, elapsed, finite_array, first_pose, is_whole, real_array
 from sgns.reduction.basis import Basis
 
-# Every step it is looked at whether the tool's place and way are far outside the training range; the rest, such as its
-# orientation, takes longer and is looked at every so many steps.
+# Every step it is looked at whether the tool's pose and its change are far outside the training range; the rest, such
+# as its lowest point, takes longer and is looked at every so many steps.
 _LOOK_EVERY = 30
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
 _SETTLING = 0.5

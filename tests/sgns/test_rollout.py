@@ -141,7 +141,7 @@ def test_a_path_unlike_the_training_runs_is_told_and_recorded(simulator, tmp_pat
     excess = Excess(np.array([0.0] * 8 + [0.7] * 4), ["load"] * 12)
     simulator.rollout = lambda *a, **k: replace(answer(*a, **k), _excess=lambda: excess)
     rollout_scene(simulator, FakeScene(simulator), tmp_path / "a.h5")
-    words = "from frame 8 on the path is unlike the training runs; at frame 8 load is 0.7 times its training range"
+    words = "from frame 8 on the scene is unlike the training runs; at frame 8 load is 0.7 times its training range"
     assert words in caplog.text and "guess" in caplog.text
     with Run(tmp_path / "a.h5") as run:
         assert run.extra["outside_training"] == 0.7

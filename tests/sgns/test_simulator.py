@@ -11,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from sgns.config import UserError
 from sgns.data.run import soil_surface
@@ -240,6 +241,15 @@ def test_a_step_far_outside_is_told_when_it_comes(trained, change, words) -> Non
         simulator.step(path[6])
     simulator.step(path[7])
     assert len(caught) == 1 and ("millimetres" in str(caught[0].message)) == ("millimetres" in words)
+
+
+def test_a_tool_that_turns_far_outside_is_told_when_it_does(trained) -> None:
+    """In its middle, so that neither place nor displacement say so."""
+    simulator, path = trained.simulator("pose"), trained.run.pose[:7].copy()
+    path[6, 3:] = (Rotation.from_euler("z", 90, degrees=True) * Rotation.from_quat(path[6, 3:])).as_quat()
+    stepped(simulator, path[:6])
+    with pytest.warns(UserWarning, match=r"at frame 6 the tool's (rotation per frame|orientation)"):
+        simulator.step(path[6])
 
 
 @pytest.mark.parametrize("kind", ["pose", "points"])

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mpm_warp.poses import in_body_frame
 from sgns.config import UserError
-from sgns.model.training_range import NOTEWORTHY, TrainingRange, components, widths
+from sgns.model.training_range import FAR, NOTEWORTHY, Excess, TrainingRange, components, widths
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,35 @@ def test_the_unit_is_the_width_of_the_range(data, known) -> None:
     assert found.quantity[-1] == "the tool's position (x)"
     assert found.words().startswith("from frame 0 on")
     assert "the tool's position (x) is 2.5 times its training range" in found.words()
+
+
+@pytest.mark.parametrize(
+    ("quantity", "words"),
+    [
+        ("the tool's position (x)", "path is"),
+        ("the soil's velocity (mode 1, x)", "predicted soil is"),
+        ("load", "scene is"),
+    ],
+)
+def test_it_says_what_is_unlike_the_training_runs(quantity, words) -> None:
+    assert f"from frame 1 on the {words}" in Excess(np.array([0.0, 0.1]), ["", quantity]).words()
+
+
+def test_the_quick_look_at_a_step_agrees_with_the_whole(data, known) -> None:
+    run, rng = data.runs("train")[0], np.random.default_rng(0)
+    answers = []
+    for size in np.repeat([0.0, 0.01, 0.1, 1.0], 20):
+        before, pose = run.pose[3], run.pose[4].copy()
+        pose[:3] += 0.1 * size * rng.normal(size=3)
+        turn = Rotation.from_rotvec(size * rng.normal(size=3))
+        pose[3:] = rng.choice([-1, 1]) * (turn * Rotation.from_quat(pose[3:])).as_quat()
+        found = known.excess(
+            np.stack([before, pose]), np.zeros((0, 3)), np.zeros((2, 4, 3)), {"depth": 0.0}, of="the tool's"
+        )
+        answers.append(known.far(before, pose))
+        # The lowest point, here the position, is looked at less often.
+        assert answers[-1] == (found.amount[1] > FAR) or found.quantity[1] == "the tool's lowest point"
+    assert {True, False} == set(answers)
 
 
 def turned(run):
