@@ -264,15 +264,28 @@ def test_a_sweep_over_groups_takes_the_keys_of_their_options(empty_folder: Path)
         assert "limits.disk is 1e-09 GB" in done.stderr, done.stderr
 
 
-def test_one_grid_or_several_are_drawn_whichever_the_dataset_has(empty_folder: Path) -> None:
-    for name, draw, keys in (
-        ("quick", "{depth: [0.04, 0.06, 0.08]}", "depth"),
-        ("quick_wheel", "[{slip: [0.2, 0.3]}, {load: [60, 80]}]", "slip,load"),
-    ):
-        where = [f"dataset={name}", f"dataset.path={name}", "dataset.runs=null"]
-        done = call("simulate", *where, f"dataset.draw={draw}", "limits.disk=1e-9")
-        assert "limits.disk is 1e-09 GB" in done.stderr, done.stderr
-        assert Path(name, "runs.csv").read_text().startswith(f"run,split,{keys}\n")
+@pytest.mark.parametrize(
+    ("name", "draw", "keys"),
+    [
+        ("quick", "draw={depth: [0.04, 0.06, 0.08]}", "depth"),
+        ("quick_wheel", "draw=[{slip: [0.2, 0.3]}, {load: [60, 80]}]", "slip,load"),
+        ("quick_wheel", "draw={slip: [0.2, 0.3, 0.4]}", "slip"),
+        ("quick_wheel", "draw.slip=[0.2, 0.3]", "gravity,slip,load,friction_angle"),
+    ],
+)
+def test_given_grids_take_the_place_of_the_datasets(
+    name: str, draw: str, keys: str, empty_folder: Path
+) -> None:
+    where = [f"dataset={name}", "dataset.path=here", "dataset.runs=null"]
+    done = call("simulate", *where, f"dataset.{draw}", "limits.disk=1e-9")
+    assert "limits.disk is 1e-09 GB" in done.stderr, done.stderr
+    assert Path("here", "runs.csv").read_text().startswith(f"run,split,{keys}\n")
+
+
+def test_drawing_in_a_sweep(empty_folder: Path) -> None:
+    sweep = ["dataset=quick,quick_wheel", "dataset.draw={slip: [0.2]}", "limits.disk=1e-9"]
+    done = call("simulate", "-m", *sweep)
+    assert_one_line(done, "job 0 (dataset=quick,dataset.draw={slip:[0.2]},limits", "draw gives 1 runs")
 
 
 def test_a_bug_keeps_its_traceback(empty_folder: Path) -> None:
