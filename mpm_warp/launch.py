@@ -278,6 +278,7 @@ class Threads:
             [
                 Launch(kernel, end - first, arguments(given, thread), self.device, first)
                 for kernel, given in calls
+                if end > first
             ]
             for thread, (first, end) in enumerate(pairwise(ends))
         ]
@@ -390,10 +391,10 @@ class _Batch:
         order = [(item, 0) for item in self._begin]
         order += [(item, step) for step in range(steps) for item in self._step]
         order += [(item, 0) for item in self._end]
-        _run_side_by_side(order, self._threads)
+        run_side_by_side(order, self._threads)
 
 
-def _run_side_by_side(order: Sequence[tuple[Launch | SideBySide | BatchedLaunch, int]], threads: int) -> None:
+def run_side_by_side(order: Sequence[tuple[Launch | SideBySide | BatchedLaunch, int]], threads: int) -> None:
     """Runs items, each with the number of its step, in order; the caller's thread does what is not shared."""
     barrier = threading.Barrier(threads)
 
