@@ -8,10 +8,13 @@ import linecache
 import os
 import shutil
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -155,8 +158,13 @@ class SceneKernel:
     @cached_property
     def alone(self) -> wp.Kernel:
         """Over the items of one scene, with the function's arguments."""
-        arguments = ", ".join(f"{name}: types[{name!r}]" for name in self._types)
-        return self._kernel("", arguments, f"one_item(wp.tid(), {', '.join(self._types)})")
+        return self._kernel("", self._arguments, f"one_item(wp.tid(), {', '.join(self._types)})")
+
+    @cached_property
+    def part(self) -> wp.Kernel:
+        """Over the items from `first` on, with the function's arguments."""
+        line = f"one_item(first + wp.tid(), {', '.join(self._types)})"
+        return self._kernel("_part", f"first: int, {self._arguments}", line)
 
     @cached_property
     def together(self) -> wp.Kernel:
@@ -176,6 +184,10 @@ class SceneKernel:
         # Not the one made below: where Warp has met the same text and types before, it gives the kernel it made then.
         return self.together.adj.arg_types["table"].dtype
 
+    @property
+    def _arguments(self) -> str:
+        return ", ".join(f"{name}: types[{name!r}]" for name in self._types)
+
     def _kernel(self, ending: str, arguments: str, *lines: str) -> wp.Kernel:
         # Warp translates a kernel's text. This one stands in no file, so Python has to be told of it.
         name = self.name + ending
@@ -184,7 +196,7 @@ class SceneKernel:
         linecache.cache[file] = len(text), None, text.splitlines(keepends=True), file
         names: dict[str, Any] = {"wp": wp, "one_item": self._function, "types": self._types}
         names["__name__"] = self._body.__module__
-        if ending:
+        if "table" in arguments:
             names["row"] = wp.struct(type(f"{self.name}_row", (), {"__annotations__": self._types}))
         exec(compile(text, file, "exec"), names)
         function: Any = names[name]
@@ -201,16 +213,80 @@ class Launch:
     arguments: Sequence[Any]
     """Of the kernel's function, without its first. Arrays keep their place and numbers their value."""
     device: wp.Device
+    first: int | None = None
+    """Of the items, where they are a part of the scene's."""
 
     @cached_property
     def recorded(self) -> wp.Launch:
         """The launch, with the kernel loaded, which compiles it the first time."""
-        load_kernel(self.kernel.alone, self.device)
-        return wp.launch(self.kernel.alone, self.count, self.arguments, device=self.device, record_cmd=True)
+        kernel, arguments = self.kernel.alone, list(self.arguments)
+        if self.first is not None:
+            kernel, arguments = self.kernel.part, [self.first, *arguments]
+        load_kernel(kernel, self.device)
+        return wp.launch(kernel, self.count, arguments, device=self.device, record_cmd=True)
 
     def launch(self, step: int = 0) -> None:
         """Run it, whatever the number of the step."""
         self.recorded.launch()
+
+
+@dataclass(frozen=True, eq=False)
+class SideBySide:
+    """What threads do at the same time: launches for each of them, in order. None writes what another one uses."""
+
+    launches: Sequence[Sequence[Launch]]
+    owned: str
+    """What a thread's launches use of what others write in the next ones over the same: nothing. So none waits for the
+    others before those; empty: they wait."""
+
+    @property
+    def kernel(self) -> tuple[SceneKernel, ...]:
+        """Those of a thread."""
+        return tuple(launch.kernel for launch in self.launches[0])
+
+
+@dataclass(frozen=True)
+class Threads:
+    """Shares work among so many threads of a CPU."""
+
+    count: int
+    device: wp.Device
+
+    def share(
+        self,
+        items: int,
+        *calls: tuple[SceneKernel, Sequence[Any]],
+        owned: str = "",
+        alone: Sequence[Launch] = (),
+    ) -> list[Launch | SideBySide]:
+        """Launches of kernels with their arguments, in order, over the same items, of which each thread takes a part.
+
+        An argument that is a list has an entry for each thread: what a kernel adds up at places that another thread
+        adds to as well. The first thread does what is `alone` before its part.
+        """
+
+        def arguments(given: Sequence[Any], thread: int) -> list[Any]:
+            return [one[thread] if isinstance(one, list) else one for one in given]
+
+        if self.count == 1:
+            return [
+                *alone,
+                *(Launch(kernel, items, arguments(given, 0), self.device) for kernel, given in calls),
+            ]
+        ends = np.linspace(0, items, self.count + 1).astype(int).tolist()
+        launches = [
+            [
+                Launch(kernel, end - first, arguments(given, thread), self.device, first)
+                for kernel, given in calls
+                if end > first
+            ]
+            for thread, (first, end) in enumerate(pairwise(ends))
+        ]
+        return [SideBySide([[*alone, *launches[0]], *launches[1:]], owned)]
+
+    def copies(self, array: wp.array) -> list[wp.array]:
+        """The array for the first thread, and one of zeros like it for each of the others."""
+        return [array, *(wp.zeros_like(array) for _ in range(1, self.count))]
 
 
 class BatchedLaunch:
@@ -243,12 +319,12 @@ class BatchedLaunch:
 class Program:
     """What a scene lets the device do: `begin`, then `step` as often as it asks, then `end`."""
 
-    begin: Sequence[Launch]
-    step: Sequence[Launch] = ()
-    end: Sequence[Launch] = ()
+    begin: Sequence[Launch | SideBySide]
+    step: Sequence[Launch | SideBySide] = ()
+    end: Sequence[Launch | SideBySide] = ()
 
     @cached_property
-    def kernels(self) -> tuple[tuple[SceneKernel, ...], ...]:
+    def kernels(self) -> tuple[tuple[object, ...], ...]:
         """Programs that have the same can run as one."""
         return tuple(tuple(launch.kernel for launch in part) for part in (self.begin, self.step, self.end))
 
@@ -279,12 +355,17 @@ class _Batch:
         self._begin = self._serving([p.begin for p in programs])
         self._step = self._serving([p.step for p in programs])
         self._end = self._serving([p.end for p in programs])
+        shared = [item for item in (*self._begin, *self._step, *self._end) if isinstance(item, SideBySide)]
+        self._threads = max((len(item.launches) for item in shared), default=1)
 
-    def _serving(self, parts: Sequence[Sequence[Launch]]) -> list[Launch | BatchedLaunch]:
+    def _serving(
+        self, parts: Sequence[Sequence[Launch | SideBySide]]
+    ) -> list[Launch | SideBySide | BatchedLaunch]:
         """What runs in place of the programs' launches, in order."""
         if len(parts) == 1:
-            for launch in parts[0]:
-                _ = launch.recorded
+            for item in parts[0]:
+                for launch in chain(*item.launches) if isinstance(item, SideBySide) else [item]:
+                    _ = launch.recorded
             return list(parts[0])
         groups = list(zip(*parts, strict=True))
         batched = {group: BatchedLaunch(group, self._steps) for group in dict.fromkeys(groups)}
@@ -307,13 +388,43 @@ class _Batch:
         wp.capture_launch(self._graphs[most])
 
     def _launch(self, steps: int) -> None:
-        for launch in self._begin:
-            launch.launch()
-        for step in range(steps):
-            for launch in self._step:
-                launch.launch(step)
-        for launch in self._end:
-            launch.launch()
+        order = [(item, 0) for item in self._begin]
+        order += [(item, step) for step in range(steps) for item in self._step]
+        order += [(item, 0) for item in self._end]
+        run_side_by_side(order, self._threads)
+
+
+def run_side_by_side(order: Sequence[tuple[Launch | SideBySide | BatchedLaunch, int]], threads: int) -> None:
+    """Runs items, each with the number of its step, in order; the caller's thread does what is not shared."""
+    barrier = threading.Barrier(threads)
+
+    def go(thread: int) -> None:
+        before: str | None = None
+        try:
+            for item, step in order:
+                owned = item.owned if isinstance(item, SideBySide) else None
+                if before != owned or owned == "":
+                    barrier.wait()
+                before = owned
+                if isinstance(item, SideBySide):
+                    for launch in item.launches[thread]:
+                        launch.launch()
+                elif thread == 0:
+                    item.launch(step)
+        except threading.BrokenBarrierError:
+            pass  # another thread has the error
+        except BaseException:
+            barrier.abort()
+            raise
+
+    if threads == 1:
+        go(0)
+        return
+    with ThreadPoolExecutor(threads - 1) as pool:
+        others = [pool.submit(go, thread) for thread in range(1, threads)]
+        go(0)
+    for other in others:
+        other.result()
 
 
 class Executor:

@@ -9,14 +9,15 @@ sinks slower than one such step per substep would hang in the air.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from .kernels.contact import HOLDING_LAYER, ContactLaw, axle_step, body_struct
+from .kernels.grid import adding_up
 from .kernels.signed_distance import shape_data
-from .launch import Launch
+from .launch import Launch, Threads
 from .poses import rotation_vectors
 from .scene import Scene
 from .state import SolverStopped
@@ -74,18 +75,19 @@ class RigidBody:
         scene: Scene,
         effects: Effects,
         real: type,
-        device: wp.Device,
+        threads: Threads,
         substeps: int,
         time_step: float,
         particles: int,
     ) -> None:
-        vec3 = wp.types.vector(3, real)
+        vec3, device = wp.types.vector(3, real), threads.device
         self.scene, self.substeps, self.time_step = scene, substeps, time_step
         shape, axle, h = scene.body, scene.axle, scene.bed.spacing
         assert shape is not None
         self._shape = shape
         self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, effects.torque)
-        self.data = data = body_struct(real)()
+        struct: Any = body_struct(real)
+        self.data = data = struct()
         """The struct that kernels take."""
         data.margin = scene.contact_distance
         data.layer = HOLDING_LAYER * h if scene.bilateral else 0.0
@@ -101,16 +103,29 @@ class RigidBody:
         data.rotation = wp.zeros(substeps, wp.types.quaternion(real), device)
         data.stick = wp.zeros(particles, vec3, device)
         data.impulse = wp.zeros(1 + effects.torque, vec3, device)
-        self.launches: list[Launch] = []
-        """What has to run in every substep after the soil's push was added up."""
+        self.of_threads = [data]
+        """The struct for each thread, whose push it adds up."""
         self._axle: wp.array | None = None
+        moving = []
         if axle is not None:
             height = scene.poses_at(np.zeros(1))[0, 2]
             self._axle = data.axle = wp.array([height, 0.0, 0.0], dtype=wp.float64, device=device)
             self._fall: wp.array = wp.array([scene.gravity], dtype=wp.float64, device=device)
             mass = axle.mass * (0.5 if effects.symmetry else 1.0)
             values = [self._axle, data.impulse, time_step, mass, self._fall, axle.damping]
-            self.launches.append(Launch(axle_step(real), 1, values, device))
+            moving.append(Launch(axle_step(real), 1, values, device))
+        impulses = threads.copies(data.impulse)
+        for impulse in impulses[1:]:
+            own = struct()
+            for name in struct.vars:
+                setattr(own, name, getattr(data, name))
+            own.impulse = impulse
+            self.of_threads.append(own)
+        self.launches = [
+            Launch(kernel, len(data.impulse), given, device) for kernel, given in adding_up(impulses)
+        ]
+        self.launches += moving
+        """What has to run in every substep after the soil's push was added up."""
 
     def start_frame(self, frame: int) -> None:
         """Load the prescribed motion of the frame that begins at `frame`, and forget the impulse.

@@ -16,10 +16,10 @@ from .discretisation import half, initial_stress, lay_grid, require_symmetry
 from .effects import Effects
 from .kernels.contact import body_struct
 from .kernels.fluidity import soil_parameters
-from .kernels.grid import GhostNodes, ghost_kernels, grid_step, particle_struct
+from .kernels.grid import GhostNodes, adding_up, ghost_kernels, grid_step, particle_struct
 from .kernels.nonlocal_fluidity import nonlocal_launches, wall_sink
 from .kernels.transfer import transfer
-from .launch import Executor, Job, Launch, Program, SceneKernel, find_device
+from .launch import Executor, Job, Launch, Program, SideBySide, Threads, find_device
 from .limits import PhysicalLimits, require_memory, steps_to_remap, substeps_per_frame, top_body_speed
 from .poses import rotate
 from .rigid_body import RigidBody
@@ -27,6 +27,7 @@ from .scene import Scene
 from .settings import short_repr
 from .state import Memory, SceneError, SolverStopped, State
 
+MOST_THREADS = 256
 PRECISIONS = {"float32": wp.float32, "float64": wp.float64}
 
 
@@ -62,8 +63,10 @@ class Solver:
     Args:
         scene: what to compute.
         effects: which physics; kernels are compiled without what is off.
-        device: `cpu` (one core) or `cuda`, `cuda:0`, ...
+        device: `cpu` or `cuda`, `cuda:0`, ...
         precision: `float32` or `float64`.
+        threads: of the CPU, each with a part of the soil. Another number of them rounds sums otherwise; the same one
+            always gives the same answer. It pays from some ten thousand particles on.
         start: what to go on from instead of the scene's own start; of the same scene, whose numerics may differ.
     """
 
@@ -73,6 +76,7 @@ class Solver:
         effects: Effects | None = None,
         device: str = "cpu",
         precision: str = "float32",
+        threads: int = 1,
         start: State | None = None,
     ) -> None:
         if precision not in PRECISIONS:
@@ -81,6 +85,13 @@ class Solver:
         self.effects = effects or Effects()
         self.device = find_device(device)
         self._real = PRECISIONS[precision]
+        if not (isinstance(threads, int) and 1 <= threads <= MOST_THREADS):
+            raise SceneError(f"threads is {threads!r}; allowed: 1 to {MOST_THREADS}")
+        if threads > 1 and self.device.is_cuda:
+            raise SceneError(
+                f"threads is {threads} on {self.device}; they are a CPU's: set it to 1, or device=cpu"
+            )
+        self._threads = Threads(threads, self.device)
         require_memory(scene, precision, device, self.effects.symmetry)
         if self.effects.symmetry:
             require_symmetry(scene)
@@ -199,19 +210,23 @@ class Solver:
             excess=n if effects.nonlocality else 0,
         )
         """The arrays of the particles that are computed, see kernels/grid.py."""
-        self._momentum, self._velocity, self._before, self._impulse = (zeros(vec4, padded) for _ in range(4))
+        self._velocity, self._before = (zeros(vec4, padded) for _ in range(2))
+        own = self._threads.copies
+        self._momentum, self._impulse = (own(zeros(vec4, padded)) for _ in range(2))
         self._inverse_mass = zeros(real, node_count)
         self._cooperative_field, self._cooperation = (
             zeros(vec4, padded if effects.nonlocality else 0) for _ in range(2)
         )
-        self._top_speed, self._keep = zeros(real, 1), zeros(real, 1)
-        self.grid.substep, self._fault = zeros(int, 1), zeros(int, 4)
+        self._top_speed, self._fault = own(zeros(real, 1)), own(zeros(int, 4))
+        self._keep, self.grid.substep = zeros(real, 1), zeros(int, 1)
         periodic = (axis for axis, kind in enumerate(scene.bed.walls.conditions) if kind == "periodic")
         self._turns = {axis: zeros(int, n) for axis in periodic}
         self.body: RigidBody | None = None
         """The tool or wheel; None without one."""
         if scene.body is not None:
-            self.body = RigidBody(scene, effects, real, device, self.substeps_per_frame, self.time_step, n)
+            self.body = RigidBody(
+                scene, effects, real, self._threads, self.substeps_per_frame, self.time_step, n
+            )
         self._remap, self._steps = self._programs(layers)
         self._memory = Memory(self._lasting())
         if self._start is not None:
@@ -234,43 +249,46 @@ class Solver:
         kernels = transfer(real, self.effects, body.law if body else None, atomic=device.is_cuda)
         node_kernels, wrap = grid_step(real, scene.bed.walls.conditions), ghost_kernels(real).wrap
         ghost_nodes = GhostNodes(real, device, self.grid, layers, mirrored=self._half is not None)
-        body_data = body.data if body else body_struct(real)()
-
-        def over_particles(kernel: SceneKernel, *arguments: Any) -> Launch:
-            return Launch(kernel, self.computed_count, [particles, self.grid, *arguments], device)
-
-        def over_nodes(kernel: SceneKernel, *arguments: Any) -> Launch:
-            return Launch(kernel, len(self._inverse_mass), [self.grid, *arguments], device)
-
-        remap = [
+        bodies = body.of_threads if body else [body_struct(real)()] * self._threads.count
+        threads, soil, nodes = self._threads, self.computed_count, len(self._inverse_mass)
+        given, grid, keep = [particles, self.grid], self.grid, self._keep
+        remap: list[Launch | SideBySide] = [
             Launch(wrap, len(turns), [particles.position, turns, axis, scene.bed.size[axis]], device)
             for axis, turns in self._turns.items()
         ]
-        remap.append(over_particles(kernels.to_grid, momentum, self._top_speed, self._fault))
+        remap += threads.share(soil, (kernels.to_grid, [*given, momentum, self._top_speed, self._fault]))
+        moved = [momentum[0], velocity, before, self._inverse_mass, impulse[0]]
+        stepped = [velocity, self._inverse_mass, impulse[0]]
         begin = [
-            *ghost_nodes.fold(momentum),
-            over_nodes(node_kernels.begin, momentum, velocity, before, self._inverse_mass, impulse),
+            *threads.share(nodes, *adding_up(momentum), owned="nodes"),
+            *ghost_nodes.fold(momentum[0]),
+            *threads.share(nodes, (node_kernels.begin, [grid, *moved]), owned="nodes"),
             *ghost_nodes.unfold(before),
         ]
         step = [
-            over_particles(kernels.scatter, body_data, impulse),
-            *(body.launches if body else ()),
-            *ghost_nodes.fold(impulse),
-            over_nodes(node_kernels.step, velocity, self._inverse_mass, impulse),
+            *threads.share(soil, (kernels.scatter, [*given, bodies, impulse]), owned="soil"),
+            *threads.share(nodes, *adding_up(impulse), owned="nodes", alone=body.launches if body else ()),
+            *ghost_nodes.fold(impulse[0]),
+            *threads.share(nodes, (node_kernels.step, [grid, *stepped]), owned="nodes"),
             *(self._nonlocal_launches(layers) if self.effects.nonlocality else ()),
             *ghost_nodes.unfold(velocity),
-            over_particles(kernels.gather, velocity, self._cooperation, self._fault),
-            over_particles(kernels.material, self._soil),
+            *threads.share(
+                soil,
+                (kernels.gather, [*given, velocity, self._cooperation, self._fault]),
+                (kernels.material, [*given, self._soil]),
+                owned="soil",
+            ),
         ]
-        return Program(remap), Program(begin, step, [over_particles(kernels.from_grid, before, self._keep)])
+        end = threads.share(soil, (kernels.from_grid, [*given, before, keep]), owned="soil")
+        return Program(remap), Program(begin, step, end)
 
-    def _nonlocal_launches(self, layers: dict[int, np.ndarray]) -> list[Launch]:
+    def _nonlocal_launches(self, layers: dict[int, np.ndarray]) -> list[Launch | SideBySide]:
         grid, field, cooperation = self.grid, self._cooperative_field, self._cooperation
         sink = np.zeros(len(self._inverse_mass))
         if self.scene.material.fluidity_at_walls == "zero":
             sink = wall_sink((grid.nx, grid.ny, grid.nz), grid.low, grid.high)
         ghost_nodes = GhostNodes(self._real, self.device, grid, layers, mirrored=False)
-        given = (self.particles, grid, self._soil, field, cooperation, ghost_nodes)
+        given = (self.particles, grid, self._soil, field, cooperation, ghost_nodes, self._threads)
         launches = nonlocal_launches(self._real, self.effects, sink, *given)
         return [*launches, *ghost_nodes.unfold(cooperation)]
 
@@ -283,9 +301,10 @@ class Solver:
             self.body.start_frame(index - 1)
         left = self.substeps_per_frame
         while left:
-            self._top_speed.zero_()
+            for top_speed in self._top_speed:
+                top_speed.zero_()
             yield Job(self._remap, 1)
-            top = float(self._top_speed.numpy()[0])
+            top = float(np.max([own.numpy()[0] for own in self._top_speed]))
             if not top <= self._limits.top_speed:
                 fastest = int(np.argmax(np.linalg.norm(self.particles.velocity.numpy(), axis=1)))
                 substep = self.substeps_per_frame - left
@@ -299,9 +318,10 @@ class Solver:
     def _check(self, index: int) -> None:
         """At the end of frame `index`."""
         particles, limits = self.particles, self._limits
-        count, particle, substep, near = (int(i) for i in self._fault.numpy())
-        if count:
-            raise self._stopped(index, substep, particle, limits.strayed(bool(near)))
+        for fault in self._fault:
+            count, particle, substep, near = (int(i) for i in fault.numpy())
+            if count:
+                raise self._stopped(index, substep, particle, limits.strayed(bool(near)))
         found = limits.too_strained(particles.log_volume.numpy(), particles.elastic_strain.numpy())
         found = found or limits.lost_fluidity(particles.excess.numpy())
         if found is not None:

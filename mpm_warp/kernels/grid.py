@@ -177,6 +177,23 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
     return SimpleNamespace(begin=begin, step=step)
 
 
+@cache
+def _adding(number: type) -> SceneKernel:
+    @SceneKernel
+    def add(i: int, total: wp.array(dtype=number), own: wp.array(dtype=number)):
+        total[i] = total[i] + own[i]
+        own[i] = number()
+
+    return add
+
+
+def adding_up(arrays: list[wp.array]) -> list[tuple[SceneKernel, list[wp.array]]]:
+    """Kernels with their arguments that add what other threads have in theirs to the first one's array, and clear
+    theirs (`Threads.copies`)."""
+    total, *others = arrays
+    return [(_adding(total.dtype), [total, own]) for own in others]
+
+
 # --- Ghost nodes: those beyond a mirror or a periodic side ----------------------------------------------
 
 

@@ -34,9 +34,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..launch import Launch, SceneKernel
+from ..launch import Launch, SceneKernel, SideBySide, Threads
 from .fluidity import fluidity, soil_struct
-from .grid import GhostNodes, grid_struct, particle_struct
+from .grid import GhostNodes, adding_up, grid_struct, particle_struct
 from .node_rows import splines
 
 if TYPE_CHECKING:
@@ -217,7 +217,8 @@ def nonlocal_launches(
     field: wp.array,
     cooperation: wp.array,
     ghost_nodes: GhostNodes,
-) -> list[Launch]:
+    threads: Threads,
+) -> list[Launch | SideBySide]:
     """What computes the cooperative term: in order, after the grid step and before the particles read the grid.
 
     Args:
@@ -234,16 +235,16 @@ def nonlocal_launches(
     ratio = (soil.cooperative_length / grid.spacing) ** 2
     relaxation = soil.fluidity_time / grid.dt if effects.fluidity else None
 
-    def sweep(start: wp.array, end: wp.array) -> list[Launch]:
-        return [
-            *ghost_nodes.unfold(start),
-            Launch(kernels.sweep, count, [ratio, grid, walls, start, end], device),
-        ]
+    def sweep(start: wp.array, end: wp.array) -> list[Launch | SideBySide]:
+        given = [ratio, grid, walls, start, end]
+        return [*ghost_nodes.unfold(start), *threads.share(count, (kernels.sweep, given))]
 
+    own = threads.copies(sums)
     return [
-        Launch(kernels.project, len(particles.home), [particles, grid, soil, sums], device),
+        *threads.share(len(particles.home), (kernels.project, [particles, grid, soil, own])),
+        *threads.share(count, *adding_up(own), owned="nodes"),
         *ghost_nodes.fold(sums),
-        Launch(kernels.prepare, count, [sums, field], device),
+        *threads.share(count, (kernels.prepare, [sums, field]), owned="nodes"),
         *[*sweep(field, other), *sweep(other, field)] * (sweep_count(ratio, relaxation) // 2),
-        Launch(kernels.place, count, [grid, soil, field, cooperation], device),
+        *threads.share(count, (kernels.place, [grid, soil, field, cooperation])),
     ]

@@ -339,6 +339,12 @@ class SolverSettings(Group):
 
     group: ClassVar[str] = "solver"
     precision: Literal["float32", "float64"] = setting("float32", "of the numbers")
+    threads: int = setting(
+        1,
+        "of the CPU for one run, each with a part of its soil; a dataset makes a run per core",
+        ge=1,
+        le=256,
+    )
     batch: int = setting(32, "with a dataset on a GPU: runs under way at once", ge=1, le=100_000)
 
 

@@ -103,6 +103,10 @@ def main(cfg: DictConfig) -> float | None:
                 "dataset.where picks among runs that are there; to simulate fewer change dataset.draw"
             )
         require_undrawn(settings, HydraConfig.get().overrides.task)
+        if cfg.solver.threads != 1:
+            raise UserError(
+                f"solver.threads is {cfg.solver.threads}; a dataset makes a run per core instead: leave it out"
+            )
         campaign = plan(settings, base_scene(settings), asked, cfg.solver.precision, cfg.seed)
         limits = Limits.from_dict(plain(cfg.limits))
         for line in warning_summary(campaign.scenes, limits.any_unit):
@@ -151,7 +155,7 @@ def simulate_one(scene: Scene, cfg: DictConfig, restart: Restart | None = None, 
         log.info("%s", cost_line([cost]))
         require_limits({scene.name: cost}, Limits.from_dict(plain(cfg.limits)))
         require_space(output.parent, cost.size)
-        settings |= {"device": cfg.device, "restart": restart}
+        settings |= {"device": cfg.device, "threads": cfg.solver.threads, "restart": restart}
         try:
             with tqdm(total=scene.frame_count, unit="frame", desc=scene.name, disable=None) as bar:
                 timing = simulate_scene(scene, output, progress=bar.update, **settings)

@@ -34,7 +34,16 @@ CHANGES = (
 )
 """Keys of the scene that may change half-way: how it is computed, not what it is."""
 _FILE = "scene.tool.file"
-_OTHERS = ("continue_from", "output", "device", "solver.precision", "limits.time", "limits.disk", "hydra")
+_OTHERS = (
+    "continue_from",
+    "output",
+    "device",
+    "solver.precision",
+    "solver.threads",
+    "limits.time",
+    "limits.disk",
+    "hydra",
+)
 
 
 @dataclass(frozen=True)
@@ -244,6 +253,7 @@ def scene_stages(
     seed: int = 0,
     device: str = "cpu",
     precision: str = "float32",
+    threads: int = 1,
     progress: Callable[[], object] = lambda: None,
     restart: Restart | None = None,
 ) -> Generator[Timing | Job, None, None]:
@@ -265,11 +275,12 @@ def scene_stages(
     computed, state, before = scene, None, 0.0
     if restart is not None:
         computed, state, before = restart.changed_scene, restart.state, restart.wall_time
-    solver = Solver(computed, effects, device, precision, start=state)
+    solver = Solver(computed, effects, device, precision, threads, state)
     stored = scene.stored
     made_with = {
         "device": device,
         "precision": precision,
+        "threads": threads,
         "time_step_s": solver.time_step,
         "substeps_per_frame": solver.substeps_per_frame,
         "particles_simulated": solver.particle_count,

@@ -6,6 +6,7 @@ import os
 import time
 
 import h5py
+import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
@@ -40,6 +41,21 @@ def test_command_writes_a_complete_run(tmp_path):
     with h5py.File(tmp_path / "run.h5") as file:
         assert file["particles/soil/position/value"].shape == (4, 29, 3)
     assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
+
+
+def test_threads_compute_a_run_but_no_dataset(tmp_path):
+    runs = []
+    for threads in (1, 2):
+        file = f"{threads}.h5"
+        done = sgns(tmp_path, "simulate", *SHORT, f"solver.threads={threads}", f"output={file}")
+        assert done.returncode == 0, done.stderr
+        with Run(tmp_path / file) as run:
+            assert run.extra["threads"] == threads
+            runs.append(run.positions(3))
+    np.testing.assert_allclose(*runs, atol=1e-5)
+    done = sgns(tmp_path, "simulate", "dataset=quick", "solver.threads=2")
+    assert done.returncode == 2
+    assert "solver.threads is 2; a dataset makes a run per core" in done.stderr
 
 
 def test_scenes_side_by_side_share_the_time_that_passes(tmp_path):
