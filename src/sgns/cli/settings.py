@@ -125,11 +125,11 @@ class CheckedLoader:
         try:
             cfg = compose([*first, *overrides])
         except Exception as error:
-            if in_sweep and "no such key" in (line := describe(error) or ""):
+            if in_sweep and "no such key" in (said := describe(error) or ""):
                 options = [one for one in (*first, *overrides) if options_of(one.partition("=")[0])]
                 chosen = " ".join(one for one in options if "," not in one)
                 raise UserError(
-                    f"the job with {chosen}: {line}; each job of a sweep takes every setting: for options with other "
+                    f"the job with {chosen}: {said}; each job of a sweep takes every setting: for options with other "
                     "keys make sweeps of their own"
                 ) from error
             if isinstance(error, (MemoryError, UserError)) or describe(error) is not None:
