@@ -328,7 +328,8 @@ def _unknown_key(cause: ConfigAttributeError | ConfigKeyError) -> str:
             if where == "scene.tool"
             else f"the {kind} scene has {has}"
         )
-        return f"{line}{has}; for a mesh: scene=body scene/tool=mesh scene.tool.file=..."
+        height = ", whose height the path prescribes" if kind == "wheel" else ""
+        return f"{line}{has}; for a mesh{height}: scene=body scene/tool=mesh scene.tool.file=..."
     if near:
         line += f"did you mean {' or '.join(near[:3])}? "
     return line + _allowed(f"keys of {where}" if where else "keys", name, siblings)

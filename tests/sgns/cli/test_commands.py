@@ -197,6 +197,10 @@ def test_every_option_of_every_group_composes(command: str) -> None:
             ["simulate", "scene=./my.yaml"],
             ["scene=./my.yaml: ", "FOLDER/scene/my.yaml", "--config-dir FOLDER"],
         ),
+        (
+            ["simulate", "scene=wheel", "scene.tool.file=a.obj"],
+            ["a mesh, whose height the path prescribes: "],
+        ),
         (["simulate", "scene=paths/a.csv"], ["a path is scene.path=paths/a.csv"]),
         (
             ["simulate", "scene=body", "scene/tool=a/b.stl"],
