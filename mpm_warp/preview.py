@@ -64,12 +64,8 @@ class Preview:
                 f"the tool is in the soil at the start, {_words(-low[0])} deep: {len(scene.displaced)} particles "
                 "that would lie inside it are left out; soil closes in on it in the first 0.2 s: let it rest so long"
             )
-        above = scene.bed.size[2] + float(low[deepest])
-        if scene.axle is None and touch is not None and above < scene.bed.spacing:
-            warnings.append(
-                f"the tool's lowest point comes to {_words(above)} above the floor, less than one grid spacing: soil "
-                "jams there and forces get too large; use a deeper scene.bed.size"
-            )
+        if touch is not None:
+            warnings += near_floor(scene, float(low[deepest]))
         lines = _bin(scene) + ([] if scene.axle is not None else _way(scene, low, times, touch))
         given = scene.path_times()
         if len(given) > 1 and given[-1] < scene.duration - 1.0 / scene.frame_rate:
@@ -107,6 +103,18 @@ class Preview:
             not_meant=tuple(one.words for one in odd if one.sure),
             lines=tuple(lines),
         )
+
+
+def near_floor(scene: Scene, lowest: float) -> list[str]:
+    """A line if a tool whose lowest point gets to this z [m] is too near to the floor. Of a wheel it is known
+    afterwards."""
+    above = scene.bed.size[2] + lowest
+    if above >= scene.bed.spacing:
+        return []
+    return [
+        f"the tool's lowest point comes to {_words(above)} above the floor, less than one grid spacing: soil jams "
+        "there and forces get too large; use a deeper scene.bed.size"
+    ]
 
 
 def _words(length: float) -> str:

@@ -187,9 +187,12 @@ def build(cls: type[Settings], data: Any, where: str, make: Callable[..., Any] |
     Raises:
         cls.raises: the data have other keys, or values that are not of their type or not allowed.
     """
-    if not isinstance(data, dict):
-        raise cls.raises(f"{where} is {data!r}; it must be a group of keys")
     known = _fields_of(cls)
+    if not isinstance(data, dict):
+        keys = ", ".join(f"{where}.{name}" for name in list(known)[:5])
+        raise cls.raises(
+            f"{where} is {data!r}; it must be a group of keys: give {keys}{', ...' * (len(known) > 5)}"
+        )
     if unknown := sorted(set(map(str, data)) - set(known)):
         raise cls.raises(f"{where} has no key {unknown[0]!r}; allowed: {', '.join(sorted(known))}")
     values = {}

@@ -75,7 +75,7 @@ def test_ctrl_c_ends_the_command_and_the_demo_in_one_line(tmp_path):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
     process = subprocess.Popen(command, cwd=tmp_path, env=environment(), **pipes)
     assert process.stdout is not None
-    while not process.stdout.readline().startswith("dataset quick in"):
+    while not process.stdout.readline().startswith("dataset in "):
         assert process.poll() is None, process.communicate()
     os.killpg(process.pid, signal.SIGINT)
     _, said = process.communicate(timeout=100)

@@ -118,7 +118,7 @@ def advice(points: Sequence[Point], wish: Wish) -> list[str]:
     step = wish.step_time(point)
     soil = "" if point.kind == "solver" else ", all particles decoded" if wish.particles else ", none decoded"
     lines = [
-        f"{'use' if met else 'nothing meets this; closest'}: {point.kind}, {point.label}",
+        f"{'use' if met else 'nothing meets this; closest'}: {named(point)}",
         *(f"  {line}" for line in commands(point)),
         f"  costs {1e3 * step:.3g} ms per step of 1/60 s{called(point)}{soil}, on one core of {point.machine}: up to "
         f"{float(f'{1.0 / step:.3g}'):g} steps a second",
@@ -172,6 +172,16 @@ def advice(points: Sequence[Point], wish: Wish) -> list[str]:
         "  whatever you choose, forces depend on the grid (draft by some 20 %, a wheel's pull more): docs/limits.md",
     ]
     return lines + ([f"  note: {point.note}"] if point.note else [])
+
+
+def named(point: Point) -> str:
+    """A point in words."""
+    what = {"solver": "solver", "surrogate": "network"}.get(point.kind, point.kind)
+    if "model=polynomial" in point.settings.split():
+        what = "polynomial"
+    if not math.isnan(point.training_s):
+        what += f" trained for {point.training_s:.2g} s"
+    return f'{what}, called "{point.label}" in the study'
 
 
 def tasks(points: Sequence[Point]) -> str:

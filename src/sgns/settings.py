@@ -434,9 +434,11 @@ class Frontier(_Command):
 
 
 def _error(words: str, unit: str = "") -> Any:
-    return setting(
-        None, f"largest {words}; null: do not care", unit, gt=0, words="; it must be a number above 0"
-    )
+    allowed = "; it must be a number above 0"
+    limits: dict[str, Any] = {"gt": 0, "words": allowed}
+    if not unit:  # of all: no better than a force of zero
+        limits = {"gt": 0, "le": 1, "words": f"{allowed}, at most 1, a share: for 30 % give 0.3"}
+    return setting(None, f"largest {words}; null: do not care", unit, **limits)
 
 
 @settings

@@ -24,6 +24,12 @@ class FakeDataset:
     path: Path
     splits: dict[str, list[Path]]
 
+    command = "sgns simulate dataset=fake"
+
+    @property
+    def title(self) -> str:
+        return self.name
+
     def runs(self, split: str) -> list[Path]:
         return self.splits[split]
 

@@ -171,6 +171,9 @@ def test_a_tool_that_comes_to_the_floor_is_told():
     assert not any("floor" in words for words in Preview.of(cut(depth=0.1, duration=1.5, speed=0.1)).warnings)
     [words] = Preview.of(cut(depth=0.15, duration=1.5, speed=0.1)).warnings
     assert "mm above the floor, less than one grid spacing" in words
+    assert not any("floor" in words for words in Preview.of(Wheel()).warnings)
+    [words] = [one for one in Preview.of(Wheel(clearance=-0.055)).warnings if "floor" in one]
+    assert "comes to 5 mm above the floor" in words
 
 
 @pytest.mark.parametrize(

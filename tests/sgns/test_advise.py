@@ -37,21 +37,25 @@ def answer(*overrides: str, more: Sequence[Point] = ()) -> list[str]:
 
 def test_the_fastest_that_is_good_enough_is_named_with_its_command() -> None:
     lines = answer("error.force=0.25")
-    assert lines[0] == "use: solver, coarse"
+    assert lines[0] == 'use: solver, called "coarse" in the study'
     assert "sgns simulate scene=quick_excavation output=run.h5" in lines[1]
     assert "study full" in lines[-3] and "the solver at finest" in lines[-3]
     assert "task=cut in these beds and soils only" in lines[-2] and "depend on the grid" in lines[-1]
     surrogate = answer("error.force=0.4")
-    assert surrogate[0] == "use: surrogate, r = 8"
+    assert surrogate[0] == 'use: network, called "r = 8" in the study'
     assert any("its training runs: force NRMSE 0.26" in line for line in surrogate)
-    assert answer("error.position=0.004")[0] == "use: solver, coarse"  # in metres
+    assert answer("error.position=0.004")[0] == 'use: solver, called "coarse" in the study'  # in metres
 
 
 def test_time_is_that_of_a_step() -> None:
-    assert answer("error.force=0.4", "time=0.001")[0] == "use: surrogate, r = 8"  # 0.02 / 60 s
-    assert answer("time=0.1")[0] == "use: solver, coarse"  # the smallest error within the time
+    assert (
+        answer("error.force=0.4", "time=0.001")[0] == 'use: network, called "r = 8" in the study'
+    )  # 0.02 / 60 s
+    assert (
+        answer("time=0.1")[0] == 'use: solver, called "coarse" in the study'
+    )  # the smallest error within the time
     closest = answer("error.force=0.25", "time=0.001")
-    assert closest[0].startswith("nothing meets this; closest: surrogate")
+    assert closest[0].startswith("nothing meets this; closest: network")
     decoded = answer("error.force=0.4", "time=0.001", "particles=true")
     assert decoded[0].startswith("nothing meets this")
 
@@ -70,12 +74,12 @@ def test_a_step_is_what_a_control_loop_calls() -> None:
 
     lines = told("error.force=0.4", "time=0.002")
     assert (
-        lines[0] == "use: surrogate, known"
+        lines[0] == 'use: network, called "known" in the study'
         and "costs 1 ms per step of 1/60 s with Simulator.step" in lines[3]
     )
     assert not any("takes longer" in line for line in lines)
     # A whole path at once would be quick enough, 0.17 ms a step.
-    assert told("error.force=0.4", "time=0.0005")[0].startswith("nothing meets this; closest: surrogate")
+    assert told("error.force=0.4", "time=0.0005")[0].startswith("nothing meets this; closest: network")
     decoded = told("error.force=0.4", "particles=true")[3]
     assert f"costs {1e3 * (0.06 + 0.19) / 60:.3g} ms" in decoded and "all particles decoded" in decoded
 
@@ -90,19 +94,19 @@ def test_a_step_is_what_a_control_loop_calls() -> None:
 def test_some_surrogates_are_not_named(change: dict) -> None:
     other = replace(POINTS[3], wall_s_per_simulated_s=0.01, **change)
     for wish in ("error.force=0.4", "time=0.001"):
-        assert answer(wish, more=[other])[0] == "use: surrogate, r = 8"
+        assert answer(wish, more=[other])[0] == 'use: network, called "r = 8" in the study'
 
 
 def test_nothing_claims_to_be_better_than_the_reference_is_known() -> None:
     lines = answer("error.force=0.1")
-    assert lines[0].startswith("nothing meets this; closest: solver, fine")
+    assert lines[0].startswith('nothing meets this; closest: solver, called "fine"')
     assert any("only known to 0.2" in line for line in lines)
     assert any("within the reference's own error" in line for line in lines)
 
 
 def test_surrogates_can_be_judged_against_their_training_runs() -> None:
     lines = answer("error.force=0.3", "against=training")
-    assert lines[0] == "use: surrogate, r = 8" and "over its test runs" in lines[-3]
+    assert lines[0] == 'use: network, called "r = 8" in the study' and "over its test runs" in lines[-3]
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,16 @@ def test_presets_state_only_what_is_allowed() -> None:
         (DatasetSettings, {"runs": 10.5}, "dataset.runs is 10.5; it must be a whole number"),
         (typed.Simulate, {"seed": -1}, "seed is -1; it must be a whole number, 0 or more"),
         (typed.Evaluate, {"new_rollouts": 5}, "new_rollouts is 5; it must be a list of run files"),
-        (typed.Advise, {"error": 5}, "error is 5; it must be a group of keys"),
+        (
+            typed.Advise,
+            {"error": 5},
+            "error is 5; it must be a group of keys: give error.force, error.position, ",
+        ),
+        (
+            typed.Advise,
+            {"error": {"force": 30}},
+            "error.force is 30.0; it must be a number above 0, at most 1, a share: for 30 % give 0.3",
+        ),
         (typed.Advise, {"error": {"force": "x"}}, "error.force is 'x'; it must be a finite number"),
     ],
 )

@@ -110,8 +110,11 @@ def command_help(command: str) -> str:
     width = max(map(len, groups), default=0)
     lines = []
     for group, default in groups.items():
-        options = (f"{name} (default)" if name == default else name for name in options_of(group))
-        lines.append(f"  {group:<{width}}  {', '.join(options)}")
+        of_checkpoint = command == "rollout"  # both of its groups
+        usual = None if of_checkpoint else default
+        options = (f"{name} (default)" if name == usual else name for name in options_of(group))
+        end = "; default: the checkpoint's" if of_checkpoint else ""
+        lines.append(f"  {group:<{width}}  {', '.join(options)}{end}")
     text = Template(template).substitute(
         APP_CONFIG_GROUPS="\n".join(lines), KEYS="\n".join(key_lines(command))
     )
@@ -136,7 +139,13 @@ def key_lines(command: str) -> list[str]:
             if name in groups
             else [(name, *rest)]
         )
-    return [f"  {name:<22} {words}{allowed and f' ({allowed})'}" for name, _, allowed, words in rows]
+    lines = []
+    for name, default, allowed, words in rows:
+        default = default.replace("'", "").replace("False", "false").replace("True", "true")
+        usual = f"default {default}" if default[:4] not in ("", "[]", "None") else default[4:]
+        known = "; ".join(filter(None, (usual.strip(), allowed)))  # without a default the unit alone
+        lines.append(f"  {name:<22} {words}{known and f' ({known})'}")
+    return lines
 
 
 def _settings(command: str) -> dict:
@@ -247,14 +256,33 @@ def _unreadable(error: OverrideParseException) -> str:
 
 def _missing_option(error: MissingConfigException) -> str:
     """A group option that does not exist, for example dataset=nope."""
-    group, _, option = (error.missing_cfg_file or "").rpartition("/")
-    if not group:
+    name = error.missing_cfg_file or ""
+    group, *parts = name.split("/")
+    if not parts:
         return _flat(str(error))
+    while len(parts) > 1 and (group == "hydra" or (parts[0].isalpha() and options_of(f"{group}/{parts[0]}"))):
+        group += f"/{parts.pop(0)}"
+    option = "/".join(parts)  # of which a path may have been given
     options = sorted(error.options or [])
-    line = f"{group}={option}: no such option; {_allowed('allowed', option, options)}"
+    line = f"{group}={option}: no such option; {_of_own_file(group, option)}{_allowed('allowed', option, options)}"
     if group == "hydra/launcher":
         line += "; more launchers: pip install hydra-submitit-launcher (clusters) or hydra-joblib-launcher (processes)"
     return line
+
+
+def _of_own_file(group: str, option: str) -> str:
+    """What to write for a folder or a file that was given where the name of an option is wanted."""
+    path, end = Path(option), Path(option).suffix.lower()
+    if group == "dataset":
+        found = next((one for one in (path, "data" / path) if one.is_dir()), path)
+        return f"a dataset's folder is dataset.path={found}; " if found.is_dir() or "/" in option else ""
+    if end in (".yaml", ".yml"):
+        return f"your own file FOLDER/{group}/{path.stem}.yaml is --config-dir FOLDER {group}={path.stem}; "
+    if group == "scene" and end == ".csv":
+        return f"a path is scene.path={option}; "
+    if group in ("scene", "scene/tool") and end in (".stl", ".obj", ".ply", ".off", ".glb", ".3mf"):
+        return f"a mesh is scene=body scene/tool=mesh scene.tool.file={option}; "
+    return ""
 
 
 def _composition(error: ConfigCompositionException) -> str:
@@ -265,7 +293,8 @@ def _composition(error: ConfigCompositionException) -> str:
         return _unknown_key(cause)
     found = re.search(r"Could not override '([^']*)'\.\s*No match in the defaults list", text)
     if found:
-        return f"{found[1]}=...: this command has no group {found[1]!r}; its groups and keys: --help"
+        hint = "it goes with scene=body; " if found[1] == "scene/tool" else ""
+        return f"{found[1]}=...: this command has no group {found[1]!r}; {hint}its groups and keys: --help"
     found = re.search(r"Ambiguous value for argument '(.*)'", text)
     if found:
         key, _, value = found[1].partition("=")
@@ -299,7 +328,8 @@ def _unknown_key(cause: ConfigAttributeError | ConfigKeyError) -> str:
             if where == "scene.tool"
             else f"the {kind} scene has {has}"
         )
-        return f"{line}{has}; for a mesh: scene=body scene/tool=mesh scene.tool.file=..."
+        height = ", whose height the path prescribes" if kind == "wheel" else ""
+        return f"{line}{has}; for a mesh{height}: scene=body scene/tool=mesh scene.tool.file=..."
     if near:
         line += f"did you mean {' or '.join(near[:3])}? "
     return line + _allowed(f"keys of {where}" if where else "keys", name, siblings)

@@ -99,7 +99,10 @@ class CheckedLoader:
             require_options(overrides, ("hydra", *groups_of(config_name or "")))
         how = (run_mode, from_shell, validate_sweep_overrides)
         return self._composed(
-            config_name, overrides, lambda all_: self._loader.load_configuration(config_name, all_, *how)
+            config_name,
+            overrides,
+            lambda all_: self._loader.load_configuration(config_name, all_, *how),
+            any("," in value and options_of(key) for key, _, value in (o.partition("=") for o in overrides)),
         )
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
@@ -107,16 +110,28 @@ class CheckedLoader:
             master_config.hydra.job.config_name,
             sweep_overrides,
             lambda all_: self._loader.load_sweep_config(master_config, all_),
+            True,
         )
 
     def _composed(
-        self, command: str | None, overrides: list[str], compose: Callable[[list[str]], DictConfig]
+        self,
+        command: str | None,
+        overrides: list[str],
+        compose: Callable[[list[str]], DictConfig],
+        in_sweep: bool,
     ) -> DictConfig:
         require_plain_overrides(overrides)
         first = self._first(command, overrides)
         try:
             cfg = compose([*first, *overrides])
         except Exception as error:
+            if in_sweep and "no such key" in (said := describe(error) or ""):
+                options = [one for one in (*first, *overrides) if options_of(one.partition("=")[0])]
+                chosen = " ".join(one for one in options if "," not in one)
+                raise UserError(
+                    f"the job with {chosen}: {said}; each job of a sweep takes every setting: for options with other "
+                    "keys make sweeps of their own"
+                ) from error
             if isinstance(error, (MemoryError, UserError)) or describe(error) is not None:
                 raise
             if isinstance(error, ValueError) and (line := _key_of_a_grid(overrides)):

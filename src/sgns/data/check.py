@@ -177,7 +177,10 @@ def _verdict(path: Path) -> str:
         duration = run.scene.get("duration")
         length = duration * run.frame_rate if isinstance(duration, (int, float)) else math.nan
         total = f" of {round(length) + 1}" if math.isfinite(length) else ""
-        return f"unfinished: {run.frame_count}{total} frames, good; the same `sgns simulate` goes on"
+        return (
+            f"unfinished: {run.frame_count}{total} frames, good; the same `sgns simulate` goes on (of a sweep: "
+            f"continue_from={path})"
+        )
 
 
 def _check_times(file: h5py.File) -> Iterator[str]:
@@ -353,8 +356,18 @@ def main(cfg: DictConfig) -> float:
     Raises:
         UserError: A path is missing or a file has a problem; all problems have been listed before.
     """
-    files = run_files([cfg.files] if isinstance(cfg.files, str) else cfg.files)
+    paths = [cfg.files] if isinstance(cfg.files, str) else list(cfg.files)
+    files: list[Path] = []
     bad = 0
+    for path in paths or run_files([]):
+        try:
+            files += run_files([path])
+        except UserError as error:
+            if len(paths) == 1:
+                raise
+            bad += 1
+            log.info("%s", error)
+    checked = bad + len(files)
     for path in files:
         if problems := check_run(path):
             bad += 1
@@ -363,7 +376,5 @@ def main(cfg: DictConfig) -> float:
         else:
             log.info("%s: %s", path, _verdict(path))
     if bad:
-        raise UserError(
-            f"{bad} of {len(files)} files checked {'is' if bad == 1 else 'are'} not good; see above"
-        )
+        raise UserError(f"{bad} of {checked} files checked {'is' if bad == 1 else 'are'} not good; see above")
     return 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,17 @@ class Dataset:
     name: str
     path: Path
     split: dict[str, list[str]]
+
+    @property
+    def title(self) -> str:
+        """What it is called, see `dataset_title`."""
+        return dataset_title(self.name, self.path)
+
+    @property
+    def command(self) -> str:
+        """What simulates it; what was changed in its settings is not known."""
+        place = "" if self.title == self.name else f" dataset.path={shlex.quote(str(self.path))}"
+        return f"sgns simulate dataset={self.name}{place}"
 
     @classmethod
     def open(cls, folder: str | os.PathLike[str], where: Mapping[str, Any] | None = None) -> Dataset:
@@ -61,7 +73,7 @@ class Dataset:
         if missing:
             raise UserError(
                 f"runs of {path} are missing: {len(missing)}, the first is {missing[0].name}; finish the dataset "
-                f"with the command that began it: sgns simulate dataset={dataset.name} dataset.path={path} ..."
+                f"with the command that began it: {dataset.command} ..."
             )
         return dataset
 
@@ -70,6 +82,12 @@ class Dataset:
         if split not in SPLITS:
             raise UserError(f"split is {split!r}; allowed: {', '.join(SPLITS)}")
         return [self.path / "runs" / f"{name}.h5" for name in self.split[split]]
+
+
+def dataset_title(name: str, path: Path) -> str:
+    """What a dataset is called: by its name, or its folder where that has another; then it was made from the settings
+    of that name, with others."""
+    return name if path.resolve().name == name else str(path)
 
 
 def _are_names(names: Any) -> bool:

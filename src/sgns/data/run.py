@@ -44,7 +44,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from mpm_warp import Bed, SceneError
-from mpm_warp.settings import short_repr
+from mpm_warp.settings import short, short_repr
 
 AXES = ["x", "y", "z"]
 POSE = [*AXES, "qx", "qy", "qz", "qw"]
@@ -158,7 +158,11 @@ class Run:
         return self._whole("body_points")
 
     def positions(self, frames: slice | int | list[int] | np.ndarray = slice(None)) -> np.ndarray:
-        """Soil particles [m] in the chosen frames, shape (t, n, 3), float32; one frame gives t = 1."""
+        """Soil particles [m] in the chosen frames, shape (t, n, 3), float32; one frame gives t = 1.
+
+        Raises:
+            UserError: the run has no such frame.
+        """
         return self._frames("position", frames)
 
     def velocities(self, frames: slice | int | list[int] | np.ndarray = slice(None)) -> np.ndarray:
@@ -169,7 +173,8 @@ class Run:
         """The soil's surface in a frame, the last if none is given: x (nx,), y (ny,) and heights z (nx, ny) [m].
 
         Raises:
-            UserError: `frame` is no whole number, or the scene does not say how its bed is filled.
+            UserError: `frame` is no whole number or not one of the run, or the scene does not say how its bed is
+                filled.
         """
         if not is_whole(frame):
             raise UserError(
@@ -203,7 +208,7 @@ class Run:
             UserError: xarray is not installed.
         """
         xr = library("xarray", "run.to_xarray()")
-        index = np.atleast_1d(np.arange(self.frame_count)[frames])
+        index = self._index(frames)
         parts = {
             "position": (("particle", "axis"), self.positions(index), "m"),
             "velocity": (("particle", "axis"), self.velocities(index), "m/s"),
@@ -281,8 +286,18 @@ class Run:
                 self._cache[key] = self._dataset(name, part)[...].astype(np.float64)
         return self._cache[key].copy()
 
+    def _index(self, frames: slice | int | list[int] | np.ndarray) -> np.ndarray:
+        """Numbers of the chosen frames, shape (t,)."""
+        try:
+            return np.atleast_1d(np.arange(self.frame_count)[frames])
+        except IndexError as error:
+            raise UserError(
+                f"frames is {short(frames)}: {self.path} has {self.frame_count} frames, 0 to {self.frame_count - 1} "
+                "(or counted from the end, -1 the last); that of a time t is round(t * run.frame_rate)"
+            ) from error
+
     def _frames(self, name: str, frames: slice | int | list[int] | np.ndarray) -> np.ndarray:
-        index = np.atleast_1d(np.arange(self.frame_count)[frames])
+        index = self._index(frames)
         dataset = self._dataset(name)
         out = np.empty((len(index), self.particle_count, 3), dtype=np.float32)
         with self._reading(name):

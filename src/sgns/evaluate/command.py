@@ -200,8 +200,8 @@ def evaluate(
     paths = dataset.runs(split)
     if not paths:
         raise UserError(
-            f"dataset {dataset.name} has no complete run in its split {split!r}; allowed: train, "
-            f"validation, test; simulate it first: sgns simulate dataset={dataset.name}"
+            f"dataset {dataset.title} has no complete run in its split {split!r}; allowed: train, "
+            f"validation, test; simulate it first: {dataset.command}"
         )
     for path in (*paths, *new_rollouts):  # all of them before anything is written
         with Run(path) as run:
@@ -250,7 +250,7 @@ def evaluate(
 
     trained_on, chosen_by = seen_before(simulator, names)
     evaluation = Evaluation(
-        dataset=str(dataset.name),
+        dataset=dataset.title,
         split=split,
         runs=runs,
         total=aggregate([run.scores for run in runs]),

@@ -31,6 +31,7 @@ from sgns.evaluate.figures import (
 )
 from sgns.evaluate.results import EvaluatedRun, Evaluation, typical_and_worst
 from sgns.evaluate.views import common_scales, latent_path, side_views, solid_views, subspace_view, view_times
+from sgns.numbers import counted
 
 # --- Numbers, runs and scenes in plain words -------------------------------------------------------------
 
@@ -316,7 +317,7 @@ def histories(evaluation: Evaluation) -> list[FigureGroup]:
 def by_particle(evaluation: Evaluation) -> FigureGroup:
     """How the errors are spread over particles."""
     particles = [run.errors.particles for run in evaluation.runs if run.errors.particles is not None]
-    caption = f"{len(particles)} runs together; dotted: the median. Below 1 µm counts as 1 µm."
+    caption = f"{counted(len(particles), 'run')} together; dotted: the median. Below 1 µm counts as 1 µm."
     figures = [picture("particles", "Error by particle", caption, histogram_figure(particles))]
     return FigureGroup("Error by particle", "particles", figures)
 

@@ -191,10 +191,7 @@ def reduce_dataset(
     paths = {split: dataset.runs(split) for split in SPLITS}
     everything = [path for split in SPLITS for path in paths[split]]
     if not paths["train"]:
-        raise UserError(
-            f"{dataset.path} has no complete training runs; make them with: sgns simulate "
-            f"dataset={dataset.name}"
-        )
+        raise UserError(f"{dataset.path} has no complete training runs; make them with: {dataset.command}")
     content, frame_rate = check_one_bed(everything)
     folder = dataset.path / "reduced" / cache_key([content[path] for path in paths["train"]], settings)
     bar = {"disable": None if progress else True, "unit": "run", "leave": False}

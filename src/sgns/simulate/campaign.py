@@ -18,9 +18,11 @@ import numpy as np
 import yaml
 
 from mpm_warp import Decision, Effects, Scene, SceneError, substeps_per_frame
-from sgns.config import UserError, flattened
+from mpm_warp.settings import short
+from sgns.config import UserError, differences, flattened
 from sgns.data.dataset import SPLITS, read_description
 from sgns.data.files import file_lock, write_whole
+from sgns.numbers import counted
 from sgns.settings import DatasetSettings, Limits
 from sgns.simulate.scene import decided, replaced, scene_from_data
 
@@ -238,7 +240,9 @@ class Campaign:
                     f"{len(self.scenes)} runs have other physics; {advice}"
                     + (f"; to go on with it: {changed}" if changed else "")
                 )
-        raise UserError(f"{self.path} holds a dataset made with other settings; {advice}")
+        raise UserError(
+            f"{self.path} holds a dataset made with other settings{_what_changed(there, here)}; {advice}"
+        )
 
     def _decided_otherwise(self, asked: Any) -> int | None:
         """How many runs would have other effects if `asked` decided; None where it cannot.
@@ -253,6 +257,46 @@ class Campaign:
             )
         except (UserError, SceneError):
             return None
+
+
+def _what_changed(there: Any, here: Mapping[str, Any]) -> str:
+    """In what the contents of two dataset.yaml differ, in words: the first few settings."""
+    scenes = there.get("scenes") if isinstance(there, Mapping) else None
+    if not isinstance(scenes, Mapping) or not all(isinstance(one, Mapping) for one in scenes.values()):
+        return ""
+    own = {"dataset.name": "name", "seed": "seed", "solver.precision": "precision"}
+    found = differences(*({key: one.get(name) for key, name in own.items()} for one in (there, here)))
+    values = [_values(every) for every in (scenes, here["scenes"])]
+    found |= {f"scene.{key}": pair for key, pair in differences(*values).items()}
+    if not found and len(scenes) != len(here["scenes"]):
+        found = {"the number of runs": (len(scenes), len(here["scenes"]))}
+    elif not found and there.get("split") != here["split"]:
+        found = {"dataset.split": (None, None)}
+    words = [
+        f"{key} is {_words(old)} there and {_words(new)} here"
+        if _words(old) != _words(new)
+        else f"{key} is another"
+        for key, (old, new) in found.items()
+    ]
+    more = f" and {len(words) - 3} more" if len(words) > 3 else ""
+    return f": {', '.join(words[:3])}{more}" if words else ""
+
+
+def _values(scenes: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Dotted key → all values that the scenes have there."""
+    values: dict[str, set[str]] = {}
+    for scene in scenes.values():
+        for key, value in flattened(scene).items():
+            values.setdefault(key, set()).add(repr(value))
+    return {key: sorted(every) for key, every in values.items()}
+
+
+def _words(value: Any) -> str:
+    """In few characters."""
+    if not isinstance(value, list):
+        return short(value)
+    text = ", ".join(value)
+    return text if len(text) <= _LONGEST_NAME else counted(len(value), "value")
 
 
 def plan(
@@ -277,7 +321,8 @@ def plan(
         raise UserError(f"dataset.draw gives {len(combinations)} runs; a campaign needs 3 or more")
     if not 3 <= count <= len(combinations):
         raise UserError(
-            f"dataset.runs is {count}; allowed: 3 to {len(combinations)}, the combinations of dataset.draw"
+            f"dataset.runs is {count}, as given or as dataset={asked.name} has it; allowed: 3 to {len(combinations)}, "
+            "the combinations of dataset.draw; dataset.runs=null takes all of them"
         )
     rng = np.random.default_rng(seed)
     chosen = sorted(rng.choice(len(combinations), size=count, replace=False).tolist())

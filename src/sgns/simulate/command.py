@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from mpm_warp import Preview, Scene
+from mpm_warp.preview import near_floor
 from sgns.config import Interrupted, UserError, of_dataset
 from sgns.data.files import only_here
 from sgns.data.run import Run
@@ -170,6 +171,9 @@ def simulate_one(scene: Scene, cfg: DictConfig, restart: Restart | None = None, 
         log.info("%s: %d particles%s, %d frames", output, count, kept, run.frame_count)
         if words := scene.summary(run.force, run.torque, run.pose):
             log.info("%s", words)
+        if scene.axle is not None:  # others were told before
+            for words in near_floor(scene, float(scene.lowest_points(run.pose).min())):
+                log.warning("%s", words)
     log.info(
         "%.1f s for %.2f simulated s: %.2f s per simulated second, %.2f M particle-steps/s on %s",
         timing.wall_time,

@@ -92,7 +92,7 @@ def simulate_campaign(
         remove_abandoned(campaign.file(name))
     part = f", {len(share)} of them in shard {shard} of {shards}" if shards > 1 else ""
     total = f"{len(campaign.scenes)} runs{part}"
-    log.info("dataset %s in %s: %s, %d to do", campaign.name, campaign.path, total, len(missing))
+    log.info("dataset in %s: %s, %d to do", campaign.path, total, len(missing))
     if not missing:
         return
     log.info("%s", effects_line([physics[name][1] for name in missing]))

@@ -58,11 +58,12 @@ def main(cfg: DictConfig) -> float:
     output = Path(cfg.output)
     with only_here(output / "best.ckpt"):
         pass  # who cannot have it shall not wait for the reduction to hear so
+    title = plain["dataset"]["name"]
     if cfg.dataset.get("format") == "published":
         reduced = published_dataset(plain["dataset"], cfg.reduction.num_modes)
     else:
         dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
-        reduced = reduce_dataset(dataset, cfg.reduction, device=cfg.device)
+        reduced, title = reduce_dataset(dataset, cfg.reduction, device=cfg.device), dataset.title
     skill = train(
         reduced,
         num_modes=reduced.num_modes,
@@ -72,7 +73,7 @@ def main(cfg: DictConfig) -> float:
         seed=cfg.seed,
         device=cfg.device,
         start_from=cfg.checkpoint,
-        provenance={"preset": plain["preset"]["name"], "dataset": plain["dataset"]["name"]},
+        provenance={"preset": plain["preset"]["name"], "dataset": title},
     )
     if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.RUN:  # a sweep ends with a table
         for line in next_commands(output / "best.ckpt", reduced, HydraConfig.get().overrides.task):

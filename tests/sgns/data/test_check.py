@@ -240,3 +240,14 @@ def test_every_file_is_read_before_a_bad_one_is_reported(tmp_path, caplog):
     first, problem, last = caplog.messages
     assert first == last == f"{good}: good"
     assert problem.startswith(str(bad)) and problem.count("bad.h5") == 1
+
+
+def test_files_that_are_missing_are_listed_with_the_problems_of_the_others(tmp_path, caplog):
+    good = make_run(tmp_path / "good.h5")
+    with caplog.at_level(logging.INFO), pytest.raises(UserError, match="2 of 3 files checked are not good"):
+        main(OmegaConf.create({"files": [str(tmp_path / "a.h5"), str(good), str(tmp_path / "b.h5")]}))
+    assert [line.partition(": ")[2][:12] for line in caplog.messages] == [
+        "no such file",
+        "no such file",
+        "good",
+    ]

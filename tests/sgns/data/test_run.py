@@ -180,3 +180,12 @@ def test_what_is_missing_or_newer_is_named(tmp_path, change, words):
         change(file)
     said = refused(path)
     assert all(word in said for word in words)
+
+
+def test_frames_that_a_run_does_not_have(tmp_path):
+    with Run(make_run(tmp_path / "a.h5", frames=5)) as run:
+        for read in (run.positions, run.surface, run.velocities):
+            with pytest.raises(UserError, match=r"frames is 500: .* has 5 frames, 0 to 4"):
+                read(500)
+        with pytest.raises(UserError, match=r"frames is \[0, -6\]: .* has 5 frames"):
+            run.positions([0, -6])

@@ -103,7 +103,7 @@ def test_several_grids_are_joined(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"runs": 13}, "allowed: 3 to 12"),
+        ({"runs": 13}, "allowed: 3 to 12, the combinations of dataset.draw; dataset.runs=null takes all"),
         ({"draw": {"rake": 3.0}}, "dataset.draw.rake is 3.0"),
         ({"draw": [3]}, "must be a grid"),
         ({"split": [0.8, 0.1, 0.2]}, "sum to 1"),
@@ -118,7 +118,7 @@ def test_record_once_and_open(tmp_path):
     c = campaign(tmp_path)
     c.record()
     c.record()  # the same again is fine
-    with pytest.raises(UserError, match="made with other settings"):
+    with pytest.raises(UserError, match="made with other settings: seed is 0 there and 1 here; give"):
         campaign(tmp_path, seed=1).record()
     with pytest.raises(UserError, match="are missing: 10"):
         Dataset.open(c.path)
@@ -131,6 +131,46 @@ def test_record_once_and_open(tmp_path):
     assert all(run.exists() for run in dataset.runs("train"))
     with pytest.raises(UserError, match="allowed: train, validation, test"):
         dataset.runs("valid")
+
+
+DRAW = {"rake": [0.0, 10.0], "depth": [0.02, 0.04, 0.05], "blade.friction": [0.1, 0.3]}
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        (
+            {"draw": DRAW | {"depth": [0.02, 0.03, 0.05]}},
+            "scene.depth is 0.02, 0.04, 0.05 there and 0.02, 0.03, ",
+        ),
+        ({"draw": DRAW | {"rake": [5.0, 6.0]}}, "scene.rake is 0.0, 10.0 there and 5.0, 6.0 here; give"),
+        ({"split": [0.6, 0.2, 0.2]}, "dataset.split is another; give"),
+        ({"runs": 8}, "the number of runs is 10 there and 8 here; give"),
+    ],
+)
+def test_what_a_folder_was_made_with_otherwise_is_named(tmp_path, changed, words):
+    campaign(tmp_path).record()
+    with pytest.raises(UserError, match=f"made with other settings: {words}"):
+        campaign(tmp_path, **changed).record()
+
+
+def test_another_path_is_named_without_its_rows(tmp_path):
+    c = campaign(tmp_path)
+    c.path.mkdir()
+    scenes = {
+        name: data | {"path": [[0.1 * n] * 8 for n in range(50)]}
+        for name, data in c.describe()["scenes"].items()
+    }
+    (c.path / "dataset.yaml").write_text(yaml.safe_dump(c.describe() | {"scenes": scenes}))
+    with pytest.raises(UserError, match=r"scene.path is 1 value there and None here; give"):
+        c.record()
+
+
+def test_a_dataset_in_another_folder_is_called_by_it(tmp_path):
+    here, there = Dataset("quick", tmp_path / "quick", {}), Dataset("quick", tmp_path / "mine", {})
+    assert here.title == "quick" and here.command == "sgns simulate dataset=quick"
+    assert there.title == str(tmp_path / "mine")
+    assert there.command == f"sgns simulate dataset=quick dataset.path={tmp_path / 'mine'}"
 
 
 def test_a_tolerance_that_decides_alike_makes_no_other_dataset(tmp_path):

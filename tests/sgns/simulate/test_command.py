@@ -119,3 +119,17 @@ def test_effects_are_told_in_one_line_with_what_decided_them():
     assert "; rate_dependence on: the body moves soil at" in line
     assert "; torque off: asked for; auto would turn it on" in line
     assert "fluidity" not in line and "granular soil" not in line
+
+
+def test_a_wheel_that_came_to_the_floor_is_told_afterwards(tmp_path):
+    """Before, its height is not known."""
+    shallow = [
+        "scene.bed.size=[0.3,0.19,0.025]",
+        "scene.load=4000",
+        "scene.duration=0.15",
+        "scene.settle=0.1",
+    ]
+    done = sgns(tmp_path, "simulate", "scene=wheel", *shallow, "output=run.h5")
+    assert done.returncode == 0, done.stderr
+    [line] = [line for line in (done.stdout + done.stderr).splitlines() if "above the floor" in line]
+    assert line.startswith("warning: the tool's lowest point comes to ")
