@@ -31,6 +31,7 @@ def reference_page() -> str:
     """The page of all settings with default, unit, range and meaning, from the classes that define them."""
     import mpm_warp as mpm
     import sgns.settings as typed
+    from mpm_warp.motions import Passes
     from mpm_warp.settings import reference
 
     soil = [
@@ -43,6 +44,7 @@ def reference_page() -> str:
         mpm.Bed,
         mpm.Walls,
         mpm.Plate,
+        Passes,
     ]
     soil += [
         mpm.Box,

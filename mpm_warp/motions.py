@@ -1,14 +1,15 @@
-"""How tools move: the published cuts; how a wheel's load, place and forces are read."""
+"""How tools move: the published cuts, several passes; how a wheel's load, place and forces are read."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from .settings import short
+from .poses import about_y, rotate
+from .settings import Settings, setting, settings, short
 from .state import SceneError
 
 CUT_LENGTH = 0.4
@@ -46,6 +47,103 @@ def ramp(time: np.ndarray, depth: float, speed: float) -> np.ndarray:
     second = np.clip(time - down, 0.0, across)
     third = np.clip(time - down - across, 0.0, down)
     return np.stack([RAMP_SPEED * (first + third) + speed * second, RAMP_SPEED * (third - first)], axis=-1)
+
+
+def tip_poses(
+    tip: np.ndarray, start: tuple[float, float, float], rake: float, moved: np.ndarray
+) -> np.ndarray:
+    """Poses (T, 7) of a body whose `tip`, in the body frame [m], is at `start` [m] and has then `moved` (T, 2) along x
+    and z [m]; its top leans back by `rake` [degrees]."""
+    rotation = about_y(-math.radians(rake))
+    poses = np.empty((len(moved), 7))
+    poses[:, :3] = np.array(start) - rotate(rotation, tip)
+    poses[:, [0, 2]] += moved
+    poses[:, 3:] = rotation
+    return poses
+
+
+# --- Several passes -------------------------------------------------------------------------------------
+
+
+@settings
+class Passes(Settings):
+    """Several cuts one after the other, of motion=passes.
+
+    Each goes down at 45 degrees, along x, and up at 45 degrees at the scene's `speed`. Then the tool is lifted and goes
+    back and down to where the next one begins, at `return_speed`.
+    """
+
+    group: ClassVar[str] = "scene.passes"
+
+    number: int = setting(2, "of cuts", ge=1, le=100)
+    length: float = setting(0.20, "of a cut along x at its full depth", "m", ge=0, le=1e3)
+    advance: float = setting(0.0, "each cut begins so much further along x", "m", ge=-1e3, le=1e3)
+    deepening: float = setting(0.02, "each cut goes so much deeper", "m", ge=-1e3, le=1e3)
+    lift: float = setting(0.08, "of the tip above its starting height, on the way back", "m", ge=0, le=1e3)
+    return_speed: float = setting(0.20, "above the starting height", "m/s", gt=0, le=1e4)
+    easing: float = setting(
+        0.10, "time in which the velocity changes at a corner; it rounds the corner", "s", ge=1e-3, le=10
+    )
+
+    def corners(self, depth: float, speed: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times (k,) [s] and displacements (k, 2) of the tip along x and z [m] between which it would move straight
+        without easing."""
+        points, rates = [(0.0, 0.0)], []
+        for cut in range(self.number):
+            begin, deep = cut * self.advance, depth + cut * self.deepening
+            if not deep > 0.0:
+                raise SceneError(
+                    f"scene.depth is {depth:g} m and scene.passes.deepening {self.deepening:g} m: cut {cut + 1} would "
+                    f"be {deep:g} m deep; it must be above 0 m"
+                )
+            end = begin + deep + self.length
+            if cut:
+                points += [(begin, self.lift), (begin, 0.0)]
+                rates += [self.return_speed] * 2
+            points += [(begin + deep, -deep), (end, -deep), (end + deep, 0.0), (end + deep, self.lift)]
+            rates += [speed] * 3 + [self.return_speed]
+        places = np.array(points)
+        ways = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(ways / np.array(rates))]), places
+
+    def displacement(self, time: np.ndarray, depth: float, speed: float) -> np.ndarray:
+        """Displacement (dx, dz) of the tip, shape (T, 2) [m]: the mean of the straight way over the last `easing`
+        seconds, so that the acceleration is at most 2 speed / easing."""
+        corners, places = self.corners(depth, speed)
+        lasting = np.diff(corners)
+        moving = lasting > 0.0
+        velocity = np.diff(places, axis=0)[moving] / lasting[moving, None]
+        corners, places = (
+            np.append(corners[:-1][moving], corners[-1]),
+            np.append(places[:-1][moving], places[-1:], 0),
+        )
+        velocity = np.append(velocity, [[0.0, 0.0]], axis=0)  # rests afterwards
+        way = (places[:-1] + 0.5 * velocity[:-1] * np.diff(corners)[:, None]) * np.diff(corners)[:, None]
+        integral = np.concatenate([[[0.0, 0.0]], np.cumsum(way, axis=0)])
+
+        def until(t: np.ndarray) -> np.ndarray:
+            """Integral of the straight way over time; before its start it is at rest where it begins."""
+            part = np.searchsorted(corners, t, side="right") - 1
+            since = (np.maximum(t, 0.0) - corners[np.maximum(part, 0)])[:, None]
+            part = np.maximum(part, 0)
+            return integral[part] + (places[part] + 0.5 * velocity[part] * since) * since
+
+        time = np.asarray(time, dtype=float)
+        return (until(time) - until(time - self.easing)) / self.easing
+
+    def turns(self, depth: float, speed: float) -> np.ndarray:
+        """Times at which the tip begins and ends to change its velocity [s], increasing, shape (k,)."""
+        corners = self.corners(depth, speed)[0]
+        return np.unique(np.concatenate([corners, corners + self.easing]))
+
+    def cutting(self, time: np.ndarray, depth: float, speed: float) -> np.ndarray:
+        """Which cut, from 0, is under way at some times [s], shape (T,); -1: none."""
+        corners, shift = self.corners(depth, speed)[0], 0.5 * self.easing
+        found = np.full(len(time), -1)
+        for cut in range(self.number):
+            begin, end = corners[6 * cut] + shift, corners[6 * cut + 3] + shift
+            found[(time > begin) & (time <= end)] = cut
+        return found
 
 
 # --- Wheels ---------------------------------------------------------------------------------------------

@@ -72,7 +72,7 @@ class Preview:
             lines.append(
                 f"the path ends at {given[-1]:.4g} s; the tool rests there until {scene.duration:g} s"
             )
-        if given.size:
+        if getattr(scene, "motion", "path") == "path" and given.size:
             sides = ", ".join(
                 f"{round(1e3 * a)} to {round(1e3 * b)} mm along {axis}"
                 for axis, a, b in zip("xyz", *reach, strict=True)

@@ -12,8 +12,8 @@ import numpy as np
 from .bed import Bed, Walls, digest
 from .bodies import Axle, Box, Cylinder, MeshBody, Plate, Tool
 from .material import Material
-from .motions import along_and_across, as_loads, curved, ramp, sinkage
-from .poses import about_y, about_z_y, rotate
+from .motions import Passes, along_and_across, as_loads, curved, ramp, sinkage, tip_poses
+from .poses import about_z_y
 from .scene import Scene
 from .settings import same, setting, settings
 from .state import SceneError
@@ -38,7 +38,8 @@ class Excavation(Scene):
     rake: float = setting(
         10.0, "angle of the plate from vertical, tip leading", "degrees", ge=-60, le=60, radians_below=1.0
     )
-    motion: Literal["curved", "ramp", "rest", "path"] = setting("curved", "of the tip")
+    motion: Literal["curved", "ramp", "rest", "path", "passes"] = setting("curved", "of the tip")
+    passes: Passes = setting(Passes, "for motion=passes: how many, how long and where")
     start: float = setting(0.10, "where the tip starts" + _SHARE, ge=0, le=1, note=_SHARE)
     clearance: float = setting(
         0.00665, "height of the tip above the surface at the start", "m", ge=-1e3, le=1e3
@@ -64,7 +65,7 @@ class Excavation(Scene):
                 f"scene.path is given but scene.motion is {self.motion!r}; use scene.motion=path"
             )
         self._check_thickness(self.blade, "blade.thickness")
-        remedy = "change scene.depth, speed, start, duration or the path"
+        remedy = "change scene.depth, speed, start, duration, path or passes"
         if self.depth > max(self.bed.size):
             remedy = f"scene.depth is {self.depth:g} m; lengths are in metres"
         self._check_inside(self.blade, "the plate", remedy)
@@ -77,16 +78,15 @@ class Excavation(Scene):
         if self.motion == "path":
             return super().poses_at(time)
         time = np.atleast_1d(np.asarray(time, dtype=float))
-        rotation = about_y(-math.radians(self.rake))
         lx, ly, _ = self.bed.size
-        poses = np.empty((len(time), 7))
-        poses[:, :3] = np.array([self.start * lx, 0.5 * ly, self.clearance]) - rotate(
-            rotation, self.blade.tip
-        )
+        moved = np.zeros((len(time), 2))
         if self.motion != "rest":
-            poses[:, [0, 2]] += (curved if self.motion == "curved" else ramp)(time, self.depth, self.speed)
-        poses[:, 3:] = rotation
-        return poses
+            laws = {"curved": curved, "ramp": ramp, "passes": self.passes.displacement}
+            moved = laws[self.motion](time, self.depth, self.speed)
+        return tip_poses(self.blade.tip, (self.start * lx, 0.5 * ly, self.clearance), self.rake, moved)
+
+    def path_times(self) -> np.ndarray:
+        return self.passes.turns(self.depth, self.speed) if self.motion == "passes" else super().path_times()
 
     def body_points(self) -> np.ndarray:
         return self.blade.points(*self.body_grid)
@@ -101,7 +101,14 @@ class Excavation(Scene):
         return found
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
-        return f"mean draft {-np.mean(force[1:, 0]):.1f} N, vertical force {np.mean(force[1:, 2]):.1f} N"
+        words = f"mean draft {-np.mean(force[1:, 0]):.1f} N, vertical force {np.mean(force[1:, 2]):.1f} N"
+        if self.motion != "passes":
+            return words
+        cut = self.passes.cutting(self.times()[: len(force)], self.depth, self.speed)
+        each = [
+            f"{-force[cut == one, 0].mean():.1f}" for one in range(self.passes.number) if (cut == one).any()
+        ]
+        return f"{words}; mean draft of each pass: {', '.join(each)} N"
 
 
 @settings
@@ -112,19 +119,41 @@ class Body(Scene):
     kind: str = "body"
     duration: float = 2.0
     tool: Box | Cylinder | MeshBody = setting(Box, "the body")
+    motion: Literal["path", "passes"] = setting("path", "of the body; passes: of its tip")
     path: tuple[Any, ...] | None = setting(None, _PATH)
+    passes: Passes = setting(Passes, "for motion=passes, with the five keys that follow")
+    depth: float = same(Excavation, "depth")
+    speed: float = same(Excavation, "speed")
+    rake: float = same(Excavation, "rake", default=0.0)
+    start: float = same(Excavation, "start")
+    clearance: float = same(Excavation, "clearance")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.path is None:
+        if self.motion == "path" and self.path is None:
             raise SceneError("scene.path is missing: a CSV file with columns t,x,y,z,qx,qy,qz,qw")
+        if self.motion == "passes" and self.path is not None:
+            raise SceneError("scene.path is given but scene.motion is 'passes'; use scene.motion=path")
         if not isinstance(self.tool, MeshBody):  # whose thin walls are made to hold
             self._check_thickness(self.tool, "a body")
-        self._check_inside(self.tool, "the body", "change scene.path or scene.duration")
+        remedy = "change scene.path or scene.duration"
+        if self.motion == "passes":
+            remedy = "change scene.start, depth, passes or duration"
+        self._check_inside(self.tool, "the body", remedy)
 
     @property
     def body(self) -> Tool:
         return self.tool
+
+    def poses_at(self, time: np.ndarray) -> np.ndarray:
+        if self.motion == "path":
+            return super().poses_at(time)
+        moved = self.passes.displacement(np.atleast_1d(time), self.depth, self.speed)
+        lx, ly, _ = self.bed.size
+        return tip_poses(self.tool.tip, (self.start * lx, 0.5 * ly, self.clearance), self.rake, moved)
+
+    def path_times(self) -> np.ndarray:
+        return self.passes.turns(self.depth, self.speed) if self.motion == "passes" else super().path_times()
 
     def warnings(self) -> list[str]:
         found, h = super().warnings(), self.bed.spacing

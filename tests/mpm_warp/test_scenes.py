@@ -1,4 +1,4 @@
-"""Motion laws and paths."""
+"""Paths, and the kinds of scenes that move a tool."""
 
 import math
 from dataclasses import replace
@@ -23,35 +23,13 @@ from mpm_warp import (
 from mpm_warp.discretisation import asymmetry
 from mpm_warp.effects import expected_flow
 from mpm_warp.limits import PhysicalLimits, top_body_speed
-from mpm_warp.motions import along_and_across, curved, ramp
+from mpm_warp.motions import along_and_across
 from mpm_warp.poses import about_y, rotate, sampled_poses
 from mpm_warp.rigid_body import stable_step
 from sgns_testing.scenes import UNDAMPED, BlockBed, block, cut
 from sgns_testing.solvers import momenta
 
-# --- Motion laws and paths ------------------------------------------------------------------------------
-
-
-def test_curved_motion_is_half_an_ellipse():
-    t = np.linspace(0.0, 4.0, 401)
-    x, z = curved(t, 0.08, 0.1).T
-    inside = t <= 0.95 * 4.0
-    np.testing.assert_allclose(((x[inside] - 0.2) / 0.2) ** 2 + (z[inside] / 0.08) ** 2, 1.0, atol=1e-12)
-    assert z.min() == pytest.approx(-0.08)
-    np.testing.assert_allclose(np.diff(x[~inside]), 0.0)  # it stops at 95 %
-
-
-def test_fastest_cut_lasts_the_published_2_6_seconds():
-    """0.4 m / 0.15 m/s is 2.67 s; the published scripts say 2.6."""
-    z = curved(np.linspace(0, 3, 3001), 0.05, 0.15)[:, 1]
-    assert np.argmin(z) == pytest.approx(1300, abs=1)
-
-
-def test_ramp_goes_down_across_and_up():
-    t = np.array([0.0, 1.0, 2.0, 4.0, 6.0, 7.0, 8.0, 20.0])
-    x, z = ramp(t, 0.05, 0.1).T
-    np.testing.assert_allclose(z, [0, -0.025, -0.05, -0.05, -0.05, -0.025, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(x, [0, 0.025, 0.05, 0.25, 0.45, 0.475, 0.5, 0.5], atol=1e-12)
+# --- Paths ------------------------------------------------------------------------------------------
 
 
 def test_sampled_path_interpolates_and_rests_at_its_ends():
