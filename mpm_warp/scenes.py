@@ -63,15 +63,16 @@ class Excavation(Scene):
             raise SceneError(
                 f"scene.path is given but scene.motion is {self.motion!r}; use scene.motion=path"
             )
-        self._check_thickness(self.blade, "blade.thickness")
+        self._check_thickness(self.body, "blade.thickness")
         remedy = "change scene.depth, speed, start, duration or the path"
         if self.depth > max(self.bed.size):
             remedy = f"scene.depth is {self.depth:g} m; lengths are in metres"
-        self._check_inside(self.blade, "the plate", remedy)
+        self._check_inside(self.body, "the plate", remedy)
 
-    @property
+    @cached_property
     def body(self) -> Plate:
-        return self.blade
+        rotation = about_y(-math.radians(self.rake)) if self.path is None else np.array(self.path[0][4:])
+        return self.blade.level_at(rotation)
 
     def poses_at(self, time: np.ndarray) -> np.ndarray:
         if self.motion == "path":
@@ -80,16 +81,14 @@ class Excavation(Scene):
         rotation = about_y(-math.radians(self.rake))
         lx, ly, _ = self.bed.size
         poses = np.empty((len(time), 7))
-        poses[:, :3] = np.array([self.start * lx, 0.5 * ly, self.clearance]) - rotate(
-            rotation, self.blade.tip
-        )
+        poses[:, :3] = np.array([self.start * lx, 0.5 * ly, self.clearance]) - rotate(rotation, self.body.tip)
         if self.motion != "rest":
             poses[:, [0, 2]] += (curved if self.motion == "curved" else ramp)(time, self.depth, self.speed)
         poses[:, 3:] = rotation
         return poses
 
     def body_points(self) -> np.ndarray:
-        return self.blade.points(*self.body_grid)
+        return self.body.points(*self.body_grid)
 
     def warnings(self) -> list[str]:
         found = super().warnings()
