@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from abc import ABC, abstractmethod
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -41,7 +42,7 @@ class Tool(ABC):
     """What a solver asks of any rigid body. The body frame's origin is its centre of mass."""
 
     surface: ClassVar[str]
-    """Which signed distance it has: box | cylinder | mesh (kernels/signed_distance.py)."""
+    """Which signed distance it has: box | plate | cylinder | mesh (kernels/signed_distance.py)."""
     friction: float
 
     @property
@@ -102,20 +103,82 @@ def _upright_edges(half_size: np.ndarray, count: int) -> np.ndarray:
     )
 
 
+WEDGE = 30.0
+"""Angle of a plate's edge that is ground from the back [degrees]."""
+
+
 @settings
 class Plate(Settings, Tool):
-    """A blade: a box centred on its centre of mass.
+    """A blade: a box, or one whose lower end is cut.
 
-    Body frame: x through the thickness (front face at +x), y along the width, z along the length (tip at -z).
+    Body frame: x through the thickness (front face at +x), y along the width, z along the length (tip at -z). Its
+    origin is the middle of the box, whatever the edge, so that a path means the same for all edges.
     """
 
     group: ClassVar[str] = "blade"
-    surface: ClassVar[str] = "box"
+    level: ClassVar[float] = 0.0
+    """Of an end that is cut level: its angle from a square one [degrees], see `level_at`."""
 
     length: float = _length(0.305, "along the blade, tip to top")
     width: float = _length(0.457, "across the direction of travel")
     thickness: float = _length(0.028, "2 to 3 grid spacings keep the soil on its two sides apart")
     friction: float = setting(0.3, "Coulomb friction between soil and body", ge=0)
+    edge: Literal["square", "level", "bevel"] = setting(
+        "square",
+        f"of the lower end; level: cut level where the motion starts; bevel: ground from the back to {WEDGE:g} degrees",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.cut_angle and abs(self._cut) >= self.length:
+            raise SceneError(
+                f"blade.length is {self.length} m; an edge that is cut by {abs(self.cut_angle):.3g} degrees needs more "
+                f"than {abs(self._cut):.3g} m: make the plate longer or thinner, or set blade.edge=square"
+            )
+
+    @property
+    def surface(self) -> str:  # type: ignore[override]  # of other tools it is the same for all
+        return "plate" if self.cut_angle else "box"
+
+    @property
+    def cut_angle(self) -> float:
+        """Of the lower end from a square one, positive where its back is higher [degrees]."""
+        return {"square": 0.0, "level": self.level, "bevel": 90.0 - WEDGE}[self.edge]
+
+    @property
+    def _cut(self) -> float:
+        """By what the end's back is higher than its front [m]."""
+        return self.thickness * math.tan(math.radians(self.cut_angle))
+
+    def level_at(self, rotation: np.ndarray) -> Plate:
+        """The same plate; a level end is horizontal with this rotation (4,)."""
+        if self.edge != "level":
+            return self
+        x, y, z, w = rotation
+        level = math.degrees(math.atan2(2.0 * (x * z - w * y), w * w + z * z - x * x - y * y))
+        plate = copy(self)
+        object.__setattr__(plate, "level", min(max(level, -89.9), 89.9))
+        plate.__post_init__()
+        return plate
+
+    @property
+    def section(self) -> np.ndarray:
+        """Corners of the cut with the plane y = 0, x and z [m]: lower front, then up, back and down; shape (4, 2)."""
+        x, _, z = self.half_size
+        front, back = max(0.0, -self._cut), max(0.0, self._cut)
+        return np.array([[x, front - z], [x, z], [-x, z], [-x, back - z]])
+
+    @property
+    def corners(self) -> np.ndarray:
+        """In the body frame [m], shape (8, 3)."""
+        y = 0.5 * self.width
+        return np.array([[x, side, z] for side in (-y, y) for x, z in self.section])
+
+    @property
+    def tip(self) -> np.ndarray:
+        """Middle of the lower end, or of its edge."""
+        x, z = self.section[0] if self.edge == "bevel" else 0.5 * (self.section[0] + self.section[3])
+        return np.array([x, 0.0, z])
 
     @property
     def half_size(self) -> np.ndarray:
@@ -124,11 +187,16 @@ class Plate(Settings, Tool):
     def points(self, rows: int = 3, columns: int = 5) -> np.ndarray:
         """Body nodes: rows x columns points on the front face in the body frame [m], shape (M, 3)."""
         hx, hy, hz = self.half_size
-        z, y = np.meshgrid(np.linspace(-hz, hz, rows), np.linspace(-hy, hy, columns), indexing="ij")
+        z, y = np.meshgrid(
+            np.linspace(self.section[0, 1], hz, rows), np.linspace(-hy, hy, columns), indexing="ij"
+        )
         return np.stack([np.full(rows * columns, hx), y.ravel(), z.ravel()], axis=-1)
 
     def outline(self) -> np.ndarray:
-        return _upright_edges(self.half_size, 9)
+        if not self.cut_angle:
+            return _upright_edges(self.half_size, 9)
+        low, high = self.corners[[0, 3, 4, 7]], self.corners[[1, 2, 5, 6]]
+        return np.concatenate([low + share * (high - low) for share in np.linspace(0.0, 1.0, 9)])
 
 
 @settings

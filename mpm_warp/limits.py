@@ -106,9 +106,9 @@ def steps_to_remap(scene: Scene, time_step: float, speed: float) -> int:
     """Number of steps of `time_step` [s] until momentum is carried to a fresh grid: 2^n or 3 2^n.
 
     Soil of at most `speed` [m/s] must not travel far from the place that its weights belong to: at most
-    `scene.remap_distance` grid spacings, free fall included, and never longer than `scene.remap_time`.
+    `scene.remap_distance` grid spacings, free fall included, and never longer than `scene.remap_limit`.
     """
-    room, limit = scene.remap_distance * scene.bed.spacing, scene.remap_time
+    room, limit = scene.remap_distance * scene.bed.spacing, scene.remap_limit
     if speed * limit + scene.gravity * limit**2 > room:
         limit = 2.0 * room / (speed + math.sqrt(speed**2 + 4.0 * scene.gravity * room))
     most = max(1, int(limit / time_step * (1.0 + 1e-9)))

@@ -30,6 +30,10 @@ MOST_COURANT = 0.8
 """Largest `courant`. From 0.86 on a cut's forces come out too small, with nothing else to see
 (experiments/stability/step.csv)."""
 
+REMAP_TIME, VELOCITY_MEMORY = 4.0e-3, 0.1
+"""`remap_time` and `velocity_memory` by default, in the default sand on Earth [s]; elsewhere they are the same shares
+of sqrt(d / g), the time in which a grain falls its own size, so that similar scenes have similar answers."""
+
 _ROUNDING = 1e-9
 """Lengths that differ by less are the same [m]."""
 _MOST_POSES, _MOST_POINTS = 100_000, 1_000_000
@@ -90,15 +94,17 @@ class Scene(Settings):
     )
     elastic_damping: float = setting(0.1, "damping ratio of the grid's shortest elastic waves", ge=0, le=1)
     volume_averaging: float = setting(1.0, "share of volume changes that a local mean replaces", ge=0, le=1)
-    remap_time: float = setting(
-        4.0e-3,
-        "longest time between two remaps of the velocities (solver.py)",
+    remap_time: float | None = setting(
+        None,
+        "longest time between two remaps of the velocities (solver.py); None: 0.72 sqrt(d / g)",
         "s",
         ge=0,
-        words=" s; it must be 0 (every step) or more",
+        words=" s; it must be 0 (every step) or more, or null",
     )
     remap_distance: float = setting(0.1, "soil's way between two remaps", "grid spacings", gt=0, le=0.5)
-    velocity_memory: float = setting(0.1, "time in which velocities below the grid fade to 37 %", "s", gt=0)
+    velocity_memory: float | None = setting(
+        None, "time in which velocities below the grid fade to 37 %; None: 18 sqrt(d / g)", "s", gt=0
+    )
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -124,6 +130,21 @@ class Scene(Settings):
         return getattr(self, "path", None)
 
     # --- what a solver or a rollout asks of a scene -------------------------------------------------------
+
+    @property
+    def remap_limit(self) -> float:
+        """Longest time between two remaps [s]."""
+        return self._like_grains(REMAP_TIME) if self.remap_time is None else self.remap_time
+
+    @property
+    def memory_time(self) -> float:
+        """In which velocities below the grid fade to 37 % [s]."""
+        return self._like_grains(VELOCITY_MEMORY) if self.velocity_memory is None else self.velocity_memory
+
+    def _like_grains(self, time: float) -> float:
+        """A time of the default sand on Earth, scaled as sqrt(d / g); without gravity with that of the Earth [s]."""
+        size = self.material.grain_diameter / Material.grain_diameter
+        return time * math.sqrt(size * (Scene.gravity / (self.gravity or Scene.gravity)))
 
     @property
     def contact_distance(self) -> float:

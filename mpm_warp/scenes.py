@@ -13,7 +13,7 @@ from .bed import Bed, Walls, digest
 from .bodies import Axle, Box, Cylinder, MeshBody, Plate, Tool
 from .material import Material
 from .motions import Passes, along_and_across, as_loads, curved, ramp, sinkage, tip_poses
-from .poses import about_z_y
+from .poses import about_y, about_z_y
 from .scene import Scene
 from .settings import same, setting, settings
 from .state import SceneError
@@ -64,15 +64,16 @@ class Excavation(Scene):
             raise SceneError(
                 f"scene.path is given but scene.motion is {self.motion!r}; use scene.motion=path"
             )
-        self._check_thickness(self.blade, "blade.thickness")
+        self._check_thickness(self.body, "blade.thickness")
         remedy = "change scene.depth, speed, start, duration, path or passes"
         if self.depth > max(self.bed.size):
             remedy = f"scene.depth is {self.depth:g} m; lengths are in metres"
-        self._check_inside(self.blade, "the plate", remedy)
+        self._check_inside(self.body, "the plate", remedy)
 
-    @property
+    @cached_property
     def body(self) -> Plate:
-        return self.blade
+        rotation = about_y(-math.radians(self.rake)) if self.path is None else np.array(self.path[0][4:])
+        return self.blade.level_at(rotation)
 
     def poses_at(self, time: np.ndarray) -> np.ndarray:
         if self.motion == "path":
@@ -83,13 +84,13 @@ class Excavation(Scene):
         if self.motion != "rest":
             laws = {"curved": curved, "ramp": ramp, "passes": self.passes.displacement}
             moved = laws[self.motion](time, self.depth, self.speed)
-        return tip_poses(self.blade.tip, (self.start * lx, 0.5 * ly, self.clearance), self.rake, moved)
+        return tip_poses(self.body.tip, (self.start * lx, 0.5 * ly, self.clearance), self.rake, moved)
 
     def path_times(self) -> np.ndarray:
         return self.passes.turns(self.depth, self.speed) if self.motion == "passes" else super().path_times()
 
     def body_points(self) -> np.ndarray:
-        return self.blade.points(*self.body_grid)
+        return self.body.points(*self.body_grid)
 
     def warnings(self) -> list[str]:
         found = super().warnings()

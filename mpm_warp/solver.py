@@ -311,7 +311,7 @@ class Solver:
                 raise self._stopped(index, substep, fastest, self._limits.too_fast(top))
             steps = min(left, steps_to_remap(self.scene, self.time_step, max(self._top_body_speed, top)))
             left -= steps
-            self._keep.fill_(math.exp(-steps * self.time_step / self.scene.velocity_memory))
+            self._keep.fill_(math.exp(-steps * self.time_step / self.scene.memory_time))
             yield Job(self._steps, steps)
         self._check(index)
 

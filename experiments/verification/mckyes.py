@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mpm_warp import Bed, Effects, Material, MeshBody, Scene, Solver, Walls
+from mpm_warp.bodies import WEDGE
 
 ANGLE = math.degrees(math.atan(0.76))  # of friction, of the paper's sand [degrees]
 WALL_ANGLE = math.atan(0.3)  # of friction between soil and blade [rad]
@@ -76,15 +77,20 @@ class BuriedBlade(Scene):
         return poses
 
 
-def level_blade(rake: float, width: float) -> MeshBody:
+def level_blade(rake: float, width: float, end: str = "level") -> MeshBody:
     """A blade like the plate of the excavations but cut off level below, so that only its front meets soil.
 
     Args:
         rake: of the front from vertical, tip leading [degrees].
         width: [m].
+        end: level, or bevel: that of a plate with such an edge.
     """
-    back, lean = THICKNESS / math.cos(math.radians(rake)), HEIGHT * math.tan(math.radians(rake))
+    c, s, t = (f(math.radians(rake)) for f in (math.cos, math.sin, math.tan))
+    back, lean = THICKNESS / c, HEIGHT * t
     section = [(0.0, 0.0), (-lean, HEIGHT), (-lean - back, HEIGHT), (-back, 0.0)]
+    if end == "bevel":
+        up = THICKNESS * (c / math.tan(math.radians(WEDGE)) - s)
+        section[3] = (-back - up * t, up)
     vertices = [(x, y, z) for y in (-0.5 * width, 0.5 * width) for x, z in section]
     faces = ["4 3 2 1", "5 6 7 8", "1 2 6 5", "2 3 7 6", "3 4 8 7", "4 1 5 8"]
     lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {face}" for face in faces]
@@ -100,6 +106,7 @@ def buried_blade(
     depth: float = 0.08,
     spacing: float = 0.02,
     bin_width: float = 0.0,
+    end: str = "level",
 ) -> BuriedBlade:
     """A blade in soil with the numerics of `scene=excavation`; endless in y if `bin_width` is 0."""
     bed = Bed(
@@ -112,7 +119,7 @@ def buried_blade(
     return BuriedBlade(
         bed=bed,
         material=Material(friction_angle=ANGLE, friction_map=friction_map),
-        blade=level_blade(rake, WIDTH if bin_width else 1.0),
+        blade=level_blade(rake, WIDTH if bin_width else 1.0, end),
         rake=rake,
         depth=depth,
         duration=MEASURED[1] / BuriedBlade.speed,
@@ -163,6 +170,7 @@ def cases() -> list[dict]:
     plane = [
         {"friction_map": m, "rake": rake, "spacing": h} for h in SPACINGS for m in MAPS for rake in RAKES
     ]
+    plane += [plane[0] | {"rake": rake, "spacing": SPACINGS[1], "end": "bevel"} for rake in RAKES]
     bins = [(0.04, 0.02, 1.2), (0.06, 0.02, 1.2), *((0.08, h, w) for w in (1.2, 0.6) for h in (0.02, 0.01))]
     return plane + [
         {"friction_map": m, "depth": depth, "spacing": h, "bin_width": width}
@@ -183,6 +191,7 @@ def measure() -> list[dict]:
             "rake": scene.rake,
             "depth": scene.depth,
             "spacing": scene.bed.spacing,
+            "end": case.get("end", "level"),
             "bin_width": case.get("bin_width", math.inf),
             "draft": along,
             "down": down,

@@ -20,6 +20,8 @@ def shape_struct(real: type) -> type:
     @wp.struct
     class Size:
         half: vec3  # of a box; of the box that holds a mesh and everything in contact with it
+        sides: wp.types.matrix((4, 4), real)  # of a plate's section: x, z and direction
+        lengths: wp.types.vector(4, real)  # of these sides
         radius: real  # of a cylinder, like what follows
         half_width: real
         grousers: int
@@ -50,6 +52,11 @@ def shape_data(
         data.grouser_half = 0.5 * body.grouser_thickness
         # A bar can be thinner than twice the depth at which contact begins; it then begins half-way to its middle.
         data.grouser_offset = min(0.0, margin + 0.25 * body.grouser_thickness)
+    elif body.surface == "plate":
+        along = np.roll(body.section, -1, axis=0) - body.section
+        lengths = np.linalg.norm(along, axis=1)
+        data.sides = wp.types.matrix((4, 4), real)(np.hstack([body.section, along / lengths[:, None]]))
+        data.lengths = wp.types.vector(4, real)(*lengths)
     elif body.surface == "mesh":
         vertices, triangles = body.mesh
         mesh = wp.Mesh(
@@ -70,7 +77,7 @@ def signed_distance(real: type, shape: str) -> wp.Function:
     """Warp function (point in the body frame, struct of the shape) -> outward normal and, as the fourth number,
     signed distance [m], negative inside. Inside a corner the nearest face counts; inside a grouser's root the
     distance is a lower bound."""
-    return {"box": _box, "cylinder": _cylinder, "mesh": _mesh}[shape](real)
+    return {"box": _box, "plate": _plate, "cylinder": _cylinder, "mesh": _mesh}[shape](real)
 
 
 @cache
@@ -143,6 +150,44 @@ def _box(real: type) -> wp.Function:
         return vec4(n[0] * wp.sign(q[0]), n[1] * wp.sign(q[1]), n[2] * wp.sign(q[2]), n[3])
 
     return box_distance
+
+
+def _plate(real: type) -> wp.Function:
+    vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
+    Size = shape_struct(real)
+
+    @wp.func
+    def plate_distance(q: vec3, size: Size):
+        # Of the section, which is convex: outside the nearest side counts, inside the nearest line.
+        deepest = real(-OUT_OF_REACH)
+        nearest = real(OUT_OF_REACH)
+        normal = vec2()
+        away = vec2()
+        for k in range(4):
+            along = vec2(size.sides[k, 2], size.sides[k, 3])
+            r = vec2(q[0] - size.sides[k, 0], q[2] - size.sides[k, 1])
+            n = vec2(along[1], -along[0])
+            if wp.dot(r, n) > deepest:
+                deepest = wp.dot(r, n)
+                normal = n
+            r -= wp.clamp(wp.dot(r, along), real(0.0), size.lengths[k]) * along
+            if wp.length(r) < nearest:
+                nearest = wp.length(r)
+                away = r
+        distance = deepest
+        if deepest > real(0.0):
+            distance = nearest
+            normal = away / nearest
+        end = wp.abs(q[1]) - size.half[1]
+        side = wp.sign(q[1])
+        if end > real(0.0) and distance > real(0.0):
+            both = wp.sqrt(end * end + distance * distance)
+            return vec4(distance / both * normal[0], end / both * side, distance / both * normal[1], both)
+        if end > distance:
+            return vec4(real(0.0), side, real(0.0), end)
+        return vec4(normal[0], real(0.0), normal[1], distance)
+
+    return plate_distance
 
 
 def _cylinder(real: type) -> wp.Function:

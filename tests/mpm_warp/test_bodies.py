@@ -1,9 +1,12 @@
 """Bodies and mesh files: what they are, what they refuse."""
 
+import math
+
 import numpy as np
 import pytest
 
-from mpm_warp import Body, Box, Cylinder, MeshBody, Scene, SceneError
+from mpm_warp import Body, Box, Cylinder, Excavation, MeshBody, Plate, Scene, SceneError
+from mpm_warp.poses import about_y, in_world_frame
 from mpm_warp.preview import Preview
 from sgns_testing.meshes import BOX_FACES, box_corners, box_triangles, write_obj, write_stl, write_text_stl
 
@@ -141,3 +144,39 @@ def test_old_runs_keep_their_tool(tmp_path):
     scene = Scene.from_dict(data, body.mesh)
     assert not scene.body.path_point.any()
     np.testing.assert_array_equal(scene.mesh[0], body.mesh[0])
+
+
+@pytest.mark.parametrize("rake", [-20.0, 0.0, 30.0])
+@pytest.mark.parametrize("edge", ["square", "level", "bevel"])
+def test_the_tip_of_a_plate_is_where_the_motion_says(edge, rake):
+    """A square end reaches below it on one side, a level end and an edge do not."""
+    scene = Excavation(blade=Plate(edge=edge), rake=rake, depth=0.06, motion="curved")
+    poses = scene.body_poses()
+    tip = in_world_frame(poses, scene.body.tip[None])[:, 0]
+    assert tip[0] == pytest.approx([0.08, 0.3, 0.00665])
+    below = tip[:, 2] - scene.lowest_points(poses)
+    deeper = 0.5 * Plate.thickness * abs(math.sin(math.radians(rake))) if edge == "square" else 0.0
+    if edge == "bevel" and rake < 0.0:
+        assert (below < 1e-9).all()
+    else:
+        assert below == pytest.approx(deeper, abs=1e-9)
+    end = in_world_frame(poses[:1], scene.body.corners)[0][[0, 3], 2]
+    if edge == "level":
+        assert end[0] == pytest.approx(end[1])
+    points = scene.body_points()
+    assert points[:, 0] == pytest.approx(0.014)
+    assert points[:, 2].min() == pytest.approx(scene.body.section[0, 1])
+
+
+def test_a_level_end_is_level_where_a_path_starts():
+    rows = [(t, 0.2 + 0.1 * t, 0.3, 0.2 - 0.05 * t, *about_y(-math.radians(25.0))) for t in (0.0, 1.0)]
+    scene = Excavation(blade=Plate(edge="level"), motion="path", path=rows, duration=1.0)
+    assert scene.body.cut_angle == pytest.approx(25.0)
+    assert scene.blade.cut_angle == 0.0  # a plate alone knows no path
+
+
+def test_a_plate_too_short_for_its_edge():
+    with pytest.raises(
+        SceneError, match=r"blade.length is 0.04 m; an edge that is cut by 60 degrees needs more"
+    ):
+        Plate(length=0.04, thickness=0.028, edge="bevel")

@@ -79,8 +79,6 @@ def scaled_cut(length: float, gravity: float):
         path=path,
         duration=0.1 / rate,
         frame_rate=100.0 * rate,
-        remap_time=4e-3 / rate,
-        velocity_memory=0.1 / rate,
     )
 
 
@@ -95,3 +93,24 @@ def test_exact_scaling():
     np.testing.assert_allclose(force[1], q * r**3 * force[0], atol=1e-8 * np.abs(force[1]).max())
     np.testing.assert_allclose(torque[1], q * r**4 * torque[0], atol=1e-8 * np.abs(torque[1]).max())
     np.testing.assert_allclose(frames[1][-1].position, r * frames[0][-1].position, atol=1e-6 * r)
+
+
+@pytest.mark.parametrize("scale", [0.1, 10.0, pytest.param(100.0, marks=pytest.mark.long)])
+def test_similar_cuts_have_similar_forces_in_single_precision(scale):
+    """Lengths x k, times x sqrt(k), E x k, every other setting left alone: forces x k^3. What is left is rounding, some
+    1e-6 of the largest force here."""
+    one, other = (
+        np.array([f.force for f in Solver(scaled_cut(k, 1.0)).frames()]) / k**3 for k in (1.0, scale)
+    )
+    assert -one[:, 0].mean() > 10.0
+    np.testing.assert_allclose(other, one, atol=1e-4 * np.abs(one).max())
+
+
+def test_times_of_the_numerics_follow_grains_and_gravity():
+    scene = cut()
+    assert (scene.remap_limit, scene.memory_time) == (4.0e-3, 0.1)
+    finer = replace(scene, material=Material(grain_diameter=0.25 * Material.grain_diameter), gravity=4 * 9.81)
+    assert (finer.remap_limit, finer.memory_time) == pytest.approx((1.0e-3, 0.025))
+    in_seconds = replace(finer, remap_time=0.0, velocity_memory=0.3)
+    assert (in_seconds.remap_limit, in_seconds.memory_time) == (0.0, 0.3)
+    assert replace(scene, gravity=0.0).remap_limit == 4.0e-3  # as on Earth

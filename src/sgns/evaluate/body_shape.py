@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from mpm_warp import Plate
 from mpm_warp.poses import in_world_frame
 from sgns.model.features import is_wheel
 
@@ -30,7 +31,8 @@ def body_corners(run: Any, frame: int) -> np.ndarray:
         rim = np.insert(circle(float(drum["diameter"]), 64), 1, 0.5 * float(drum["width"]), axis=1)
         corners = np.concatenate([rim, rim * [1.0, -1.0, 1.0]])
     elif isinstance(blade, Mapping):
-        corners = (CUBE - 0.5) * np.array([blade["thickness"], blade["width"], blade["length"]], float)
+        sizes = {key: blade[key] for key in ("thickness", "width", "length", "edge") if key in blade}
+        corners = Plate.from_dict(sizes).level_at(run.pose[0, 3:]).corners
     elif run.mesh is not None:
         corners = run.mesh[0]
     else:

@@ -1,6 +1,7 @@
 """Signed distances against analytic ones."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,6 +11,7 @@ import warp as wp
 from mpm_warp import Box, Cylinder, MeshBody, Plate
 from mpm_warp.kernels.signed_distance import shape_data, shape_struct, signed_distance
 from mpm_warp.launch import start_warp
+from mpm_warp.poses import about_y
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
 start_warp()
@@ -51,13 +53,19 @@ R = math.sqrt(0.5)
             [[1, 0, 0], [0, 0, -1], [1, 0, 0], [0.6, 0, 0.8], [-1, 0, 0]],
         ),
         (
+            Plate(thickness=0.04, width=0.4, length=0.2, edge="bevel"),  # its back ends 40 sqrt(3) mm higher
+            [[0.03, 0, 0.0], [0.02, 0, -0.13], [0, 0, -0.1], [0.05, 0.24, 0.0], [0, -0.16, 0.095]],
+            [0.01, 0.03, 0.01 * math.sqrt(3.0), 0.05, -0.005],
+            [[1, 0, 0], [0, 0, -1], [-math.sqrt(0.75), 0, -0.5], [0.6, 0.8, 0], [0, 0, 1]],
+        ),
+        (
             Cylinder(diameter=0.2, width=0.1),
             [[0.0, 0, -0.12], [0.07 * R, 0.01, 0.07 * R], [0.05, -0.048, 0], [0.13, 0.09, 0], [0, 0.07, 0]],
             [0.02, -0.03, -0.002, 0.05, 0.02],
             [[0, 0, -1], [R, 0, R], [0, -1, 0], [0.6, 0.8, 0], [0, 1, 0]],
         ),
     ],
-    ids=["plate", "cylinder"],
+    ids=["plate", "bevelled plate", "cylinder"],
 )
 def test_known_distances(body, points, exact, normals):
     normal, distance = distances(body, points)
@@ -96,10 +104,11 @@ def test_thin_grousers_act_although_contact_begins_inside():
     "body",
     [
         Box(size=(0.1, 0.2, 0.3)),
+        Plate(thickness=0.05, width=0.2, length=0.3, edge="bevel"),
         Cylinder(),
         Cylinder(grousers=7, grouser_height=0.02, grouser_thickness=0.01),
     ],
-    ids=["box", "cylinder", "grousers"],
+    ids=["box", "plate", "cylinder", "grousers"],
 )
 def test_the_normal_is_the_gradient_of_the_distance(body):
     """Wherever one face is clearly the nearest; the distance never changes faster than the place."""
@@ -127,6 +136,23 @@ def test_a_mesh_of_a_box_is_the_box(tmp_path, real):
     np.testing.assert_allclose(distance, exact, atol=2e-6)
     agree = np.linalg.norm(normal - exact_normal, axis=1) < 1e-3
     assert agree.mean() > 0.98  # elsewhere two faces are equally near
+
+
+@pytest.mark.parametrize("rake", [-40.0, 20.0, None], ids=["forward", "back", "bevel"])
+def test_a_mesh_of_a_plate_is_the_plate(tmp_path, rake):
+    plate = Plate(thickness=0.1, width=0.2, length=0.3, edge="bevel")
+    if rake is not None:
+        plate = replace(plate, edge="level").level_at(about_y(-math.radians(rake)))
+    ring = [(k, (k + 1) % 4, 4 + (k + 1) % 4, 4 + k) for k in range(4)]
+    file = write_obj(tmp_path / "plate.obj", plate.corners, [(0, 1, 2, 3), (7, 6, 5, 4), *ring])
+    mesh, points = (
+        MeshBody(file=str(file), origin="file"),
+        np.random.default_rng(2).uniform(-0.2, 0.2, (500, 3)),
+    )
+    normal, distance = distances(plate, points)
+    mesh_normal, expected = distances(mesh, points - mesh.centre, margin=0.5)
+    np.testing.assert_allclose(distance, expected, atol=2e-6)
+    assert (np.linalg.norm(normal - mesh_normal, axis=1) < 1e-3).mean() > 0.98
 
 
 def test_points_far_from_a_mesh_are_not_looked_up(tmp_path):

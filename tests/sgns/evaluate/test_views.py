@@ -8,9 +8,10 @@ import pytest
 from matplotlib.colors import Normalize, to_rgb
 from scipy.spatial import ConvexHull
 
+from mpm_warp.bodies import Plate
 from mpm_warp.motions import sinkage
 from mpm_warp.poses import rotation_matrices
-from mpm_warp.scenes import Wheel
+from mpm_warp.scenes import Excavation, Wheel
 from sgns import plot
 from sgns.data.run import Run, particle_spacing
 from sgns.evaluate import figures
@@ -249,6 +250,17 @@ def test_a_wheel_is_its_rims_and_from_the_side_a_circle():
     assert np.abs(corners[:, 1]) == pytest.approx(0.04)
     assert area(hull_triangles(corners)) == pytest.approx(np.pi * 0.15 * (0.08 + 0.075), rel=0.01)
     assert np.linalg.norm(body_silhouette(run, 0)[0] - REST[0, [0, 2]], axis=1) == pytest.approx(0.075)
+
+
+@pytest.mark.parametrize("edge", ["level", "bevel"])
+def test_a_plate_is_drawn_with_its_edge(edge):
+    scene = Excavation(blade=Plate(edge=edge), rake=30.0, depth=0.06)
+    run = SimpleNamespace(scene=scene.to_dict(), pose=scene.body_poses(), mesh=None)
+    for frame in (0, 100):
+        (outline,) = body_silhouette(run, frame)
+        assert outline[:, 1].min() == pytest.approx(scene.lowest_points(run.pose[[frame]])[0])
+        low = np.sort(outline[:, 1])[:2]
+        assert np.ptp(low) == pytest.approx(0.0 if edge == "level" else 0.028, abs=1e-9)
 
 
 def test_a_turned_wheel_is_from_the_side_as_wide_as_it_is_thick():
