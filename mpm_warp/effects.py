@@ -45,6 +45,11 @@ class Effects(Settings):
     separation: bool = setting(
         True, "soil below its critical density carries no stress", note="soil may carry tension"
     )
+    cohesion: bool = setting(
+        True,
+        "soil holds together with material.cohesion (where that is above 0)",
+        note="soil without cohesion",
+    )
     symmetry: bool = setting(False, "half the bed is computed and mirrored", note="the whole bed is computed")
     torque: bool = setting(True, "the torque on the body is recorded", note="no torque is recorded")
 
@@ -61,6 +66,11 @@ class Effects(Settings):
                     f"effects.{name} needs effects.rate_dependence: the fluidity is what the rate law mu(I) leads to; "
                     f"set effects.rate_dependence=true or effects.{name}=false"
                 )
+
+    @property
+    def can_tear(self) -> bool:
+        """Whether soil bears tension until it tears."""
+        return self.cohesion and self.separation
 
     def described(self) -> dict[str, dict[str, bool | str]]:
         """Each effect with its state and the reason, as stored in a run file."""
@@ -97,7 +107,7 @@ def expected_flow(scene: Scene) -> Flow | None:
     """The flow with the largest inertial number; None where the soil stays at rest.
 
     With the speed V and the thickness l of the flowing layer I = (V / l) d sqrt(rho_s / p) at the pressure
-    p = rho g l of soil as deep as the layer.
+    p = rho g l of soil as deep as the layer, and that of its cohesion.
     """
     found = [flow for flow in (_of_body(scene), _of_column(scene), _of_slope(scene)) if flow]
     return max(found, key=lambda flow: flow.inertial_number, default=None)
@@ -107,7 +117,7 @@ def _sheared(scene: Scene, cause: str, speed: float, thickness: float) -> Flow:
     material = scene.material
     # No layer on a grid is thinner than one spacing.
     thickness = min(max(thickness, scene.bed.spacing), scene.bed.size[2])
-    pressure = material.bulk_density * scene.gravity * thickness
+    pressure = material.bulk_density * scene.gravity * thickness + material.cohesive_pressure
     inertial = math.inf
     if pressure > 0.0:
         inertial = speed / thickness * material.grain_diameter * math.sqrt(material.grain_density / pressure)
@@ -142,9 +152,16 @@ def _of_column(scene: Scene) -> Flow | None:
 
 
 def _of_slope(scene: Scene) -> Flow | None:
-    """On a slope steeper than atan mu_s the steady flow with mu(I) = tan(slope); there is none beyond atan mu_2."""
+    """On a slope steeper than atan mu_s the steady flow with mu(I) = tan(slope); there is none beyond atan mu_2.
+
+    Cohesion carries a part of it: at the base tau / (p + p_c) is less than tan(slope).
+    """
     material, slope, thickness = scene.material, abs(math.tan(math.radians(scene.tilt))), scene.bed.size[2]
     if slope <= material.static_friction or scene.gravity == 0.0:
+        return None
+    across = material.bulk_density * scene.gravity * math.cos(math.radians(scene.tilt)) * thickness
+    slope *= across / (across + material.cohesive_pressure)
+    if slope <= material.static_friction:
         return None
     inertial = material.inertial_number(slope)
     if math.isinf(inertial):  # what accelerates for ever is taken as fast as free fall through the layer
@@ -216,6 +233,7 @@ def effects_for(
         "fluidity": _fluidity(scene, flow),
         "nonlocality": _nonlocality(scene, flow, tolerances),
         "separation": Decision(True, "the surface is free: soil near it can come apart"),
+        "cohesion": _cohesion(scene),
         "symmetry": Decision(
             asymmetric is None,
             asymmetric or "bed, body and motion are their own mirror image about mid-width",
@@ -285,6 +303,11 @@ def _nonlocality(scene: Scene, flow: Flow | None, tolerances: Tolerances) -> Dec
     return _against("tolerance.reach", reach, tolerances.reach, words)
 
 
+def _cohesion(scene: Scene) -> Decision:
+    cohesion = scene.material.cohesion
+    return Decision(cohesion > 0.0, f"material.cohesion is {cohesion:g} Pa", cohesion)
+
+
 def _free_body(scene: Scene) -> Decision:
     if scene.axle is not None:
         return Decision(
@@ -296,6 +319,8 @@ def _free_body(scene: Scene) -> Decision:
 def _require_possible(scene: Scene, asked: Mapping[str, bool | str]) -> None:
     if asked["symmetry"] is True:
         require_symmetry(scene)
+    if asked["cohesion"] is True and scene.material.cohesion == 0.0:
+        raise SceneError("effects.cohesion needs material.cohesion above 0 Pa; or set effects.cohesion=auto")
     if asked["torque"] is True and scene.body is None:
         raise SceneError("effects.torque needs a body and this scene has none; set effects.torque=auto")
     if asked["free_body"] is True and scene.axle is None:

@@ -17,12 +17,21 @@ FRICTION_MAPS: dict[str, Callable[[float], float]] = {
 """mu_s of an angle [rad] such that the cone and the Mohr-Coulomb criterion agree in one kind of loading: `tan` in
 simple shear, `sin` in plane strain, `triaxial` in triaxial compression. In other kinds they differ."""
 
+SINES: dict[str, Callable[[float], float]] = {
+    "tan": lambda mu: mu / math.hypot(1.0, mu),
+    "sin": lambda mu: mu,
+    "triaxial": lambda mu: 3.0 * mu / (2.0 * math.sqrt(3.0) + mu),
+}
+"""sin phi of mu_s, the other way round; 1 or more where no angle has that mu_s."""
+
 
 def static_friction(angle: float, friction_map: str = "tan") -> float:
     """mu_s [-] of soil with friction angle `angle` [degrees], between 0 and 90."""
     return FRICTION_MAPS[friction_map](math.radians(angle))
 
 
+MOST_STRETCH = 0.05
+"""Largest ln J of soil that holds together: the elastic law is meant for small strains."""
 FRICTION_RANGE = 0.2016
 """mu_2 - mu_s of the paper's sand: what the limit friction is set above a static friction that reaches it."""
 
@@ -33,7 +42,7 @@ def _positive(default: float, words: str, unit: str = "") -> Any:
 
 @settings
 class Material(Settings):
-    """Dry granular soil: Hencky elasticity with rate-dependent friction mu(I) and its fluidity.
+    """Granular soil: Hencky elasticity with rate-dependent friction mu(I), its fluidity, and cohesion.
 
     The defaults are the sand of the paper's excavation runs (A. Haeri, K. Skonieczny) except for the
     stiffness: 1 MPa instead of 15 MPa, which makes the explicit step almost four times longer.
@@ -50,6 +59,12 @@ class Material(Settings):
     packing: float = setting(0.67, "solid volume fraction at the critical density", ge=0.05, le=1)
     grain_diameter: float = _positive(3.0e-4, "d", "m")
     static_friction: float = setting(0.76, "mu_s, where flow begins; friction_angle goes before it", gt=0)
+    cohesion: float = setting(
+        0.0,
+        "c: shear strength of soil without pressure, with the angle that friction_map gives mu_s",
+        "Pa",
+        ge=0,
+    )
     limit_friction: float = setting(0.9616, "mu_2: the ratio approached in very fast flow")
     reference_inertial_number: float = _positive(0.278, "I_0 of the rate law")
     rate_law: Literal["saturating", "linear"] = setting(
@@ -84,6 +99,24 @@ class Material(Settings):
                 f"({self.static_friction})"
             )
 
+        if self.cohesion > 0.0:
+            self._check_cohesion()
+
+    def _check_cohesion(self) -> None:
+        if SINES[self.friction_map](self.static_friction) >= 1.0:
+            raise SceneError(
+                f"material.cohesion needs an angle of friction, and with material.friction_map={self.friction_map} no "
+                f"angle has a static friction of {self.static_friction:g}: lower material.static_friction or set "
+                "material.friction_map=tan"
+            )
+        if self.cohesive_pressure > MOST_STRETCH * self.bulk_modulus:
+            enough = self.youngs_modulus * self.cohesive_pressure / (MOST_STRETCH * self.bulk_modulus)
+            raise SceneError(
+                f"material.cohesion is {self.cohesion:g} Pa: soil as soft as material.youngs_modulus "
+                f"{self.youngs_modulus:g} Pa would stretch by more than {100.0 * MOST_STRETCH:g} % before it tears; "
+                f"raise material.youngs_modulus to {enough:.3g} Pa or more"
+            )
+
     def _apply_friction_angle(self, angle: float) -> None:
         """Set mu_s, and mu_2 where it must follow, and keep what to tell the user."""
         found = static_friction(angle, self.friction_map)
@@ -113,6 +146,12 @@ class Material(Settings):
                 "already yields under its own weight (K0 condition)"
             )
         return found
+
+    @property
+    def cohesive_pressure(self) -> float:
+        """p_c = c cot(phi) [Pa]: cohesion is like so much more pressure between the grains, tau <= mu (p + p_c)."""
+        sine = SINES[self.friction_map](self.static_friction)
+        return self.cohesion * math.sqrt(1.0 - sine**2) / sine if self.cohesion > 0.0 else 0.0
 
     @property
     def bulk_density(self) -> float:

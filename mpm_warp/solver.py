@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Generator, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice, repeat
 from typing import Any
 
@@ -83,6 +83,8 @@ class Solver:
             raise SceneError(f"precision is {precision!r}; allowed: {', '.join(PRECISIONS)}")
         self.scene = scene
         self.effects = effects or Effects()
+        if scene.material.cohesion == 0.0:
+            self.effects = replace(self.effects, cohesion=False)
         self.device = find_device(device)
         self._real = PRECISIONS[precision]
         if not (isinstance(threads, int) and 1 <= threads <= MOST_THREADS):
@@ -208,6 +210,7 @@ class Solver:
             swelling=n,
             fluidity=n if effects.fluidity else 0,
             excess=n if effects.nonlocality else 0,
+            bond=np.full(n if effects.can_tear else 0, scene.material.cohesive_pressure / bulk),
         )
         """The arrays of the particles that are computed, see kernels/grid.py."""
         self._velocity, self._before = (zeros(vec4, padded) for _ in range(2))
@@ -236,6 +239,7 @@ class Solver:
         """What a frame leaves to the next one; the grid is filled anew at every remap."""
         names = ["position", "velocity", "felt_velocity", "velocity_gradient", "elastic_strain", "log_volume"]
         names += ["stress", "swelling", *(["fluidity"] if self.effects.fluidity else [])]
+        names += ["bond"] if self.effects.can_tear else []
         arrays = {name: getattr(self.particles, name) for name in names}
         arrays |= {f"turns_{'xyz'[axis]}": turns for axis, turns in self._turns.items()}
         if self.effects.nonlocality:

@@ -137,7 +137,12 @@ def force_per_width(scene: BuriedBlade) -> tuple[float, float]:
 
 
 def wedge(
-    angle: float, rake: float, depth: float, width: float = math.inf, swept: float | None = None
+    angle: float,
+    rake: float,
+    depth: float,
+    width: float = math.inf,
+    swept: float | None = None,
+    cohesion: float = 0.0,
 ) -> tuple[float, float]:
     """Force on the blade per metre, against the motion and downwards [N/m], by McKyes and Ali (1977).
 
@@ -150,6 +155,7 @@ def wedge(
         depth: [m].
         width: of the blade [m]; infinite: the wedge alone.
         swept: soil swept up per metre of blade [m^2]; None: that of the travel before the force is measured.
+        cohesion: of the soil, on the wedge's plane only: for an infinite width [Pa].
     """
     swept = depth * float(np.mean(MEASURED)) if swept is None else swept
     soil = Material()
@@ -160,8 +166,10 @@ def wedge(
     ahead = 1.0 / math.tan(lean) + 1.0 / np.tan(plane)  # length of the wedge at the surface, in depths
     aside = np.sqrt(ahead**2 - 1.0 / math.tan(lean) ** 2)  # reach of the cones to the side, in depths
     weight = 0.5 * ahead * (1.0 + 2.0 * aside * depth / (3.0 * width)) + swept / depth**2
+    unit = soil.bulk_density * Scene().gravity
+    weight = weight + cohesion / (unit * depth) * math.cos(phi) / (np.sin(plane) * np.sin(plane + phi))
     least = np.min(weight / (math.cos(turned) + math.sin(turned) / np.tan(plane + phi)))
-    force = soil.bulk_density * Scene().gravity * depth**2 * least
+    force = unit * depth**2 * least
     return force * math.sin(turned), force * math.cos(turned)
 
 

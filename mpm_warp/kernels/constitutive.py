@@ -5,6 +5,9 @@ State per particle: the deviatoric part e of the elastic spatial log (Hencky) st
 keeps volume, so the elastic volume strain is ln J itself and the pressure is p = -K ln J. Both are small
 numbers stored as such, which is what keeps float32 accurate: a bed at rest strains by 1e-4.
 
+Cohesion holds grains together as a pressure p_c does: p + p_c then stands for p in yield and flow. Soil bears tension
+until it yields; then it tears, and bears none until it is compressed again.
+
 The trial strain is half the log of b = (I + A) exp(2 e) (I + A)^T with A = dt L, without a decomposition on the
 hot path. There are three ranges, by the size s of e and A (Frobenius norm of both):
 
@@ -42,16 +45,18 @@ def constitutive(real: type, effects: "Effects") -> SimpleNamespace:
     - `strain_trial(e, A)` -> deviatoric trial strain (6),
     - `volume_step(A)` -> ln det(I + A),
     - `yield_stress(tau_trial, p, dt, soil)` -> equivalent shear stress after the plastic return,
-    - `update(e, ln_j, A, dt, soil, g)` -> new e (6), ln J and g as an 8-vector. `g` means something with two effects:
-      with `nonlocality` alone the excess of the fluidity over its local value, which stays; with `fluidity` the
-      particle's fluidity [1/s],
-    - `kirchhoff(e, ln_j, soil)` -> Kirchhoff stress (3 x 3) [Pa].
+    - `update(e, ln_j, A, dt, soil, g, bond)` -> new e (6), ln J and g as an 8-vector, where it can tear the bond as a
+      ninth number. `g` means something with two effects: with `nonlocality` alone the excess of the fluidity over its
+      local value, which stays; with `fluidity` the particle's fluidity [1/s]. `bond` is the ln J up to which soil
+      bears stress: p_c / K, 0 where it is torn and without cohesion,
+    - `kirchhoff(e, ln_j, bond, soil)` -> Kirchhoff stress (3 x 3) [Pa].
     """
     vec3 = wp.types.vector(3, real)
     vec6 = wp.types.vector(6, real)
     mat33 = wp.types.matrix((3, 3), real)
     Soil = soil_struct(real)
-    State = wp.types.vector(8, real)
+    can_tear = effects.can_tear
+    State = wp.types.vector(9 if can_tear else 8, real)
     fluid = fluidity(real)
     coefficients, fluidity_step = fluid.coefficients, fluid.fluidity_step
     friction_with_excess = fluid.friction_with_excess
@@ -202,8 +207,11 @@ def constitutive(real: type, effects: "Effects") -> SimpleNamespace:
         return s0
 
     @wp.func
-    def state_of(e: vec6, ln_j: real, g: real):
-        return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j, g)
+    def state_of(e: vec6, ln_j: real, g: real, bond: real):
+        if wp.static(can_tear):
+            return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j, g, bond)
+        else:
+            return State(e[0], e[1], e[2], e[3], e[4], e[5], ln_j, g)
 
     @wp.func
     def separated_fluidity(a: mat33, dt: real, soil: Soil):
@@ -211,17 +219,29 @@ def constitutive(real: type, effects: "Effects") -> SimpleNamespace:
         return wp.sqrt(real(2.0) * norm_squared(deviator(symmetric(a)))) / (dt * soil.static_friction)
 
     @wp.func
-    def update(e: vec6, ln_j: real, a: mat33, dt: real, soil: Soil, g: real):
+    def holds(e: vec6, ln_j: real, soil: Soil):
+        # Whether soil in tension stays within the cone.
+        strength = soil.static_friction * (soil.cohesive_pressure - soil.bulk_modulus * ln_j)
+        return soil.shear_modulus * wp.sqrt(real(2.0) * norm_squared(e)) < strength
+
+    @wp.func
+    def update(e: vec6, ln_j: real, a: mat33, dt: real, soil: Soil, g: real, bond: real):
         new_ln_j = ln_j + volume_step(a)
         new_g = g
         if wp.static(effects.separation):
-            if new_ln_j >= real(0.0):
+            loose = new_ln_j >= bond
+            if wp.static(can_tear):
+                if new_ln_j >= real(0.0) and new_ln_j < bond:
+                    loose = not holds(strain_trial(e, a), new_ln_j, soil)
+            if loose:
                 if wp.static(effects.fluidity):
                     new_g = separated_fluidity(a, dt, soil)
-                return state_of(vec6(), new_ln_j, new_g)
+                return state_of(vec6(), new_ln_j, new_g, real(0.0))
         t = strain_trial(e, a)
         if wp.static(effects.yielding):
             p = -soil.bulk_modulus * new_ln_j
+            if wp.static(effects.cohesion):
+                p += soil.cohesive_pressure
             if p <= real(0.0):
                 t = vec6()
             else:
@@ -241,12 +261,12 @@ def constitutive(real: type, effects: "Effects") -> SimpleNamespace:
                 else:
                     if tau > soil.static_friction * p:
                         t = t * (yield_stress(tau, p, dt, soil) / tau)
-        return state_of(t, new_ln_j, new_g)
+        return state_of(t, new_ln_j, new_g, soil.cohesive_pressure / soil.bulk_modulus)
 
     @wp.func
-    def kirchhoff(e: vec6, ln_j: real, soil: Soil):
+    def kirchhoff(e: vec6, ln_j: real, bond: real, soil: Soil):
         if wp.static(effects.separation):
-            if ln_j >= real(0.0):
+            if ln_j >= bond:
                 return mat33()
         return real(2.0) * soil.shear_modulus * full(e) + wp.diag(vec3(soil.bulk_modulus * ln_j))
 
@@ -268,14 +288,14 @@ LOOSE, DENSE = 0.9, 0.98
 """Shares of an undisturbed bed's density between which a node comes to count as dense: at rest it does, whatever
 the round-off, and nothing jumps where soil comes apart."""
 APART = 0.005
-"""ln J from which on soil has no say at all in the mean volume change."""
+"""ln J above its bond from which on soil has no say at all in the mean volume change."""
 
 
 @cache
 def loose_soil(real: type) -> SimpleNamespace:
-    """Warp functions in precision `real` for particles with ln J > 0, which bear no stress:
+    """Warp functions in precision `real` for particles whose ln J is above their bond, which bear no stress:
 
-    - `apart(ln_j)`: 0 for dense soil to 1 for soil that is loose for good,
+    - `apart(above)`: 0 for dense soil to 1 for soil that is loose for good, by ln J above its bond,
     - `volume(ln_j, first, f, nodes, grid)`: its ln J.
 
     `first` is the lowest of its 27 nodes, `f` its offset from there [cells], and the fourth number of `nodes` is the
@@ -291,8 +311,8 @@ def loose_soil(real: type) -> SimpleNamespace:
         return wp.clamp((x - low) / (high - low), real(0.0), real(1.0))
 
     @wp.func
-    def apart(ln_j: real):
-        return ramp(ln_j, real(0.0), real(APART))
+    def apart(above: real):
+        return ramp(above, real(0.0), real(APART))
 
     @wp.func
     def volume(ln_j: real, first: int, f: vec3, nodes: wp.array(dtype=vec4), grid: Grid):

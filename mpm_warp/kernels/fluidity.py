@@ -20,6 +20,7 @@ def soil_struct(real: type) -> type:
         bulk_modulus: real
         static_friction: real
         limit_friction: real
+        cohesive_pressure: real  # p_c
         reference_rate: real  # I_0 sqrt(1 / rho_s) / d: G dt reference_rate sqrt(p) is the paper's alpha
         reference_inertial_number: real
         linear_rate_law: int  # 1: linear, 0: saturating
@@ -38,6 +39,7 @@ def soil_parameters(real: type, material: Material, bed_size: float) -> Any:
     soil = soil_struct(real)()
     soil.shear_modulus, soil.bulk_modulus = material.shear_modulus, material.bulk_modulus
     soil.static_friction, soil.limit_friction = material.static_friction, material.limit_friction
+    soil.cohesive_pressure = material.cohesive_pressure
     soil.reference_rate = material.reference_inertial_number / (
         material.grain_diameter * math.sqrt(material.grain_density)
     )
@@ -50,7 +52,7 @@ def soil_parameters(real: type, material: Material, bed_size: float) -> Any:
 
 
 # --- The granular fluidity g = (rate of plastic shear) / mu at a single particle, as Warp functions -----
-# Written with mu = tau / p and, for one step,
+# Written with mu = tau / p (p + p_c for p in cohesive soil) and, for one step,
 #
 #     a = G dt / p          so that the stress with fluidity g is mu = mu_trial / (1 + a g),
 #     c = I_0 sqrt(p / rho_s) / d,

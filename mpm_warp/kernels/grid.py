@@ -62,6 +62,7 @@ def particle_struct(real: type) -> type:
         swelling: wp.array(dtype=real)  # sum of the recent volume changes
         fluidity: wp.array(dtype=real)  # [1/s], with the effect `fluidity`
         excess: wp.array(dtype=real)  # fluidity that cooperative flow adds [1/s], with `nonlocality`
+        bond: wp.array(dtype=real)  # ln J up to which soil bears stress, with `cohesion` and `separation`
 
     return Particles
 

@@ -96,6 +96,11 @@ def nonlocal_kernels(real: type, effects: "Effects") -> SimpleNamespace:
     def source(p: int, particles: Particles, dt: real, soil: Soil):
         # Weight 1, g and s of a dense particle; all 0 for one without stress.
         pressure = -soil.bulk_modulus * particles.log_volume[p]
+        if wp.static(effects.cohesion):
+            pressure += soil.cohesive_pressure
+            if wp.static(effects.can_tear):
+                if particles.log_volume[p] >= particles.bond[p]:
+                    return vec3()
         if pressure <= real(0.0):
             return vec3()
         if wp.static(effects.fluidity):

@@ -46,7 +46,7 @@ def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, ato
     Particles, vec4s, reals, ints = particle_struct(real), *(wp.array(dtype=t) for t in (vec4, real, int))
     with_body = contact_law is not None
     push = contact(real, contact_law or ContactLaw(), atomic)
-    update, kirchhoff = law.update, law.kirchhoff
+    update, kirchhoff, can_tear = law.update, law.kirchhoff, effects.can_tear
     fading = fluidity(real).fading
     apart, loose_volume = loose_soil(real).apart, loose_soil(real).volume
     spline = splines(real)
@@ -67,6 +67,13 @@ def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, ato
             fault[1] = p
             fault[2] = substep
             fault[3] = near_home
+
+    @wp.func
+    def bond_of(p: int, particles: Particles):
+        if wp.static(can_tear):
+            return particles.bond[p]
+        else:
+            return real(0.0)
 
     @wp.func
     def part(p: int, grid: Grid):
@@ -202,27 +209,33 @@ def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, ato
         # large, and shared out they would compress the dense soil that it falls on.
         recent = particles.swelling[p]
         mean = particles.felt_velocity[p][3]
+        bond = bond_of(p, particles)
         averaged = grid.volume_averaging * grid.forgetting * (mean - recent)
         if wp.static(effects.separation):
-            averaged *= real(1.0) - apart(particles.log_volume[p])
+            averaged *= real(1.0) - apart(particles.log_volume[p] - bond)
         volume_before = particles.log_volume[p] + averaged
-        state = update(before, volume_before, grid.dt * particles.velocity_gradient[p], grid.dt, soil, g)
+        state = update(
+            before, volume_before, grid.dt * particles.velocity_gradient[p], grid.dt, soil, g, bond
+        )
         after = vec6(state[0], state[1], state[2], state[3], state[4], state[5])
         particles.elastic_strain[p] = after
         particles.log_volume[p] = state[6]
+        if wp.static(can_tear):
+            particles.bond[p] = state[8]
+            bond = state[8]
         changes = (real(1.0) - grid.forgetting) * recent + state[6] - volume_before
         if wp.static(effects.separation):
             mean = (real(1.0) - grid.forgetting) * mean
-            changes += apart(wp.max(volume_before, state[6])) * (mean - changes)
+            changes += apart(wp.max(volume_before, state[6]) - bond) * (mean - changes)
         particles.swelling[p] = changes
         if wp.static(effects.fluidity):
             particles.fluidity[p] = state[7]
         # Viscosity of the elastic strain: it damps waves that the grid hardly resolves and leaves steady flow alone. It
-        # takes away at most half of the pressure, since soil can bear no tension.
+        # takes away at most half of the pressure, since soil can bear no tension, or no more than its bond.
         volume = state[6] + grid.damping * (state[6] - volume_before)
         if wp.static(effects.separation):
-            volume = wp.where(state[6] < real(0.0), wp.min(volume, real(0.5) * state[6]), state[6])
-        t = kirchhoff(after + grid.damping * (after - before), volume, soil)
+            volume = wp.where(state[6] < bond, wp.min(volume, real(0.5) * (state[6] + bond)), state[6])
+        t = kirchhoff(after + grid.damping * (after - before), volume, bond, soil)
         particles.stress[p] = vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])
 
     @wp.func
@@ -251,7 +264,7 @@ def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, ato
         particles.position[p] = within_walls(particles.position[p], grid)
         ln_j = particles.log_volume[p]
         if wp.static(effects.separation):
-            if ln_j > real(0.0):
+            if ln_j > bond_of(p, particles):
                 first = node_index(base, 0, 0, grid)
                 particles.log_volume[p] = loose_volume(ln_j, first, f, before, grid)
         v = particles.velocity[p]

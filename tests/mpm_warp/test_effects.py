@@ -102,7 +102,7 @@ def test_slopes_that_rest_and_that_accelerate():
 
 def test_a_cut_in_the_papers_sand():
     effects, decisions = effects_for(cut(duration=0.5))
-    assert effects == Effects(rate_dependence=False, symmetry=True)
+    assert effects == Effects(rate_dependence=False, cohesion=False, symmetry=True)
     assert list(decisions) == list(EFFECTS)
     assert decisions["nonlocality"].number == pytest.approx(0.48 * 3e-4 / 0.02)
     assert "A d is 0.0072 grid spacings, below tolerance.grid 3 %" in decisions["nonlocality"].reason
@@ -153,7 +153,7 @@ def test_what_needs_another_brings_it_or_goes_with_it():
     assert not effects.nonlocality
     assert decisions["nonlocality"].reason == "it needs effects.rate_dependence, which is off"
     assert effects_for(slope(), {"yielding": False})[0] == Effects(
-        yielding=False, rate_dependence=False, torque=False
+        yielding=False, rate_dependence=False, cohesion=False, torque=False
     )
 
 
@@ -169,6 +169,7 @@ def test_what_is_asked_for_is_done_and_says_what_auto_would_do():
     [
         (slope(), {"symmetry": True}, "effects.symmetry needs .*periodic in y"),
         (COLUMN, {"torque": True}, "effects.torque needs a body"),
+        (COLUMN, {"cohesion": True}, "effects.cohesion needs material.cohesion above 0 Pa"),
         (
             cut(),
             {"free_body": True},
@@ -185,13 +186,26 @@ def test_what_a_scene_cannot_have_is_refused(scene, asked, words):
         effects_for(scene, asked)
 
 
+def test_cohesion_is_on_where_the_soil_has_some():
+    """And holds a slope that is steeper than its friction: nothing flows there."""
+    damp = replace(COLUMN, material=replace(COLUMN.material, cohesion=500.0))
+    effects, decisions = effects_for(damp)
+    assert effects.cohesion and decisions["cohesion"].reason == "material.cohesion is 500 Pa"
+    assert not effects_for(COLUMN)[0].cohesion
+    assert not effects_for(damp, {"cohesion": False})[0].cohesion
+    dry, held = (expected_flow(slope(material=replace(BEADS, cohesion=c))) for c in (0.0, 500.0))
+    assert dry is not None and held is None
+    assert expected_flow(damp).inertial_number < expected_flow(COLUMN).inertial_number
+
+
 # --- what is off costs nothing ----------------------------------------------------------------------------------
 
 SHEARED = cut(duration=0.05)
+DAMP = replace(SHEARED, material=Material(cohesion=500.0))
 
 
 def source(effects: Effects, kernel: str) -> str:
-    found = next(k for k in launches(Solver(SHEARED, effects)) if k.kernel.name == kernel)
+    found = next(k for k in launches(Solver(DAMP, effects)) if k.kernel.name == kernel)
     return compiled_source(found)
 
 
@@ -203,6 +217,7 @@ def source(effects: Effects, kernel: str) -> str:
         (Effects(fluidity=True), Effects(), "material", "fluidity_step"),
         (Effects(nonlocality=True), Effects(), "material", "friction_with_excess"),
         (Effects(), Effects(separation=False), "material", "where"),
+        (Effects(), Effects(cohesion=False), "material", "holds"),
         (Effects(), Effects(torque=False), "scatter", "cross"),
     ],
 )
@@ -229,6 +244,9 @@ def test_no_array_of_what_is_off():
         "to_grid", "begin", "scatter", "step", "gather", "material", "from_grid"
     ]  # fmt: skip
     assert {"fold", "unfold"} <= {k.kernel.name for k in launches(halved)}
+    damp = Solver(DAMP)
+    assert (len(plain.particles.bond), len(damp.particles.bond)) == (0, 3840)
+    assert len(Solver(DAMP, Effects(cohesion=False)).particles.bond) == 0
     column = Solver(COLUMN, effects_for(COLUMN)[0])
     assert column.body is None
 

@@ -1,12 +1,13 @@
 """Soil parameters: friction maps, their limits, cooperativity length."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mpm_warp import Material
+from mpm_warp import Material, SceneError
 from mpm_warp.material import static_friction
 from sgns_testing.scenes import cut
 
@@ -48,6 +49,35 @@ def test_limit_friction_is_raised_above_the_static_one(angle, name):
     (warning,) = soil.warnings()
     assert "the limit is raised to" in warning
     assert cut(material=soil).warnings() == [warning]
+
+
+@pytest.mark.parametrize("angle", [20.0, 37.2, 45.0])
+@pytest.mark.parametrize("name", ["tan", "sin", "triaxial"])
+def test_cohesive_pressure_is_c_cot_phi(angle, name):
+    """Where the cone ends: in every map the pressure that would give dry soil the strength c."""
+    soil = Material(friction_angle=angle, friction_map=name, cohesion=500.0)
+    assert soil.cohesive_pressure == pytest.approx(500.0 / math.tan(math.radians(angle)))
+    alike = Material(
+        static_friction=soil.static_friction, limit_friction=2.0, friction_map=name, cohesion=500.0
+    )
+    assert alike.cohesive_pressure == pytest.approx(soil.cohesive_pressure)
+    assert Material(friction_angle=angle, friction_map=name).cohesive_pressure == 0.0
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"cohesion": -1.0}, "material.cohesion is -1"),
+        ({"cohesion": 1e5}, "raise material.youngs_modulus to 3.16e+06 Pa or more"),
+        (
+            {"cohesion": 1.0, "static_friction": 1.1, "limit_friction": 1.3, "friction_map": "sin"},
+            "no angle has a static friction of 1.1",
+        ),
+    ],
+)
+def test_cohesion_that_cannot_be_is_refused(values, words):
+    with pytest.raises(SceneError, match=re.escape(words)):
+        Material(**values)
 
 
 def test_a_friction_that_is_not_used_is_named():

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import cohesion
 import mckyes
 import numpy as np
 import passive
@@ -114,3 +115,29 @@ def test_times_of_the_numerics_follow_grains_and_gravity():
     in_seconds = replace(finer, remap_time=0.0, velocity_memory=0.3)
     assert (in_seconds.remap_limit, in_seconds.memory_time) == (0.0, 0.3)
     assert replace(scene, gravity=0.0).remap_limit == 4.0e-3  # as on Earth
+
+
+def test_a_column_bears_its_unconfined_strength():
+    """2 c cos(phi) / (1 - sin(phi)), with the map that agrees in compression."""
+    scene = cohesion.pressed_column(1000.0)
+    assert cohesion.strength(scene) == pytest.approx(cohesion.unconfined(1000.0), rel=0.04)
+
+
+@pytest.mark.parametrize(("height", "stands"), [(0.48, True), (1.1, False)])
+def test_a_bank_stands_below_its_lower_bound_and_falls_above_the_upper(height, stands):
+    """Heights in 4 c / gamma tan(45 + phi / 2), the upper bound; half of it is the lower."""
+    moved = cohesion.settlement(cohesion.bank(height, cells=12))
+    assert moved < 0.005 if stands else moved > 0.3
+
+
+def test_cohesion_raises_the_draft_as_the_equation_says():
+    found, known = cohesion.cohesive_draft(0.0, 1000.0, 0.02)
+    assert found == pytest.approx(known, rel=0.15)
+
+
+def test_the_wedge_of_weightless_cohesive_soil():
+    """The least of c d cos(phi) / (sin(b) sin(a + b)), a the rake from horizontal and both angles of friction."""
+    phi, rake, depth, c = 30.0, 10.0, 0.1, 1e8
+    angle = math.radians(90.0 - rake + phi) + mckyes.WALL_ANGLE
+    least = 2.0 * c * depth * math.cos(math.radians(phi)) / (1.0 + math.cos(angle))
+    assert math.hypot(*mckyes.wedge(phi, rake, depth, cohesion=c)) == pytest.approx(least, rel=1e-3)

@@ -34,6 +34,8 @@ CHANGES = (
 )
 """Keys of the scene that may change half-way: how it is computed, not what it is."""
 _FILE = "scene.tool.file"
+_LATER = ("cohesion",)
+"""Effects that earlier run files do not name: their soil had none."""
 _OTHERS = (
     "continue_from",
     "output",
@@ -181,7 +183,8 @@ def _read_stopped(path: Path) -> Restart:
 
 def _effects(reasons: Mapping[str, Any], path: Path) -> Effects:
     try:  # some of what is recorded follows from the scene and is no choice
-        return Effects(**{effect.name: bool(reasons[effect.name]["on"]) for effect in fields(Effects)})
+        names = [one.name for one in fields(Effects) if one.name in reasons or one.name not in _LATER]
+        return Effects(**{name: bool(reasons[name]["on"]) for name in names})
     except (TypeError, KeyError) as error:
         raise UserError(f"{path}: its effects are damaged ({error}); repeat the run") from None
 

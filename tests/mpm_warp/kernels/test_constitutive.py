@@ -118,3 +118,76 @@ def test_separated_soil_has_no_stress_and_forgets_its_strain():
     found, ln_j, _ = updated(SAND, strain, -1e-3, a, 1e-4)
     assert ln_j[0] > 0
     assert not found.any()
+
+
+# --- cohesion ---------------------------------------------------------------------------------------------------
+
+ANGLE = 35.0
+DAMP = replace(SAND, friction_angle=ANGLE, friction_map="triaxial", cohesion=1000.0)
+STATIC = Effects(rate_dependence=False)
+
+
+def along_an_axis(stress):
+    """A step that gives soil at rest this stress along z and none across [Pa], tension positive; shape (1, 3, 3)."""
+    nu = SAND.poissons_ratio
+    return stress / SAND.youngs_modulus * np.array([np.diag([-nu, -nu, 1.0])])
+
+
+def axial(strain, ln_j):
+    """Stress along z [Pa]."""
+    return 2.0 * SAND.shear_modulus * strain[0, 2, 2] + SAND.bulk_modulus * ln_j[0]
+
+
+def pulled(*stresses, effects=STATIC):
+    """What is left of these stresses along z, put on one after the other [Pa]."""
+    steps = np.array([along_an_axis(stress) for stress in stresses])
+    return axial(*updated(DAMP, NOTHING, 0.0, steps, 1e-5, effects=effects)[:2])
+
+
+def test_unconfined_strength_is_that_of_mohr_and_coulomb():
+    """2 c cos(phi) / (1 - sin(phi)), with the map that agrees in triaxial compression."""
+    phi = math.radians(ANGLE)
+    strength = 2.0 * DAMP.cohesion * math.cos(phi) / (1.0 - math.sin(phi))
+    assert pulled(-0.99 * strength) == pytest.approx(-0.99 * strength, rel=1e-3)
+    strain, ln_j, _ = updated(DAMP, NOTHING, 0.0, along_an_axis(-1.5 * strength), 1e-5, effects=STATIC)
+    effective = DAMP.cohesive_pressure - DAMP.bulk_modulus * ln_j[0]
+    assert shear_stress(DAMP, strain)[0] == pytest.approx(DAMP.static_friction * effective, rel=1e-9)
+    assert abs(axial(strain, ln_j)) < 1.4 * strength
+
+
+def test_soil_tears_where_it_yields_in_tension():
+    """tau = mu (p_c + p) with p = -T / 3 and tau = T / sqrt(3)."""
+    mu = DAMP.static_friction
+    limit = math.sqrt(3.0) * mu * DAMP.cohesive_pressure / (1.0 + mu / math.sqrt(3.0))
+    assert pulled(0.99 * limit) == pytest.approx(0.99 * limit, rel=1e-3)
+    strain, ln_j, _ = updated(DAMP, NOTHING, 0.0, along_an_axis(1.01 * limit), 1e-5, effects=STATIC)
+    assert ln_j[0] > 0.0 and not strain.any()
+
+
+def test_torn_soil_bears_no_tension_until_it_is_compressed():
+    mu = DAMP.static_friction
+    limit = math.sqrt(3.0) * mu * DAMP.cohesive_pressure / (1.0 + mu / math.sqrt(3.0))
+    torn, part, more = (along_an_axis(share * limit) for share in (1.1, -0.5, -0.7))
+    strain, ln_j, _ = updated(DAMP, NOTHING, 0.0, np.array([torn, part]), 1e-5, effects=STATIC)
+    assert 0.0 < ln_j[0] < DAMP.cohesive_pressure / DAMP.bulk_modulus and not strain.any()
+    strain, ln_j, _ = updated(DAMP, NOTHING, 0.0, np.array([torn, part, more]), 1e-5, effects=STATIC)
+    assert ln_j[0] < 0.0 and strain.any()
+    again = np.array([torn, part, more, along_an_axis(0.4 * limit)])
+    strain, ln_j, _ = updated(DAMP, NOTHING, 0.0, again, 1e-5, effects=STATIC)
+    assert ln_j[0] > 0.0 and strain.any()
+
+
+@pytest.mark.parametrize(
+    "effects", [STATIC, Effects(), Effects(fluidity=True), Effects(nonlocality=True)], ids=str
+)
+@pytest.mark.parametrize("law", ["saturating", "linear"])
+def test_cohesion_shears_like_so_much_more_pressure(effects, law):
+    """At constant volume the shear stress is that of dry soil under p + p_c, in every law of flow."""
+    damp, pressure, excess = replace(DAMP, rate_law=law), 1000.0, 0.5 if effects.nonlocality else 0.0
+    dry = replace(damp, cohesion=0.0)
+    found, known = (
+        updated(soil, NOTHING, -p / soil.bulk_modulus, sheared(1e-5), 1e-5, 300, excess, effects)[0]
+        for soil, p in ((damp, pressure), (dry, pressure + damp.cohesive_pressure))
+    )
+    assert shear_stress(dry, known)[0] > dry.static_friction * pressure
+    np.testing.assert_allclose(found, known, rtol=1e-9)

@@ -32,7 +32,7 @@ class Column:
         floor = wall_sink(self.shape, (-1, -1, grid.low[2]), (2**30,) * 3)
         self.launches = nonlocal_launches(
             solver._real,
-            effects,
+            solver.effects,
             floor * (material.fluidity_at_walls == "zero"),
             *(self.particles, grid, solver._soil, self.field, solver._cooperation),
             GhostNodes(solver._real, solver.device, grid, {}, mirrored=False),
@@ -113,6 +113,22 @@ def test_nodes_that_hardly_hold_soil_do_no_harm(effects):
     assert middle.max() > 0.1
     for beyond in np.geomspace(1e-7, 1e-5, 9):
         np.testing.assert_allclose(answer(beyond), middle, rtol=1e-3)
+
+
+def test_cohesion_is_like_so_much_more_pressure():
+    """Cooperative flow of cohesive soil is that of dry soil under p + p_c; torn soil takes no part in it."""
+    dry = soil(0.03)
+    damp = replace(dry, cohesion=500.0)
+    damp_column, dry_column = (Column(STEADY, one, height=0.1) for one in (damp, dry))
+    mu = np.where(dry_column.height < 0.05, 0.8, 0.7)
+    for column, pressure in ((damp_column, PRESSURE), (dry_column, PRESSURE + damp.cohesive_pressure)):
+        column.impose(mu * (PRESSURE + damp.cohesive_pressure) / pressure, pressure)
+        column.solve(50)
+    np.testing.assert_allclose(damp_column.nodes("g"), dry_column.nodes("g"), rtol=1e-9)
+    damp_column.particles.log_volume.fill_(1e-6)
+    damp_column.particles.bond.zero_()
+    damp_column.solve(1)
+    assert not damp_column.nodes("filled").any()
 
 
 def test_flow_reaches_into_soil_below_its_friction():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -120,8 +121,16 @@ def test_the_papers_wheel_soils(angle: int, friction: float) -> None:
     assert found.youngs_modulus == 15e6
 
 
-def test_lunar_simulant_has_the_density_and_friction_of_its_source() -> None:
+def test_damp_sand_stands_where_dry_sand_would_not() -> None:
+    found = soil("damp_sand")
+    assert (found.friction_map, found.cohesion) == ("sin", 1000.0)
+    assert found.static_friction == pytest.approx(math.sin(math.radians(36.0)))
+    assert found.limit_friction - found.static_friction == pytest.approx(0.2016, abs=1e-4)
+
+
+def test_lunar_simulant_has_the_density_friction_and_cohesion_of_its_source() -> None:
     found = soil("lunar_simulant")
     assert found.bulk_density == pytest.approx(1653.0)
+    assert found.cohesive_pressure == pytest.approx(1000.0)  # c cot 45 degrees
     assert found.static_friction == pytest.approx(1.0)
     assert found.limit_friction == pytest.approx(1.2016)
