@@ -204,6 +204,8 @@ def _reading_order(points: np.ndarray, radius: float) -> np.ndarray:
 
 MOST_HEIGHTS = 100_000
 """Of a map; the scene holds them all, and more than one in a grid spacing says nothing."""
+_STAIRS = 0.3
+"""Slope from which on the columns of a lattice are stairs whose mean height is right."""
 STEEPEST = 60.0
 """Slope of the surface as one number [degrees]."""
 
@@ -354,13 +356,14 @@ class Bed(Settings):
         positions, volume = arrange(*given, above)
         height = positions[:, 2]
         if self.arrangement == "lattice":
-            # Whole layers would be half a layer off where the surface is flat: so columns end at the next one by turns,
-            # in the order of a sequence that is nowhere repeated (Roberts's R2), the same on both sides of mid-width.
+            # Whole layers would be half a layer off where the surface is flat: there columns end at one layer or the
+            # next, in the order of a sequence that never repeats (Roberts's R2), the same on both sides of mid-width.
             along, across, layers = _lattice_counts(self.size, self.particle_spacing).tolist()
             i, j = np.indices((along, across))
-            turn = (0.7548776662466927 * i + 0.5698402909980532 * np.minimum(j, across - 1 - j)) % 1.0
-            layer = self.size[2] / layers
-            height = height + np.repeat(0.998 * (turn.ravel() - 0.5), len(positions) // turn.size) * layer
+            turn = (0.7548776662466927 * i + 0.5698402909980532 * np.minimum(j, across - 1 - j)) % 1.0 - 0.5
+            turn = np.repeat(turn.ravel(), len(positions) // turn.size)
+            steep = np.linalg.norm(self.slope_at(*positions[:, :2].T), axis=0)
+            height = height + np.clip(1.0 - steep / _STAIRS, 0.0, 0.998) * turn * self.size[2] / layers
         below = height < self.surface_at(*positions[:, :2].T)
         return positions[below], volume
 

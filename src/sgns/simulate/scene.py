@@ -86,7 +86,7 @@ def scene_on(soil: Soil, cfg: DictConfig, overrides: Sequence[str]) -> Scene:
         SceneError: they say something of bed or soil that does not fit.
     """
     data, there = plain(cfg.scene) | {"material": plain(cfg.material)}, soil.scene.to_dict()
-    given = [one.lstrip("+~").partition("=")[0] for one in overrides]
+    given = {one.lstrip("+~").partition("=")[0] for one in overrides} - {"scene"}  # which chooses a kind
     for key, value in flattened({name: there[name] for name in _FROM_THE_RUN}).items():
         place = key if key.startswith("material") else f"scene.{key}"
         if not any(place == one or place.startswith(f"{one}.") for one in given):
