@@ -160,7 +160,7 @@ def hill(x, y):
     ("arrangement", "surface", "share"),
     [
         ("lattice", 20.0, 0.005),
-        ("lattice", hill, 0.005),
+        ("lattice", hill, 0.01),
         ("lattice", [[-0.05, 0.0], [0.05, 0.02]], 0.005),
         ("lattice", np.full((2, 2), -0.013), 0.005),
         ("jittered", hill, 0.01),
