@@ -13,7 +13,7 @@ from .preview import Preview
 from .scene import Scene
 from .scenes import Body, Column, Excavation, Incline, Wheel
 from .solver import Frame, Solver, frames_together
-from .state import SceneError, SolverStopped, State
+from .state import SceneError, Soil, SolverStopped, State
 
 __all__ = [
     "Bed",
@@ -32,6 +32,7 @@ __all__ = [
     "Preview",
     "Scene",
     "SceneError",
+    "Soil",
     "Solver",
     "SolverStopped",
     "State",

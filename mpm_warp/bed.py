@@ -9,6 +9,7 @@ from functools import cached_property, lru_cache
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
+from scipy import ndimage
 
 from .settings import Settings, lengths, setting, settings
 from .state import SceneError
@@ -57,9 +58,14 @@ POISSON_RADIUS = 0.897
 
 @lru_cache(maxsize=8)  # a random bed takes seconds to fill, and all scenes of a dataset share it
 def arrange(
-    kind: str, size: tuple[float, float, float], spacing: float, seed: int, mirrored: bool = False
+    kind: str,
+    size: tuple[float, float, float],
+    spacing: float,
+    seed: int,
+    mirrored: bool = False,
+    above: float = 0.0,
 ) -> tuple[np.ndarray, float]:
-    """Particles of a bed 0 <= x <= Lx, 0 <= y <= Ly, -Lz <= z <= 0.
+    """Particles of a bed 0 <= x <= Lx, 0 <= y <= Ly, -Lz <= z <= 0, or up to `above` or a little more.
 
     Args:
         kind: `lattice` (full, regular), `jittered` (the lattice, each particle moved at random by up to half
@@ -68,6 +74,7 @@ def arrange(
         spacing: nominal distance between particles [m].
         seed: of the random numbers.
         mirrored: a random bed is its own mirror image about y = Ly / 2.
+        above: height above z = 0 that is filled, too [m].
 
     Returns:
         Positions [m], shape (n, 3), float64, read-only, and the volume of one particle [m^3].
@@ -76,14 +83,18 @@ def arrange(
         raise SceneError(f"bed.arrangement is {kind!r}; allowed: {', '.join(get_args(Arrangement))}")
     volume = particle_volume(kind, size, spacing)
     if kind == "poisson":
-        points = _random_points(size, POISSON_RADIUS * spacing, seed, mirrored)
+        lx, ly, lz = size
+        points = _random_points((lx, ly, lz + above), POISSON_RADIUS * spacing, seed, mirrored)
+        points[:, 2] += above
     else:
         counts = _lattice_counts(size, spacing)
-        axes = [(np.arange(c) + 0.5) * s for c, s in zip(counts, np.asarray(size) / counts, strict=True)]
+        cell = np.asarray(size) / counts
+        counts[2] += math.ceil(above / cell[2])
+        axes = [(np.arange(c) + 0.5) * s for c, s in zip(counts, cell, strict=True)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         points[:, 2] -= size[2]
         if kind == "jittered":
-            points = points + _jitter(np.asarray(size), counts, seed, mirrored)
+            points = points + _jitter(cell, counts, seed, mirrored)
     points.flags.writeable = False
     return points, volume
 
@@ -100,10 +111,10 @@ def _lattice_counts(size: tuple[float, float, float], spacing: float) -> np.ndar
     return np.maximum(1, np.round(np.asarray(size) / spacing)).astype(int)
 
 
-def _jitter(size: np.ndarray, counts: np.ndarray, seed: int, mirrored: bool) -> np.ndarray:
-    """By what the particles of a lattice move [m], shape (n, 3)."""
+def _jitter(cell: np.ndarray, counts: np.ndarray, seed: int, mirrored: bool) -> np.ndarray:
+    """By what the particles of a lattice of such cells [m] move [m], shape (n, 3)."""
     random = np.random.default_rng(seed).uniform(-0.5, 0.5, (np.prod(counts), 3))
-    moved = (size / counts * random).reshape(*counts, 3)
+    moved = (cell * random).reshape(*counts, 3)
     if mirrored:
         # The far half moves as the near one does, mirrored; particles in the middle stay in the plane.
         image = moved[:, ::-1] * [1.0, -1.0, 1.0]
@@ -189,6 +200,40 @@ def _reading_order(points: np.ndarray, radius: float) -> np.ndarray:
     return np.lexsort((points[:, 2] // radius, points[:, 1] // radius, points[:, 0] // radius))
 
 
+# --- The surface at the start ---------------------------------------------------------------------------
+
+MOST_HEIGHTS = 100_000
+"""Of a map; the scene holds them all, and more than one in a grid spacing says nothing."""
+_STAIRS = 0.3
+"""Slope from which on the columns of a lattice are stairs whose mean height is right."""
+STEEPEST = 60.0
+"""Slope of the surface as one number [degrees]."""
+
+
+def _as_heights(rows: Any) -> tuple[tuple[float, ...], ...]:
+    """The rows of a map of heights, checked."""
+    try:
+        heights = np.asarray(rows, dtype=float)
+    except (TypeError, ValueError):
+        heights = np.zeros(0)
+    if heights.ndim != 2 or min(heights.shape) < 2:
+        raise SceneError(
+            "bed.surface is no map of heights; it needs 2 or more rows, from x = 0 to Lx, of 2 or more heights [m], "
+            "from y = 0 to Ly, all rows of the same length"
+        )
+    if heights.size > MOST_HEIGHTS:
+        raise SceneError(
+            f"bed.surface has {heights.shape[0]} x {heights.shape[1]} heights; at most {MOST_HEIGHTS} are allowed: "
+            "take a coarser map, one height for each grid spacing is enough"
+        )
+    if not np.isfinite(heights).all():
+        row, column = np.argwhere(~np.isfinite(heights))[0]
+        raise SceneError(
+            f"bed.surface holds a height that is not finite, in row {row + 1}, number {column + 1}"
+        )
+    return tuple(map(tuple, heights.tolist()))
+
+
 # --- The bed: its bin, grid and particles ----------------------------------------------------------------
 
 PADDING = 3
@@ -220,6 +265,15 @@ class Bed(Settings):
         "nu / (1 - nu) times the vertical one; none: stress-free, settles in the first frames",
     )
     headroom: float = setting(0.25, "height above the surface that soil may reach", "m", gt=0)
+    surface: float | tuple[Any, ...] | None = setting(
+        None,
+        "of the soil at the start: its slope, rising towards +x; or a map of heights above z = 0 [m], rows from x = 0 "
+        "to Lx of heights from y = 0 to Ly (a file; in Python also a function of x and y). None: flat, z = 0",
+        "degrees",
+        ge=-STEEPEST,
+        le=STEEPEST,
+        words=f" degrees; allowed: -{STEEPEST:g} to {STEEPEST:g}, or a map of heights [m]",
+    )
     store_every: int = setting(
         1,
         "one particle of so many is recorded; the solver computes all",
@@ -229,13 +283,26 @@ class Bed(Settings):
     walls: Walls = setting(Walls, "what soil may do at walls and floor")
 
     def __post_init__(self) -> None:
+        given: Any = self.surface
+        if callable(given):
+            axes = [np.linspace(0.0, side, max(2, round(side / self.spacing) + 1)) for side in self.size[:2]]
+            given = np.broadcast_to(given(*np.meshgrid(*axes, indexing="ij")), [len(one) for one in axes])
+        if isinstance(given, (list, tuple, np.ndarray)):
+            object.__setattr__(self, "surface", _as_heights(given))
         super().__post_init__()
         if not 0 < self.spacing <= min(self.size) / 2:
             raise SceneError(
                 f"bed.spacing is {self.spacing} m; allowed: above 0, at most half the bin's smallest side "
                 f"({min(self.size) / 2:g} m); lengths are in metres"
             )
-        particles = math.prod(s / self.spacing for s in self.size) * self.particles_per_cell
+        lowest, high = self._lowest_and_highest
+        if not (lowest >= -self.size[2] and high < self.headroom and high > -self.size[2] + self.spacing):
+            raise SceneError(
+                f"bed.surface reaches from {lowest:.3g} to {high:.3g} m; allowed: from the floor ({-self.size[2]:g} m) "
+                f"to below bed.headroom ({self.headroom:g} m), and a grid spacing of soil somewhere"
+            )
+        filled = (*self.size[:2], self.size[2] + max(0.0, high))
+        particles = math.prod(s / self.spacing for s in filled) * self.particles_per_cell
         if not particles <= MOST_PARTICLES:
             raise SceneError(
                 f"the bed would hold {particles:.2g} particles; at most {MOST_PARTICLES:g} are allowed: "
@@ -282,7 +349,63 @@ class Bed(Settings):
     @cached_property
     def filled(self) -> tuple[np.ndarray, float]:
         """Particle positions (n, 3) [m] and the volume of one [m^3]."""
-        return self._arranged
+        if self.surface is None:
+            return self._arranged
+        above = max(0.0, self._lowest_and_highest[1])
+        given = self.arrangement, self.size, self.particle_spacing, self.seed, self.mirrored
+        positions, volume = arrange(*given, above)
+        height = positions[:, 2]
+        if self.arrangement == "lattice":
+            # Whole layers would be half a layer off where the surface is flat: there columns end at one layer or the
+            # next, in the order of a sequence that never repeats (Roberts's R2), the same on both sides of mid-width.
+            along, across, layers = _lattice_counts(self.size, self.particle_spacing).tolist()
+            i, j = np.indices((along, across))
+            turn = (0.7548776662466927 * i + 0.5698402909980532 * np.minimum(j, across - 1 - j)) % 1.0 - 0.5
+            turn = np.repeat(turn.ravel(), len(positions) // turn.size)
+            steep = np.linalg.norm(self.slope_at(*positions[:, :2].T), axis=0)
+            height = height + np.clip(1.0 - steep / _STAIRS, 0.0, 0.998) * turn * self.size[2] / layers
+        below = height < self.surface_at(*positions[:, :2].T)
+        return positions[below], volume
+
+    @cached_property
+    def _heights(self) -> np.ndarray:
+        """A map whose bilinear interpolation is the surface [m]."""
+        if isinstance(self.surface, tuple):
+            return np.array(self.surface)
+        rise = 0.5 * self.size[0] * math.tan(math.radians(self.surface or 0.0))
+        return np.array([[-rise, -rise], [rise, rise]])
+
+    @property
+    def _lowest_and_highest(self) -> tuple[float, float]:
+        return float(self._heights.min()), float(self._heights.max())
+
+    def surface_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Height of the soil's surface at the start at some places, beyond the walls as at them [m]."""
+        shares = (np.asarray(place) / length for place, length in zip((x, y), self.size, strict=False))
+        counts = np.array(self._heights.shape) - 1
+        places = [share * count for share, count in zip(shares, counts, strict=True)]
+        return ndimage.map_coordinates(self._heights, places, order=1, mode="nearest")
+
+    def slope_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Rise of the surface along x and y over a grid spacing [-], shape (2, n)."""
+        h, (lx, ly, _) = 0.5 * self.spacing, self.size
+        along = self.surface_at(x + h, y) - self.surface_at(x - h, y)
+        across = self.surface_at(x, y + h) - self.surface_at(x, y - h)
+        # At a wall only one side is there.
+        return np.stack(
+            [
+                along / (np.minimum(x + h, lx) - np.maximum(x - h, 0.0)),
+                across / (np.minimum(y + h, ly) - np.maximum(y - h, 0.0)),
+            ]
+        )
+
+    @property
+    def soil_volume(self) -> float:
+        """Between the floor and the surface [m^3]."""
+        if self.surface is None:
+            return float(np.prod(self.size))
+        parts = [np.r_[0.5, np.ones(count - 2), 0.5] / (count - 1) for count in self._heights.shape]
+        return float(np.prod(self.size[:2]) * (self.size[2] + parts[0] @ self._heights @ parts[1]))
 
     @property
     def _arranged(self) -> tuple[np.ndarray, float]:
@@ -302,6 +425,8 @@ class Bed(Settings):
             key.append(self.seed)
             if self.mirrored:
                 key.append("mirrored")
+        if self.surface is not None:
+            key.append(["surface", self.surface])
         if self.store_every != 1:
             key.append(f"one of {self.store_every}")
         return digest(key)

@@ -97,6 +97,11 @@ class Half:
     plane: float
     """y of the plane [m]."""
 
+    @property
+    def images(self) -> np.ndarray:
+        """As `State.whole`."""
+        return np.where(self.mirrored, -1 - self.source, self.source).astype(np.int32)
+
     def whole(self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities (n, 3) of the whole bed from those of the particles computed (m, 3)."""
         position, velocity = position[self.source], velocity[self.source]
@@ -125,6 +130,8 @@ def asymmetry(scene: Scene) -> str | None:
             and (off_by := mesh_asymmetry(scene.body)) > _ALIKE * scene.bed.spacing
         ):
             return f"the tool's two sides differ by {1e3 * off_by:.3g} mm"
+    if scene.soil is not None and scene.soil.state.whole is None:
+        return "the soil to start from was not computed as one half and its mirror image"
     if half(scene) is None:
         return (
             "the particles are not mirror images of each other (bed.arrangement); use bed.arrangement=lattice or "
@@ -168,7 +175,25 @@ def half(scene: Scene) -> Half | None:
     return Half(kept, len(on), source, off < -same, plane)
 
 
-# --- The stress soil starts with ------------------------------------------------------------------------
+# --- What soil starts with ------------------------------------------------------------------------------
+
+
+def initial_particles(scene: Scene) -> dict[str, np.ndarray]:
+    """The arrays of the particles at time 0 that are not zero, by the names that they have in kernels/grid.py, for the
+    whole bed: shape (n, ...)."""
+    if scene.soil is not None:
+        every = scene.soil.particles.items()
+        return {name: np.delete(values, scene.displaced, axis=0) for name, values in every}
+    velocities, (ln_j, strain) = scene.initial_velocities(), initial_stress(scene)
+    shear, bulk = 2.0 * scene.material.shear_modulus, scene.material.bulk_modulus
+    return {
+        "position": scene.initial_positions(),
+        "velocity": velocities,
+        "felt_velocity": np.pad(velocities, ((0, 0), (0, 1))),
+        "elastic_strain": strain,
+        "log_volume": ln_j,
+        "stress": shear * strain + bulk * ln_j[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
+    }
 
 
 def initial_stress(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -176,18 +201,31 @@ def initial_stress(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
     Both `geostatic` and `k0` hold the vertical stress of rest at once, so nothing settles. `geostatic` is isotropic;
     `k0` has the horizontal stress nu / (1 - nu) times the vertical one, as an elastic bed filled from above has.
-    In a tilted bin they hold the shear stress rho g_x d at depth d, too, that carries an endless slope.
+    In a tilted bin they hold the shear stress rho g_x d at depth d, too, that carries an endless slope. Under a surface
+    that is not flat d is the depth below it, and the shear stress that carries its slope comes on top, as much of it as
+    friction holds.
     """
     positions, volume = scene.filled
     material, (pull, _, fall) = scene.material, scene.gravity_vector
     ln_j, strain = np.zeros(len(positions)), np.zeros((len(positions), 6))
     if scene.bed.initial_stress != "none":
         density = material.bulk_density * len(positions) * volume / scene.soil_volume
-        depth = np.maximum(-positions[:, 2], 0.0)
+        surface = 0.0 if scene.bed.surface is None else scene.bed.surface_at(*positions[:, :2].T)
+        depth = np.maximum(surface - positions[:, 2], 0.0)
         ratio = material.lateral_stress_ratio if scene.bed.initial_stress == "k0" else 1.0
         vertical = density * fall * depth  # tension is positive
         ln_j = vertical * (1.0 + 2.0 * ratio) / 3.0 / material.bulk_modulus
         share = vertical * (1.0 - ratio) / (6.0 * material.shear_modulus)
         strain[:, :3] = share[:, None] * np.array([-1.0, -1.0, 2.0])
         strain[:, 4] = density * pull * depth / (2.0 * material.shear_modulus)
+        if scene.bed.surface is not None:
+            # Equilibrium of an endless slope s: sigma_xx = K v, sigma_xz = K v s_x, sigma_zz = v (1 + K |s|^2).
+            slope = scene.bed.slope_at(*positions[:, :2].T)
+            steep = np.linalg.norm(slope, axis=0)
+            slope *= np.minimum(1.0, material.static_friction / np.maximum(steep, 1e-9))
+            side = ratio * vertical
+            strain[:, 4:] += (side * slope).T / (2.0 * material.shear_modulus)
+            more = side * (slope**2).sum(axis=0)
+            ln_j += more / 3.0 / material.bulk_modulus
+            strain[:, :3] += (more / (6.0 * material.shear_modulus))[:, None] * np.array([-1.0, -1.0, 2.0])
     return np.delete(ln_j, scene.displaced), np.delete(strain, scene.displaced, axis=0)

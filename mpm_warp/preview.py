@@ -53,15 +53,16 @@ class Preview:
         deepest = int(np.argmin(low))
         around = np.abs(rotation_matrices(poses[:, 3:]))[:, :2] @ body.half_size
         over = np.all((poses[:, :2] + around > 0.0) & (poses[:, :2] - around < scene.bed.size[:2]), axis=1)
-        touching = np.flatnonzero((low < 0.0) & over)
+        touching = np.flatnonzero((low < scene.bed.surface_at(*poses[:, :2].T)) & over)
         touch = float(times[touching[0]]) if len(touching) else None
         reach = np.stack([outline.min(axis=0), outline.max(axis=0)]) - body.path_point
         found = [odd_size(body, scene.bed.size, scene.open_sides), *_of_path(scene, low, touch)]
         odd = [one for one in found if one]
         warnings += [one.words for one in odd]
         if len(scene.displaced):
+            deep = f", {_words(-low[0])} deep" if low[0] < 0.0 else ""
             warnings.append(
-                f"the tool is in the soil at the start, {_words(-low[0])} deep: {len(scene.displaced)} particles "
+                f"the tool is in the soil at the start{deep}: {len(scene.displaced)} particles "
                 "that would lie inside it are left out; soil closes in on it in the first 0.2 s: let it rest so long"
             )
         if touch is not None:

@@ -18,9 +18,10 @@ from .kernels.contact import HOLDING_LAYER, ContactLaw, axle_step, body_struct
 from .kernels.grid import adding_up
 from .kernels.signed_distance import shape_data
 from .launch import Launch, Threads
-from .poses import rotation_vectors
-from .scene import Scene
-from .state import SolverStopped
+from .poses import rotation_vectors, sampled_poses
+from .scene import MOST_COURANT, Scene
+from .settings import short
+from .state import SceneError, SolverStopped
 from .tool_geometry import thickening
 
 if TYPE_CHECKING:
@@ -84,7 +85,10 @@ class RigidBody:
         self.scene, self.substeps, self.time_step = scene, substeps, time_step
         shape, axle, h = scene.body, scene.axle, scene.bed.spacing
         assert shape is not None
-        self._shape = shape
+        self._shape, self._symmetric = shape, effects.symmetry
+        # Soil's waves and the body together may go so far in a step.
+        stable = math.sqrt(1.0 + scene.elastic_damping**2) - scene.elastic_damping
+        self._fastest = MOST_COURANT * stable * h / time_step - scene.material.wave_speed
         self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, effects.torque)
         struct: Any = body_struct(real)
         self.data = data = struct()
@@ -105,6 +109,9 @@ class RigidBody:
         data.impulse = wp.zeros(1 + effects.torque, vec3, device)
         self.of_threads = [data]
         """The struct for each thread, whose push it adds up."""
+        self._given: np.ndarray | None = None  # path rows of the frame under way, if its end was given
+        self.given_speed = 0.0
+        """Of its fastest point, in a frame whose end was given [m/s]."""
         self._axle: wp.array | None = None
         moving = []
         if axle is not None:
@@ -127,6 +134,41 @@ class RigidBody:
         self.launches += moving
         """What has to run in every substep after the soil's push was added up."""
 
+    def head_for(self, frame: int, pose: np.ndarray) -> None:
+        """Go on from frame number `frame` to a pose (7,) one frame later, whatever the scene's motion is.
+
+        Raises:
+            SceneError: it is no pose, or one that the body cannot be in then.
+        """
+        h, rate = self.scene.bed.spacing, self.scene.frame_rate
+        if pose.shape != (7,) or not np.isfinite(pose).all() or abs(np.linalg.norm(pose[3:]) - 1.0) > 1e-3:
+            raise SceneError(
+                f"the pose of frame {frame + 1} is {short(pose)}; it needs seven finite numbers, x, y, z [m] and "
+                "a unit quaternion x, y, z, w"
+            )
+        now = self.pose(frame / rate)
+        to = pose.copy()
+        if self._axle is not None:
+            now[2] = to[2] = 0.0
+        elif self._symmetric and max(abs(to[1] - now[1]) / h, *np.abs(to[[3, 5]])) > 1e-6:
+            raise SceneError(
+                f"the pose of frame {frame + 1} leaves the plane at mid-width, but half of the bed is computed: set "
+                "effects.symmetry=false"
+            )
+        # A row behind the end: there the pose is the end itself, as on a longer path.
+        rows = [[(frame + after) / rate, *place] for after, place in ((0, now), (1, to), (2, to))]
+        way = np.linalg.norm(to[:3] - now[:3])
+        angle = np.linalg.norm(rotation_vectors(now[None, 3:], to[None, 3:]))
+        speed = float(way + self._shape.reach * angle) * rate
+        most = self._fastest
+        if speed > most:
+            raise SceneError(
+                f"the pose of frame {frame + 1} is {way:.3g} m and {math.degrees(angle):.3g} degrees away, {speed:.3g} "
+                f"m/s for the fastest point; allowed: {most:.3g} m/s in steps of {self.time_step:.3g} s: go there in "
+                "more frames, or lower scene.courant"
+            )
+        self._given, self.given_speed = np.array(rows), speed
+
     def start_frame(self, frame: int) -> None:
         """Load the prescribed motion of the frame that begins at `frame`, and forget the impulse.
 
@@ -139,8 +181,13 @@ class RigidBody:
             self._axle[2:].zero_()
             if self.scene.axle.load:
                 self._fall.fill_(self.scene.axle.fall(times, self.scene.gravity))
-        poses = self.scene.poses_at(times)
-        self._require_steady(frame, times, poses[:, :3])
+        if self._given is None:
+            poses, (way, angle) = self.scene.poses_at(times), self.scene.displacement(times)
+        else:
+            poses = sampled_poses(self._given, times)
+            way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+            angle = np.linalg.norm(rotation_vectors(poses[:-1, 3:], poses[1:, 3:]), axis=1)
+        self._require_steady(frame, times, poses[:, :3], way, angle)
         self.data.position.assign(poses[:-1, :3])
         self.data.rotation.assign(poses[:-1, 3:])
         self.data.velocity.assign(np.diff(poses[:, :3], axis=0) / self.time_step)
@@ -148,7 +195,10 @@ class RigidBody:
 
     def pose(self, time: float) -> np.ndarray:
         """Centre of mass [m] and quaternion now, at `time` [s], shape (7,)."""
-        pose = self.scene.poses_at(np.array([time]))[0]
+        if self._given is None:
+            pose = self.scene.poses_at(np.array([time]))[0]
+        else:
+            pose = sampled_poses(self._given, np.array([time]))[0]
         if self._axle is not None:
             pose[2] = self._axle.numpy()[0]
         return pose
@@ -165,6 +215,12 @@ class RigidBody:
         if self._axle is not None:
             arrays["axle"] = self._axle
         return arrays
+
+    def go_on(self, arrays: dict[str, np.ndarray], stretch: np.ndarray) -> None:
+        """Take over the height and speed of a free body from the arrays of a state, and the stretch of contacts [m]."""
+        self.data.stick.assign(stretch)
+        if self._axle is not None:
+            self._axle.assign(arrays["axle"])
 
     def check(self, time: float, top_speed: float) -> None:
         """Stop at `time` [s] where the soil's push or a free body's motion means nothing any more.
@@ -187,9 +243,10 @@ class RigidBody:
                 f"the body reached the floor of the bin by {time:.3f} s: make scene.bed.size deeper or the load smaller"
             )
 
-    def _require_steady(self, frame: int, times: np.ndarray, position: np.ndarray) -> None:
+    def _require_steady(
+        self, frame: int, times: np.ndarray, position: np.ndarray, way: np.ndarray, angle: np.ndarray
+    ) -> None:
         """A body that is somewhere else in the next substep does not push soil: it appears in its midst."""
-        way, angle = self.scene.displacement(times)
         farthest, most = way + self._shape.reach * angle, LONGEST_WAY * self.scene.bed.spacing
         far = ~(farthest <= most)
         if not far.any():

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
 
 from .bed import Bed, digest
-from .bodies import Axle, MeshBody, Tool
+from .bodies import Axle, Cylinder, MeshBody, Tool
 from .material import Material
 from .poses import (
     in_body_frame,
@@ -22,7 +23,7 @@ from .poses import (
     sampled_poses,
 )
 from .settings import Settings, build, setting, settings, short
-from .state import SceneError
+from .state import SceneError, Soil
 from .tool_geometry import HOLDS, distances, odd_size, place_unit, thickening
 
 MOST_FRAMES = 1_000_000
@@ -40,6 +41,10 @@ _MOST_POSES, _MOST_POINTS = 100_000, 1_000_000
 """That are looked at for walls in a way, and at a time."""
 
 
+_FREE = ("headroom", "store_every", "initial_stress", "surface")
+"""Keys of a bed that may be others than in the run to start from."""
+_SAME_PLACE = 0.01
+"""Two places no further from each other are the same [grid spacings]."""
 _FARTHEST = 1e13
 """Number in a path, which may hold epoch seconds in milliseconds [s or m]."""
 
@@ -71,6 +76,8 @@ class Scene(Settings):
     classes: ClassVar[dict[str, type[Scene]]] = {}
     """Kind → class."""
     group: ClassVar[str] = "scene"
+    own_start: ClassVar[bool] = False
+    """Whether a kind of scene says itself where its soil is and how it moves at the start."""
     bilateral: ClassVar[bool] = False
     """Whether soil in contact with the body is held, too (contact.py); a kind of scene may make it a key."""
 
@@ -121,6 +128,10 @@ class Scene(Settings):
                 f"scene.duration is {self.duration} s at scene.frame_rate {self.frame_rate} Hz: {frames:.2g} frames; "
                 f"at most {MOST_FRAMES:g} are allowed: lower one of them"
             )
+        if self.own_start and self.bed.surface is not None:
+            raise SceneError(
+                f"bed.surface is given, but a scene of the kind {self.kind} has a start of its own"
+            )
         if self._path is not None:
             object.__setattr__(self, "path", _as_path(self._path))
 
@@ -161,7 +172,74 @@ class Scene(Settings):
     @property
     def filled(self) -> tuple[np.ndarray, float]:
         """Particle positions (n, 3) of the bed without a tool [m] and the volume of one [m^3]."""
-        return self.bed.filled
+        return self.bed.filled if self.soil is None else (self.soil.particles["position"], self.bed.filled[1])
+
+    @property
+    def soil(self) -> Soil | None:
+        """What the soil starts as, if another run left it so; see `starting_from`."""
+        return self.__dict__.get("_soil")
+
+    def starting_from(self, soil: Soil) -> Scene:
+        """The same scene whose soil starts as another run left it, with its velocities and stresses.
+
+        A tool that was there and starts from the same place is taken over with its contacts; so is the height of a
+        wheel. Any other tool displaces the particles where it is.
+
+        Raises:
+            SceneError: bed or soil are not those of that run, or this kind of scene has a start of its own.
+        """
+        if self.own_start:
+            raise SceneError(
+                f"a scene of the kind {self.kind} has a start of its own; soil of another run goes into the kinds "
+                f"{', '.join(kind for kind, cls in Scene.classes.items() if not cls.own_start)}"
+            )
+        for group, here, there in (
+            ("scene.bed", self.bed, soil.scene.bed),
+            ("material", self.material, soil.scene.material),
+        ):
+            known = vars(there) | {name: getattr(here, name) for name in _FREE if group == "scene.bed"}
+            for name, value in ((one.name, getattr(here, one.name)) for one in fields(here)):
+                if value != known[name]:
+                    raise SceneError(
+                        f"{group}.{name} is {short(value)}, but {short(known[name])} in the run to start from; leave "
+                        "it as it is there"
+                    )
+        position, size, margin = soil.particles["position"], np.array(self.bed.size), self.bed.spacing
+        low, high = np.array([0.0, 0.0, -size[2]]), np.array([*size[:2], self.bed.headroom])
+        outside = ((position < low - margin) | (position > high + margin)).any(axis=1)
+        if outside.any():
+            particle = int(np.argmax(outside))
+            at = ", ".join(f"{x:.4g}" for x in position[particle])
+            raise SceneError(
+                f"particle {particle} of the soil to start from is outside the bin, at ({at}) m; if that is above it, "
+                f"raise scene.bed.headroom ({self.bed.headroom:g} m)"
+            )
+        found = copy.copy(self)
+        for name in [
+            name for name in vars(found) if isinstance(getattr(type(self), name, None), cached_property)
+        ]:
+            del found.__dict__[name]
+        found.__dict__["_soil"] = soil
+        return found
+
+    @cached_property
+    def goes_on(self) -> bool:
+        """Whether the body is there already in the soil to start from, in the same place, to a part of a grid
+        spacing; the height of a free body is then that."""
+        soil, body = self.soil, self.body
+        if soil is None or body is None or body != soil.scene.body or "contact_stretch" not in soil.particles:
+            return False
+        if (self.axle is None) != (soil.scene.axle is None) or (
+            self.axle and "axle" not in soil.state.arrays
+        ):
+            return False
+        pose, near = self.poses_at(np.zeros(1))[0], _SAME_PLACE * self.bed.spacing
+        axes = 2 if self.axle else 3
+        turned = rotation_matrices(pose[3:]) - rotation_matrices(soil.pose[3:])
+        if isinstance(body, Cylinder) and not body.grousers:
+            turned = turned[:, 1]  # round its axis it may have any angle
+        away = np.abs(pose[:axes] - soil.pose[:axes]).max()
+        return bool(away <= near and np.abs(turned).max() * body.reach <= near)
 
     @cached_property
     def displaced(self) -> np.ndarray:
@@ -172,10 +250,10 @@ class Scene(Settings):
         tenth of a particle spacing beyond where contact begins, all go that contact would push.
         """
         body, nobody = self.body, np.zeros(0, dtype=np.int64)
-        if body is None:
+        if body is None or self.goes_on:
             return nobody
-        pose = self.poses_at(np.zeros(1))[0]
-        if pose[2] - np.abs(rotation_matrices(pose[3:])[2]) @ body.half_size > -1e-9:
+        pose, top = self.poses_at(np.zeros(1))[0], max(0.0, self.filled[0][:, 2].max())
+        if pose[2] - np.abs(rotation_matrices(pose[3:])[2]) @ body.half_size > top - 1e-9:
             return nobody  # above the soil
         points = in_body_frame(pose, self.filled[0])
         thicker = thickening(body, self.contact_distance, self.bed.spacing)
@@ -207,10 +285,12 @@ class Scene(Settings):
     @property
     def soil_volume(self) -> float:
         """Space that the soil takes up at the start [m^3]."""
-        return float(np.prod(self.bed.size))
+        return self.bed.soil_volume
 
     def initial_velocities(self) -> np.ndarray:
         """Soil at time 0 [m/s], shape (n, 3), float64."""
+        if self.soil is not None:
+            return np.delete(self.soil.particles["velocity"], self.displaced, axis=0)
         return np.zeros_like(self.initial_positions())
 
     @property
@@ -309,13 +389,24 @@ class Scene(Settings):
 
     @property
     def arrangement_hash(self) -> str:
-        """See `Bed.arrangement_hash`; another one where particles are left out."""
+        """See `Bed.arrangement_hash`; another one where particles are left out, or come from another run."""
         found = self.bed.arrangement_hash
+        if self.soil is not None:
+            found = digest([found, "from", self.soil.digest])
         return digest([found, "without", self.displaced.tolist()]) if len(self.displaced) else found
 
     def warnings(self) -> list[str]:
         """What a user should know about this scene before it runs."""
-        return self.material.warnings() + (self.body.warnings() if self.body is not None else [])
+        found = self.material.warnings() + (self.body.warnings() if self.body is not None else [])
+        if self.bed.surface is not None and self.soil is None:
+            steepest = np.linalg.norm(self.bed.slope_at(*self.filled[0][:, :2].T), axis=0).max()
+            slope, stands = (math.degrees(math.atan(x)) for x in (steepest, self.material.static_friction))
+            if slope > stands:
+                found.append(
+                    f"bed.surface is up to {slope:.3g} degrees steep, more than the soil's friction "
+                    f"({stands:.3g} degrees): it may flow at the start"
+                )
+        return found
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         """What came out, in a few words, of the soil's force on the body [N] and its torque about the centre of mass

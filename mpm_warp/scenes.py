@@ -389,6 +389,7 @@ class Wheel(Scene):
 class Column(Scene):
     """Soil stands in the middle of the floor and is let go at time 0; the bed's Lz is its height."""
 
+    own_start: ClassVar[bool] = True
     name: str = "column"
     kind: str = "column"
     bed: Bed = setting(
@@ -443,6 +444,7 @@ def bagnold_speed(scene: Scene, inertial_number: float, height: np.ndarray) -> n
 class Incline(Scene):
     """A layer as thick as the bed, tilted; meant for a bed that is periodic in x."""
 
+    own_start: ClassVar[bool] = True
     name: str = "incline"
     kind: str = "incline"
     bed: Bed = setting(

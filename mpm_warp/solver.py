@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .discretisation import half, initial_stress, lay_grid, require_symmetry
+from .discretisation import half, initial_particles, lay_grid, require_symmetry
 from .effects import Effects
 from .kernels.contact import body_struct
 from .kernels.fluidity import soil_parameters
@@ -25,7 +25,7 @@ from .poses import rotate
 from .rigid_body import RigidBody
 from .scene import Scene
 from .settings import short_repr
-from .state import Memory, SceneError, SolverStopped, State
+from .state import Memory, SceneError, Soil, SolverStopped, State
 
 MOST_THREADS = 256
 PRECISIONS = {"float32": wp.float32, "float64": wp.float64}
@@ -53,6 +53,15 @@ class Frame:
     torque: np.ndarray
     """About the body's centre of mass, likewise [N m], shape (3,); zeros without the effect `torque`."""
 
+    @property
+    def pose(self) -> np.ndarray:
+        """`body_pose`, under the name that the state of a `sgns.Simulator` has for it."""
+        return self.body_pose
+
+    def soil(self) -> np.ndarray:
+        """`position`, likewise."""
+        return self.position
+
 
 class Solver:
     """Computes a scene.
@@ -68,6 +77,7 @@ class Solver:
         threads: of the CPU, each with a part of the soil. Another number of them rounds sums otherwise; the same one
             always gives the same answer. It pays from some ten thousand particles on.
         start: what to go on from instead of the scene's own start; of the same scene, whose numerics may differ.
+        start_from: soil as another solver left it (`soil()`, or `sgns.Run.soil`); see `Scene.starting_from`.
     """
 
     def __init__(
@@ -78,7 +88,10 @@ class Solver:
         precision: str = "float32",
         threads: int = 1,
         start: State | None = None,
+        start_from: Soil | None = None,
     ) -> None:
+        if start_from is not None:
+            scene = scene.starting_from(start_from)
         if precision not in PRECISIONS:
             raise SceneError(f"precision is {precision!r}; allowed: {', '.join(PRECISIONS)}")
         self.scene = scene
@@ -106,6 +119,8 @@ class Solver:
         self._limits = PhysicalLimits(scene, self.time_step)
         self._start = copy.deepcopy(start)  # every beginning needs it as it is now
         self._beginnings = 0
+        self._stepped: int | None = None
+        """Frame to which `reset` and `step` have come."""
         self._make_ready()
 
     def __repr__(self) -> str:
@@ -144,7 +159,7 @@ class Solver:
         if self._beginnings:
             self._make_ready()
         self._beginnings += 1
-        beginning = self._beginnings
+        self._stepped, beginning = None, self._beginnings
         for stage in self._computed():
             yield stage
             if self._beginnings != beginning:
@@ -155,25 +170,77 @@ class Solver:
 
     def _computed(self) -> Iterator[Frame | Job]:
         """What `stages` gives, from the solver's memory as it is."""
-        for program in (self._remap, self._steps):
-            yield Job(program, 0)
+        yield from self._begin()
         first = 0 if self._start is None else self._start.frame + 1
-        if self._start is not None:
-            self._memory.keep(self._start.frame)
         for index in range(first, self.scene.frame_count):
             if index > 0:
-                try:
-                    yield from self._advance(index)
-                except SolverStopped as stopped:
-                    stopped.state = self._memory.state()
-                    raise
+                yield from self._advance(index)
             self._memory.keep(index)
             yield self._frame(index)
+
+    def _begin(self) -> Iterator[Job]:
+        for program in (self._remap, self._steps):
+            yield Job(program, 0)
+        if self._start is not None:
+            self._memory.keep(self._start.frame)
+
+    def reset(self) -> Frame:
+        """Begin anew, for poses that are not known beforehand (`step`); returns the state at the start."""
+        if self._beginnings:
+            self._make_ready()
+        self._beginnings += 1
+        self._stepped = 0 if self._start is None else self._start.frame
+        executor = Executor(self.device)
+        for job in self._begin():
+            executor.run([job])
+        self._memory.keep(self._stepped)
+        return self._frame(self._stepped)
+
+    def step(self, pose: np.ndarray) -> Frame:
+        """Move the body to its next pose and the soil with it; returns the state then, as `frames` would for a path
+        with this pose. The scene's own motion and duration do not count. The first call begins as `reset` does.
+
+        Args:
+            pose: centre of mass [m] and unit quaternion x, y, z, w one frame from now, shape (7,). On the way there
+                positions go straight, rotations the shortest way. The height of a free body is computed.
+
+        Raises:
+            SceneError: the pose is no such array, is off the plane of the effect `symmetry`, or further away than a
+                step allows; then the solver stays where it was.
+            SolverStopped: as of `frames`.
+        """
+        if self.body is None:
+            raise SceneError("the scene has no tool to move; take its `frames`")
+        if self._stepped is None:
+            self.reset()
+        assert self._stepped is not None
+        self.body.head_for(self._stepped, np.asarray(pose, dtype=float))
+        executor, index = Executor(self.device), self._stepped + 1
+        for job in self._advance(index):
+            executor.run([job])
+        self._stepped = index
+        self._memory.keep(index)
+        return self._frame(index)
 
     def state(self) -> State | None:
         """What a solver of the same scene needs to go on after the last frame that `frames` gave; None before the
         first."""
         return self._memory.state()
+
+    def soil(self) -> Soil:
+        """Soil as it is after the last frame that `frames` gave, for another tool and path.
+
+        Raises:
+            SceneError: there is no frame yet.
+        """
+        state = self._memory.state()
+        if state is None:
+            raise SceneError(
+                "the solver has no frame yet, so there is no soil to start from; take its frames first"
+            )
+        time = state.frame / self.scene.frame_rate
+        pose = self.scene.poses_at(np.array([time]))[0] if self.body is None else self.body.pose(time)
+        return Soil(self.scene, state, pose)
 
     # --- set-up -------------------------------------------------------------------------------------------
 
@@ -185,33 +252,29 @@ class Solver:
         def zeros(dtype: Any, count: int) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device)
 
-        positions, volume = scene.initial_positions(), scene.filled[1]
-        velocities, (ln_j, strain) = scene.initial_velocities(), initial_stress(scene)
+        soil, volume = initial_particles(scene), scene.filled[1]
         self.grid, layers = lay_grid(scene, real, self.time_step, volume, self._half is not None)
         """The struct of the grid, see kernels/grid.py."""
         if self._half is not None:
-            kept, self.grid.on_plane = self._half.kept, self._half.on_plane
-            positions, velocities, ln_j, strain = positions[kept], velocities[kept], ln_j[kept], strain[kept]
+            self.grid.on_plane = self._half.on_plane
+            soil = {name: values[self._half.kept] for name, values in soil.items()}
         self._soil = soil_parameters(real, scene.material, max(scene.bed.size))
-        shear, bulk = 2.0 * scene.material.shear_modulus, scene.material.bulk_modulus
-        n, node_count = len(positions), self.grid.nx * self.grid.ny * self.grid.nz
+        n, node_count = len(soil["position"]), self.grid.nx * self.grid.ny * self.grid.nz
         padded = node_count + 1  # see kernels/node_rows.py
-        self.particles = _with_arrays(
-            particle_struct(real),
-            device,
-            position=positions,
-            home=n,
-            velocity=velocities,
-            felt_velocity=np.pad(velocities, ((0, 0), (0, 1))),
-            velocity_gradient=n,
-            elastic_strain=strain,
-            log_volume=ln_j,
-            stress=shear * strain + bulk * ln_j[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
-            swelling=n,
-            fluidity=n if effects.fluidity else 0,
-            excess=n if effects.nonlocality else 0,
-            bond=np.full(n if effects.can_tear else 0, scene.material.cohesive_pressure / bulk),
-        )
+        struct: Any = particle_struct(real)
+        given: dict[str, int | np.ndarray] = {
+            "home": n,
+            "velocity_gradient": n,
+            "swelling": n,
+            "fluidity": n,
+            "excess": n if effects.nonlocality else 0,
+            "bond": np.full(n, scene.material.cohesive_pressure / scene.material.bulk_modulus),
+        }
+        given |= {name: values for name, values in soil.items() if name in struct.vars}
+        for name, used in (("fluidity", effects.fluidity), ("bond", effects.can_tear)):
+            if not used:
+                given[name] = 0
+        self.particles = _with_arrays(struct, device, **given)
         """The arrays of the particles that are computed, see kernels/grid.py."""
         self._velocity, self._before = (zeros(vec4, padded) for _ in range(2))
         own = self._threads.copies
@@ -220,18 +283,27 @@ class Solver:
         self._cooperative_field, self._cooperation = (
             zeros(vec4, padded if effects.nonlocality else 0) for _ in range(2)
         )
+        if scene.soil is not None and effects.nonlocality:
+            field = scene.soil.state.arrays.get("cooperative_fluidity")
+            if field is not None and field.shape == (padded, 4):
+                self._cooperative_field.assign(field)
         self._top_speed, self._fault = own(zeros(real, 1)), own(zeros(int, 4))
         self._keep, self.grid.substep = zeros(real, 1), zeros(int, 1)
         periodic = (axis for axis, kind in enumerate(scene.bed.walls.conditions) if kind == "periodic")
         self._turns = {axis: zeros(int, n) for axis in periodic}
+        for axis, turns in self._turns.items():
+            if (found := soil.get(f"turns_{'xyz'[axis]}")) is not None:
+                turns.assign(found)
         self.body: RigidBody | None = None
         """The tool or wheel; None without one."""
         if scene.body is not None:
             self.body = RigidBody(
                 scene, effects, real, self._threads, self.substeps_per_frame, self.time_step, n
             )
+            if scene.goes_on and scene.soil is not None:
+                self.body.go_on(scene.soil.state.arrays, soil["contact_stretch"])
         self._remap, self._steps = self._programs(layers)
-        self._memory = Memory(self._lasting())
+        self._memory = Memory(self._lasting(), self._half.images if self._half is not None else None)
         if self._start is not None:
             self._memory.load(self._start)
 
@@ -299,10 +371,24 @@ class Solver:
     # --- stepping -----------------------------------------------------------------------------------------
 
     def _advance(self, index: int) -> Iterator[Job]:
-        """From frame index - 1 to frame `index`."""
+        """From frame index - 1 to frame `index`.
+
+        Raises:
+            SolverStopped: with the state at frame index - 1.
+        """
+        try:
+            yield from self._stepped_to(index)
+        except SolverStopped as stopped:
+            stopped.state = self._memory.state()
+            raise
+
+    def _stepped_to(self, index: int) -> Iterator[Job]:
         self.grid.substep.zero_()
         if self.body is not None:
             self.body.start_frame(index - 1)
+        body_speed = (
+            self._top_body_speed if self.body is None else max(self._top_body_speed, self.body.given_speed)
+        )
         left = self.substeps_per_frame
         while left:
             for top_speed in self._top_speed:
@@ -313,7 +399,7 @@ class Solver:
                 fastest = int(np.argmax(np.linalg.norm(self.particles.velocity.numpy(), axis=1)))
                 substep = self.substeps_per_frame - left
                 raise self._stopped(index, substep, fastest, self._limits.too_fast(top))
-            steps = min(left, steps_to_remap(self.scene, self.time_step, max(self._top_body_speed, top)))
+            steps = min(left, steps_to_remap(self.scene, self.time_step, max(body_speed, top)))
             left -= steps
             self._keep.fill_(math.exp(-steps * self.time_step / self.scene.memory_time))
             yield Job(self._steps, steps)
@@ -346,9 +432,10 @@ class Solver:
     def _frame(self, index: int) -> Frame:
         scene = self.scene
         time = index / scene.frame_rate
-        pose = scene.poses_at(np.array([time]))[0]
         impulse = np.zeros((2, 3))
-        if self.body is not None:
+        if self.body is None:
+            pose = scene.poses_at(np.array([time]))[0]
+        else:
             pose, impulse = self.body.pose(time), self.body.impulse() * (scene.frame_rate if index else 0.0)
         position, velocity = self.particles.position.numpy(), self.particles.felt_velocity.numpy()[:, :3]
         for axis, turns in self._turns.items():

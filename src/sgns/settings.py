@@ -365,6 +365,9 @@ class Simulate(_Command):
     output: str = setting("run.h5", "run file to write")
     overwrite: bool = setting(False, "true: replace a finished run that is there at `output`")
     continue_from: str | None = setting(None, "a *.stopped.h5: goes on from its last frame")
+    start_from: str | None = setting(
+        None, "a run: its soil, as the last frame left it, with this scene's tool"
+    )
     seed: int = _seed("of the particle arrangement and of a campaign's draws")
     device: str = _device()
     shard: int = setting(0, "with a dataset: which share of its runs this command makes", ge=0)

@@ -2,17 +2,18 @@
 
 import math
 from dataclasses import replace
-from itertools import product
+from itertools import islice, product
 
 import numpy as np
 import pytest
 import warp as wp
 from scipy.spatial import cKDTree
 
-from mpm_warp import Bed, Effects, Scene, SceneError, Solver, Walls, arrange
+from mpm_warp import Bed, Column, Effects, Preview, Scene, SceneError, Solver, Walls, arrange
 from mpm_warp.bed import POISSON_RADIUS
+from mpm_warp.discretisation import asymmetry, initial_stress
 from mpm_warp.kernels.grid import grid_step
-from sgns_testing.scenes import BlockBed, block
+from sgns_testing.scenes import BlockBed, block, cut
 
 # --- Floor and walls: sticking, sliding, friction, periodic ends, and a tilted bin ----------------------
 
@@ -146,3 +147,128 @@ def test_momentum_along_periodic_axes_is_conserved():
     list(solver.frames())
     after = solver.particles.velocity.numpy().sum(axis=0)
     np.testing.assert_allclose(after[:2], kick.sum(axis=0)[:2], atol=1e-12 * np.abs(kick).sum())
+
+
+# --- The surface at the start ---------------------------------------------------------------------------
+
+
+def hill(x, y):
+    return 0.04 * np.exp(-((x - 0.3) ** 2 + (y - 0.2) ** 2) / 0.01) - 0.01
+
+
+@pytest.mark.parametrize(
+    ("arrangement", "surface", "share"),
+    [
+        ("lattice", 20.0, 0.005),
+        ("lattice", hill, 0.01),
+        ("lattice", [[-0.05, 0.0], [0.05, 0.02]], 0.005),
+        ("lattice", np.full((2, 2), -0.013), 0.005),
+        ("jittered", hill, 0.01),
+        ("poisson", hill, 0.03),
+    ],
+)
+def test_the_mass_is_the_integral_of_the_map(arrangement, surface, share):
+    size = (0.6, 0.4, 0.12)
+    bed = Bed(size=size, spacing=0.03, particles_per_cell=2.0, arrangement=arrangement, surface=surface)
+    positions, volume = bed.filled
+    assert volume == bed.particle_volume
+    x, y = np.meshgrid((np.arange(300) + 0.5) / 500, (np.arange(200) + 0.5) / 500, indexing="ij")
+    exact = 0.6 * 0.4 * (0.12 + bed.surface_at(x.ravel(), y.ravel()).mean())
+    assert bed.soil_volume == pytest.approx(exact, rel=1e-3)
+    assert len(positions) * volume == pytest.approx(exact * bed.filling, rel=share)
+    assert (positions[:, 2] < bed.surface_at(*positions[:, :2].T) + 0.5 * bed.particle_spacing).all()
+    assert positions[:, 2].min() == pytest.approx(-0.12, abs=bed.particle_spacing)
+    assert bed.arrangement_hash != replace(bed, surface=None).arrangement_hash
+    assert Bed.from_dict(Scene(bed=bed).to_dict()["bed"]) == bed
+
+
+def test_a_symmetric_map_is_a_symmetric_bed():
+    def ridge(x, y):
+        return 0.03 - 0.2 * np.hypot(x - 0.1, y - 0.2)
+
+    assert asymmetry(Scene(bed=Bed(size=(0.4, 0.4, 0.12), spacing=0.02, surface=ridge))) is None
+
+
+def test_a_map_is_stretched_over_the_bin_and_linear_between_its_points():
+    bed = Bed(size=(0.6, 0.4, 0.12), surface=[[0.0, 0.02, 0.04], [0.03, 0.05, 0.07]])
+    x, y = np.array([0.0, 0.6, 0.3, 0.6, 0.7]), np.array([0.0, 0.4, 0.1, 0.2, -1.0])
+    np.testing.assert_allclose(bed.surface_at(x, y), [0.0, 0.07, 0.025, 0.05, 0.03], atol=1e-12)
+    np.testing.assert_allclose(bed.slope_at(x[2:4], y[2:4]), [[0.05, 0.05], [0.1, 0.1]], atol=1e-9)
+    slope = Bed(size=(0.6, 0.4, 0.12), surface=20.0)
+    np.testing.assert_allclose(
+        slope.surface_at(x[:2], y[:2]), [-0.3 * math.tan(math.radians(20)), 0.3 * math.tan(math.radians(20))]
+    )
+
+
+def test_a_flat_map_is_the_flat_bed():
+    bed = Bed(size=(0.3, 0.2, 0.12), spacing=0.02, particles_per_cell=4.0)
+    for one, same in ((bed, replace(bed, surface=0.0)), (bed, replace(bed, surface=np.zeros((3, 4))))):
+        np.testing.assert_array_equal(one.filled[0], same.filled[0])
+        for a, b in zip(initial_stress(Scene(bed=one)), initial_stress(Scene(bed=same)), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def heap(slope: float, **kw) -> Scene:
+    """A ridge 6 cm high in a channel, with sides of a slope [degrees]."""
+    fall = math.tan(math.radians(slope))
+    bed = Bed(
+        size=(0.4, 0.06, 0.08),
+        spacing=0.01,
+        headroom=0.1,
+        surface=lambda x, y: np.maximum(-0.06, 0.03 - fall * np.abs(x - 0.2)),
+        walls=Walls(y="slip"),
+        particles_per_cell=4.0,
+        **kw,
+    )
+    return Scene(bed=bed, duration=0.3, frame_rate=20.0)
+
+
+def furthest(scene: Scene) -> float:
+    """Way of the particle that moves furthest [m]."""
+    first, *_, last = Solver(scene).frames()
+    return float(np.linalg.norm(last.position - first.position, axis=1).max())
+
+
+def test_a_heap_stands_below_its_friction_angle_and_flows_above():
+    assert heap(25.0).warnings() == []
+    assert furthest(heap(25.0)) < 1e-3
+    (warning,) = heap(60.0).warnings()
+    assert "bed.surface is up to 60 degrees steep, more than the soil's friction (37.2 degrees)" in warning
+    assert furthest(heap(60.0)) > 0.01
+
+
+def test_the_stress_below_a_slope_carries_it():
+    """Without the shear stress of the slope the soil first gives way."""
+    bed = Bed(size=(0.4, 0.06, 0.08), spacing=0.01, headroom=0.12, surface=20.0, walls=Walls(y="slip"))
+    first, second = islice(Solver(Scene(bed=bed, frame_rate=200.0)).frames(), 2)
+    inside = (first.position[:, 0] > 0.1) & (first.position[:, 0] < 0.3)
+    assert np.abs(second.velocity[inside]).mean() < 2e-3  # 9.81 / 200 in free fall
+
+
+@pytest.mark.parametrize(
+    ("surface", "words"),
+    [
+        (70.0, "bed.surface is 70.0 degrees; allowed: -60 to 60, or a map of heights"),
+        ("map.npy", "bed.surface is 'map.npy' degrees; allowed"),
+        ([[0.0, 1.0], [0.0]], "is no map of heights; it needs 2 or more rows"),
+        ([[0.0, 0.01]], "is no map of heights"),
+        ([[0.0, "a"], [0.0, 0.0]], "is no map of heights"),
+        ([[0.0, np.nan], [0.0, 0.0]], "not finite, in row 1, number 2"),
+        (np.zeros((400, 400)), "has 400 x 400 heights; at most 100000"),
+        ([[0.0, 0.3], [0.0, 0.0]], r"reaches from 0 to 0.3 m; allowed: from the floor \(-0.15 m\) to below"),
+        ([[0.0, -0.2], [0.0, 0.0]], r"reaches from -0.2 to 0 m"),
+        (np.full((2, 2), -0.15), r"a grid spacing of soil somewhere"),
+    ],
+)
+def test_surfaces_that_are_refused(surface, words):
+    with pytest.raises(SceneError, match=words):
+        Bed(surface=surface)
+    with pytest.raises(SceneError, match=r"bed.surface is given, but a scene of the kind column"):
+        Column(bed=replace(Column().bed, surface=5.0))
+
+
+def test_a_tool_in_a_heap_displaces_it():
+    bed = replace(cut().bed, surface=hill, headroom=0.2)
+    assert len(cut(bed=bed, clearance=0.01, start=0.6, motion="rest").displaced) > 0
+    assert len(cut(bed=bed, clearance=0.08, start=0.6, motion="rest").displaced) == 0
+    assert Preview.of(cut(bed=bed, clearance=0.01, start=0.6, motion="rest")).first_touch == 0.0

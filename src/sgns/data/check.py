@@ -156,17 +156,15 @@ def _check_stopped(file: h5py.File) -> Iterator[str]:
 
 
 def _state_problems(path: str | os.PathLike[str]) -> list[str]:
-    """Why an interrupted run cannot be gone on with."""
+    """Why an interrupted run cannot be gone on with, or the soil of one cannot be started from."""
     try:
         with Run(path) as run:
-            if run.stopped is None or not run.stopped.startswith(_INTERRUPTED):
-                return []
-            frames, last = run.frame_count, run.state.frame
+            interrupted = run.stopped is not None and run.stopped.startswith(_INTERRUPTED)
+            if interrupted or (run.stopped is None and run.has_state):
+                _ = run.soil
     except UserError as error:
         return [str(error)]
-    if last == frames - 1:
-        return []
-    return [f"it holds {frames} frames but the state of frame {last}; repeat the run"]
+    return []
 
 
 def _verdict(path: Path) -> str:

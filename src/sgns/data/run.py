@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
-from mpm_warp import State
+from mpm_warp import Scene, Soil, State
 from mpm_warp.motions import along_and_across
 from sgns.config import UserError, parse_yaml
 from sgns.data.files import one_line
@@ -25,6 +25,7 @@ from sgns.data.hdf5 import BROKEN, own_attribute, own_dataset, own_object
 from sgns.data.run_file import (
     STATE,
     STOPPED,
+    WHOLE,
     open_run,
     read_attributes,
     read_mesh,
@@ -231,8 +232,13 @@ class Run:
         )
 
     @property
+    def has_state(self) -> bool:
+        """Whether the file holds more of the last frame than was recorded: that of a rollout does not."""
+        return STATE in self._file
+
+    @property
     def state(self) -> State:
-        """What the solver of a stopped run needs to go on.
+        """What the solver has in memory after the last frame.
 
         Raises:
             UserError: the file holds none, or it is damaged.
@@ -241,19 +247,38 @@ class Run:
             group = own_object(self._file, STATE)
             if not isinstance(group, h5py.Group):
                 raise UserError(
-                    f"{self.path} holds no state to go on from; give a *.stopped.h5, which `sgns simulate` leaves when "
-                    "the solver stops"
+                    f"{self.path} holds no state to go on from: it is no run of `sgns simulate`, or one of an older "
+                    "version; repeat the run"
                 )
             datasets = {name: own_dataset(group, name) for name in sorted(group)}
             for name, found in datasets.items():
                 if found.dtype.kind not in "if":
                     raise UserError(f"{self.path}: /{STATE}/{name} does not hold numbers; repeat the run")
             frame = int(own_attribute(group, "frame"))
-            return State(frame, {name: found[...] for name, found in datasets.items()})
+            arrays = {name: found[...] for name, found in datasets.items()}
+            return State(frame, arrays, arrays.pop(WHOLE, None))
         except BROKEN as error:
             raise UserError(
                 f"{self.path}: its state is damaged ({one_line(error)}); repeat the run"
             ) from error
+
+    @property
+    def soil(self) -> Soil:
+        """Soil after the last frame, for another tool and path: `mpm_warp.Solver(scene, start_from=run.soil)`.
+
+        Raises:
+            UserError: the file holds none, or it is damaged.
+        """
+        state = self.state
+        if state.frame != self.frame_count - 1:
+            raise UserError(
+                f"{self.path} holds {self.frame_count} frames but the state of frame {state.frame}; repeat the run"
+            )
+        try:
+            scene = Scene.from_dict(self.scene, self.mesh)
+            return Soil(scene, state, self.pose[-1], f"{self.path}@{state.frame}")
+        except SceneError as error:
+            raise UserError(f"{self.path}: {error}; repeat the run") from error
 
     # --- the file -----------------------------------------------------------------------------------------
 

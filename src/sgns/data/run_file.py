@@ -52,7 +52,9 @@ ATTRIBUTES: dict[str, type | tuple[type, ...]] = {
 STOPPED = "stopped"
 """Root attribute that only some files have: why a run ended before its time."""
 STATE = "state"
-"""Group of a run whose solver stopped: the arrays to go on from."""
+"""Group of a solver's run: its arrays at the last frame, to go on or to start another run from."""
+WHOLE = "whole"
+"""The one of them that says how the whole bed follows from the half that was computed."""
 
 
 @dataclass(frozen=True)

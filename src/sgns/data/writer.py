@@ -29,6 +29,7 @@ from sgns.data.run_file import (
     SERIES,
     STATE,
     STOPPED,
+    WHOLE,
     Recorded,
     open_run,
     read_attributes,
@@ -295,14 +296,17 @@ class RunWriter:
             kept.append(frame[name])
         self._hash.update(frame)
 
-    def finish(self, wall_time_s: float) -> None:
+    def finish(self, wall_time_s: float, state: State | None = None) -> None:
         """Complete the file and give it its name; `wall_time_s` is what it took to compute the run [s].
 
-        What an earlier attempt at this run left is removed.
+        What an earlier attempt at this run left is removed. `state` is the solver's at the last frame: other runs may
+        start from it.
         """
-        self._open_file()
+        file = self._open_file()
         if self.frame_count == 0:
             raise ValueError("no frame was appended")
+        if state is not None:
+            _write_state(file, state)
         self._complete(wall_time_s, self.path)
         kept = stopped_path(self.path)
         if not kept.is_symlink() and _is_stopped(kept):
@@ -319,10 +323,7 @@ class RunWriter:
         file = self._open_file()
         _set(file, STOPPED, reason)
         if state is not None:
-            group = file.create_group(STATE)
-            group.attrs["frame"] = np.int64(state.frame)
-            for name, array in state.arrays.items():
-                group[name] = array
+            _write_state(file, state)
         path = stopped_path(self.path)
         self._complete(wall_time_s, path)
         return path
@@ -394,6 +395,17 @@ class RunWriter:
                 file.close()
         finally:
             self._disk.discard()
+
+
+def _write_state(file: h5py.File, state: State) -> None:
+    group = file.create_group(STATE)
+    group.attrs["frame"] = np.int64(state.frame)
+    arrays = state.arrays | ({} if state.whole is None else {WHOLE: state.whole})
+    for name, array in arrays.items():
+        # Checksummed: no content hash guards them.
+        group.create_dataset(
+            name, data=array, chunks=array.shape if array.size else None, fletcher32=array.size > 0
+        )
 
 
 def _set(owner: h5py.Group | h5py.Dataset, name: str, value: Any) -> None:

@@ -34,6 +34,7 @@ _BYTES_PER_PARTICLE = 24
 _BYTES_PER_FRAME = 240
 _BYTES_PER_BODY_POINT = 24
 _BYTES_PER_FILE = 30_000
+_BYTES_OF_STATE = 144  # of a computed particle, in float32
 CORE_RATE = 1.0e7
 """Particle-steps per second on one core of a good CPU, which estimates assume (experiments/throughput)."""
 
@@ -67,8 +68,8 @@ class RunCost:
         return self.substeps * (self.frames - 1)
 
 
-def run_cost(scene: Scene) -> RunCost:
-    """The cost of a scene's run.
+def run_cost(scene: Scene, effects: Effects | None = None) -> RunCost:
+    """The cost of a scene's run; without `effects` with all of the bed in its last state.
 
     Raises:
         SceneError: it is too large to be computed.
@@ -79,7 +80,9 @@ def run_cost(scene: Scene) -> RunCost:
         stored * _BYTES_PER_PARTICLE + len(scene.body_points()) * _BYTES_PER_BODY_POINT + _BYTES_PER_FRAME
     )
     frames = scene.frame_count
-    return RunCost(particles, substeps, frames, size=frames * per_frame + _BYTES_PER_FILE)
+    computed = particles // 2 if effects is not None and effects.symmetry else particles
+    size = frames * per_frame + computed * _BYTES_OF_STATE + _BYTES_PER_FILE
+    return RunCost(particles, substeps, frames, size)
 
 
 def cost_line(costs: Sequence[RunCost]) -> str:

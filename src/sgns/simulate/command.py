@@ -32,6 +32,8 @@ from sgns.simulate.scene import (
     recorded,
     require_meant,
     scene_from_config,
+    scene_on,
+    soil_of,
     warning_summary,
 )
 from sgns.simulate.workers import simulate_campaign
@@ -97,6 +99,11 @@ def main(cfg: DictConfig) -> float | None:
         same = {name: getattr(restart, name) for name in ("effects", "reasons", "seed", "precision")}
         return simulate_one(restart.scene, cfg, **same, restart=restart)
     asked = asked_effects(cfg)
+    if cfg.start_from is not None and cfg.get("dataset") is not None:
+        raise UserError(
+            "start_from is for single runs: the runs of a dataset share one undisturbed bed; "
+            "leave out dataset=, or let every run make several passes: scene.motion=passes"
+        )
     if cfg.get("dataset") is not None:  # `dataset: null` in a defaults list leaves no key
         settings = plain(cfg.dataset)
         if settings.get("where"):
@@ -120,7 +127,10 @@ def main(cfg: DictConfig) -> float | None:
         return None
     if (cfg.shard, cfg.shards) != (0, 1):
         raise UserError("shard and shards divide the runs of a dataset; give dataset=... or leave them out")
-    scene = scene_from_config(cfg)
+    if cfg.start_from is None:
+        scene = scene_from_config(cfg)
+    else:
+        scene = scene_on(soil_of(cfg.start_from), cfg, HydraConfig.get().overrides.task)
     preview = Preview.of(scene)
     if not Limits.from_dict(plain(cfg.limits)).any_unit:
         require_meant(preview, "limits.any_unit=true")
@@ -139,7 +149,8 @@ def _way_on(cfg: DictConfig) -> str:
     if cfg.continue_from is None and HydraConfig.get().mode == RunMode.RUN:
         return "the same command goes on from there"
     kept = stopped_path(Path(cfg.output))
-    return f"sgns simulate continue_from={kept} output={cfg.output} goes on from there"
+    soil = f" start_from={cfg.start_from}" if cfg.start_from is not None else ""
+    return f"sgns simulate continue_from={kept}{soil} output={cfg.output} goes on from there"
 
 
 def simulate_one(scene: Scene, cfg: DictConfig, restart: Restart | None = None, **settings: Any) -> float:
@@ -152,7 +163,7 @@ def simulate_one(scene: Scene, cfg: DictConfig, restart: Restart | None = None, 
             restart = unfinished(output, scene, **same)
         if restart is not None:
             log.info("going on from frame %d of %s", restart.state.frame, restart.path)
-        cost = run_cost(scene)
+        cost = run_cost(scene, settings["effects"])
         log.info("%s", cost_line([cost]))
         require_limits({scene.name: cost}, Limits.from_dict(plain(cfg.limits)))
         require_space(output.parent, cost.size)

@@ -12,14 +12,14 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mpm_warp import Effects, Scene, Solver, SolverStopped, State
+from mpm_warp import Effects, Scene, Soil, Solver, SolverStopped, State
 from mpm_warp.launch import Job
 from mpm_warp.solver import run_concurrently
 from sgns.config import Interrupted, UserError, differences, heed, held_back
 from sgns.data.run import Run
 from sgns.data.writer import RunWriter, stopped_path
 from sgns.numbers import elapsed
-from sgns.simulate.scene import replaced
+from sgns.simulate.scene import replaced, soil_of
 
 # --- Going on with a run whose solver stopped -----------------------------------------------------------
 
@@ -38,6 +38,7 @@ _LATER = ("cohesion",)
 """Effects that earlier run files do not name: their soil had none."""
 _OTHERS = (
     "continue_from",
+    "start_from",
     "output",
     "device",
     "solver.precision",
@@ -67,11 +68,30 @@ class Restart:
     """What its frames took [s]."""
     earlier: list[dict[str, Any]]
     """What the file says of earlier restarts."""
+    start_from: dict[str, Any]
+    """What it says of the soil that it started from; empty: the scene's own."""
 
     @property
     def changed_scene(self) -> Scene:
         """What is computed from here on."""
-        return Scene.from_dict(replaced(self.scene.to_dict(), self.changes), self.scene.mesh)
+        found = Scene.from_dict(replaced(self.scene.to_dict(), self.changes), self.scene.mesh)
+        return found if self.scene.soil is None else found.starting_from(self.scene.soil)
+
+    def on(self, soil: Soil | None) -> Restart:
+        """The same with the soil that the run started from.
+
+        Raises:
+            UserError: that was another one.
+        """
+        if self.start_from and soil is None:
+            raise UserError(
+                f"{self.path} started from the soil of {self.start_from.get('run')}; give that, too: start_from=..."
+            )
+        if (soil.digest if soil is not None else None) != self.start_from.get("soil"):
+            raise UserError(
+                f"{self.path} did not start from the soil of start_from; leave it out, or give that run's"
+            )
+        return self if soil is None else replace(self, scene=self.scene.starting_from(soil))
 
     @property
     def record(self) -> list[dict[str, Any]]:
@@ -95,7 +115,7 @@ def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
     """
     path = Path(str(cfg.continue_from))
     asked = _changes(cfg, overrides)
-    restart = _read_stopped(path)
+    restart = _read_stopped(path).on(soil_of(str(cfg.start_from)) if cfg.get("start_from") else None)
     if any(o.lstrip("+").startswith(f"{_FILE}=") for o in overrides):
         raise UserError(f"{path} brings its own tool; leave out {_FILE}")
     changes = restart.changes | asked
@@ -123,8 +143,9 @@ def unfinished(output: Path, scene: Scene, effects: Effects, seed: int, precisio
         there = _read_stopped(path)
     except UserError as error:
         raise UserError(f"{error}; {anew}") from error
-    asked = _as_keys(scene, effects, seed, precision)
+    asked = _as_keys(scene, effects, seed, precision) | {"start_from": _origin(scene).get("soil")}
     found = _as_keys(there.changed_scene, there.effects, there.seed, there.precision)
+    found |= {"start_from": there.start_from.get("soil")}
     if different := differences(found, asked):
         named = [
             f"{key} is {_shown(old)} there and {_shown(new)} here" for key, (old, new) in different.items()
@@ -133,7 +154,12 @@ def unfinished(output: Path, scene: Scene, effects: Effects, seed: int, precisio
         raise UserError(
             f"{path} is an unfinished run of other settings: {', '.join(named[:3])}{more}; {anew}"
         )
-    return there
+    return there.on(scene.soil)
+
+
+def _origin(scene: Scene) -> dict[str, Any]:
+    """What a run file says of the soil that a scene starts from."""
+    return {} if scene.soil is None else {"run": scene.soil.source, "soil": scene.soil.digest}
 
 
 def _as_keys(scene: Scene, effects: Effects, seed: int, precision: str) -> dict[str, Any]:
@@ -178,6 +204,7 @@ def _read_stopped(path: Path) -> Restart:
         state=state,
         wall_time=run.wall_time_s,
         earlier=earlier,
+        start_from=extra["start_from"] if isinstance(extra.get("start_from"), dict) else {},
     )
 
 
@@ -299,7 +326,9 @@ def scene_stages(
             frame_rate=scene.frame_rate,
             seed=seed,
             producer="mpm",
-            extra=made_with | ({"continued": restart.record} if restart is not None else {}),
+            extra=made_with
+            | ({"continued": restart.record} if restart is not None else {})
+            | ({"start_from": _origin(scene)} if scene.soil is not None else {}),
             mesh=scene.mesh,
         ) as writer,
         ExitStack() as to_the_end,
@@ -344,7 +373,7 @@ def scene_stages(
             kept = writer.stop(clock.seconds, str(stopped), stopped.state)
             raise SolverStopped(f"{stopped}. {_way_on(str(stopped), kept, output, computed)}") from stopped
         clock.read(clock.shared_by)
-        writer.finish(clock.seconds)
+        writer.finish(clock.seconds, solver.state())
     frames = scene.frame_count - max(1, there)
     steps = frames * solver.substeps_per_frame * solver.computed_count
     yield Timing(elapsed(before, clock.seconds), frames / scene.frame_rate, steps)
@@ -370,7 +399,8 @@ class _Clock:
 
 def _way_on(cause: str, kept: Path, output: Path, computed: Scene) -> str:
     """Where the frames are, and how to go on if a restart can do what the cause asks for."""
-    command = f"They are kept: sgns simulate continue_from={kept} output={output}"
+    soil = f" start_from={computed.soil.source}" if computed.soil is not None else ""
+    command = f"They are kept: sgns simulate continue_from={kept}{soil} output={output}"
     if "scene.courant" in cause:
         return f"{command} scene.courant={0.5 * computed.courant:g} goes on from there with half the step"
     if "scene.bed.headroom" in cause:

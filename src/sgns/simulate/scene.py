@@ -17,12 +17,15 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from scipy.interpolate import PchipInterpolator
 
-from mpm_warp import Bed, Decision, Effects, Preview, Scene, SceneError, Tolerances, effects_for
+from mpm_warp import Bed, Decision, Effects, Preview, Scene, SceneError, Soil, Tolerances, effects_for
+from mpm_warp.bed import MOST_HEIGHTS
 from mpm_warp.bodies import Tool
-from mpm_warp.inputs import read_text
+from mpm_warp.inputs import read_bytes, read_text
 from mpm_warp.poses import rotation_matrices
 from mpm_warp.settings import short
 from sgns.config import UserError, flattened
+from sgns.data.files import one_line
+from sgns.data.run import Run
 
 # --- From conf to a scene of mpm_warp -------------------------------------------------------------------
 
@@ -37,7 +40,9 @@ def scene_from_config(cfg: DictConfig) -> Scene:
 
 
 def scene_from_data(data: dict[str, Any]) -> Scene:
-    """A scene from nested data, in which `path` may be the name of a file."""
+    """A scene from nested data, in which `path` and `bed.surface` may be the names of files."""
+    if isinstance(data.get("bed"), dict) and isinstance(data["bed"].get("surface"), str):
+        data = replaced(data, {"bed.surface": read_heights(Path(data["bed"]["surface"]))})
     if not isinstance(data.get("path"), str):
         return Scene.from_dict(data)
     file = Path(data["path"])
@@ -48,6 +53,47 @@ def scene_from_data(data: dict[str, Any]) -> Scene:
     except SceneError as error:  # its rows are lines of the file
         words = re.sub(r"\brow (\d+)", lambda row: f"line {lines[int(row[1]) - 1]} of {file}", str(error))
         raise SceneError(words) from None
+
+
+_FROM_THE_RUN = ("bed", "material", "gravity", "tilt")
+"""Of the scene: what the run to start from says, unless the command does."""
+
+
+def soil_of(words: str) -> Soil:
+    """What `start_from` names: a run, or run@frame with the number of its last frame.
+
+    Raises:
+        UserError: the file is no run with a state, or another frame is asked for.
+    """
+    name, _, frame = words.rpartition("@")
+    if Path(words).exists() or not name or not re.fullmatch(r"-?\d+", frame):
+        name, frame = words, "-1"
+    with Run(name) as run:
+        last = run.frame_count - 1
+        if int(frame) not in (-1, last):
+            raise UserError(
+                f"start_from: {name} keeps stresses and all else that soil remembers for its last frame only, number "
+                f"{last}; for frame {frame} simulate it again with scene.duration={int(frame) / run.frame_rate:.6g}"
+            )
+        return run.soil
+
+
+def scene_on(soil: Soil, cfg: DictConfig, overrides: Sequence[str]) -> Scene:
+    """The scene of `cfg` in the bed and soil of another run; gravity and tilt are that run's, too, if the command's
+    `overrides` do not say otherwise.
+
+    Raises:
+        SceneError: they say something of bed or soil that does not fit.
+    """
+    data, there = plain(cfg.scene) | {"material": plain(cfg.material)}, soil.scene.to_dict()
+    given = {one.lstrip("+~").partition("=")[0] for one in overrides} - {"scene"}  # which chooses a kind
+    for key, value in flattened({name: there[name] for name in _FROM_THE_RUN}).items():
+        place = key if key.startswith("material") else f"scene.{key}"
+        if not any(place == one or place.startswith(f"{one}.") for one in given):
+            data = replaced(data, {key: value})
+    if "friction_angle" in data and "scene.friction_angle" not in given:
+        data["friction_angle"] = None  # the soil's own
+    return scene_from_data(data).starting_from(soil)
 
 
 def plain(group: DictConfig) -> dict[str, Any]:
@@ -134,6 +180,49 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def read_heights(file: Path) -> list[list[float]]:
+    """A map of heights [m] for `scene.bed.surface`: rows from x = 0 to Lx of heights from y = 0 to Ly.
+
+    A `.npy` array or a table (`.csv`, `.txt`) is such rows. A TIFF of decimal numbers is a map seen from above: its
+    first line is the far side, y = Ly, and its columns go along x.
+    """
+    kind, allowed = file.suffix.lower(), ".npy, .csv, .txt, .tif"
+    try:
+        content = read_bytes(file, _MOST_BYTES)
+        if kind == ".npy":
+            found = np.load(io.BytesIO(content), allow_pickle=False)
+        elif kind in (".csv", ".txt"):
+            mark = "," if b"," in content else None
+            found = np.loadtxt(io.StringIO(content.decode("utf-8-sig")), delimiter=mark, ndmin=2)
+        elif kind in (".tif", ".tiff"):
+            found = _read_tiff(content)
+        else:
+            raise ValueError(f"it is no map of heights in metres; allowed: {allowed}")
+        if found.ndim != 2 or found.dtype.kind not in "fiu":
+            raise ValueError(
+                f"it holds {found.dtype} of shape {found.shape}; a map of heights has rows of numbers"
+            )
+    except (OSError, ValueError, EOFError, MemoryError) as error:
+        words = one_line(getattr(error, "strerror", None) or error)
+        raise UserError(f"scene.bed.surface: cannot read {file}: {words}") from None
+    return found.astype(float).tolist()
+
+
+def _read_tiff(content: bytes) -> np.ndarray:
+    from PIL import Image
+
+    with Image.open(io.BytesIO(content), formats=["TIFF"]) as picture:
+        if picture.mode != "F":
+            raise ValueError(
+                "its heights are whole numbers, of no unit; save them as decimal numbers, in metres"
+            )
+        if picture.width * picture.height > MOST_HEIGHTS:
+            raise ValueError(
+                f"it holds {picture.width} x {picture.height} heights, at most {MOST_HEIGHTS} are allowed; coarsen it"
+            )
+        return np.asarray(picture)[::-1].T
 
 
 def require_meant(preview: Preview, remedy: str, name: str = "") -> None:

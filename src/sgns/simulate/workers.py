@@ -84,7 +84,7 @@ def simulate_campaign(
         )
     physics = campaign.physics  # before anything is written: what was asked for may be impossible
     campaign.record()
-    costs = {name: run_cost(scene) for name, scene in campaign.scenes.items()}
+    costs = {name: run_cost(scene, physics[name][0]) for name, scene in campaign.scenes.items()}
     by_length = sorted(costs, key=lambda name: costs[name].particle_steps, reverse=True)
     share = by_length[shard::shards]
     missing = [name for name in share if not is_done(campaign.file(name), campaign.scenes[name])]

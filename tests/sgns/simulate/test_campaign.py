@@ -15,7 +15,9 @@ from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
 from sgns.simulate.campaign import Campaign, duration_words, finishing_time, plan, run_cost, size_words
 from sgns.simulate.run import simulate_scene
+from sgns.simulate.scene import scene_from_config, warning_summary
 from sgns_testing.campaigns import BASE, EFFECTS, campaign
+from sgns_testing.commands import composed
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
 # --- What runs cost: counted, scheduled, and said in words ----------------------------------------------
@@ -330,3 +332,15 @@ def test_long_values_give_short_names_and_a_table(paths):
 def test_draws_of_files_it_refuses(paths, draw, words):
     with pytest.raises(UserError, match=words):
         of_files(paths, draw=draw)
+
+
+def test_runs_of_several_passes_share_a_bed(tmp_path):
+    base = scene_from_config(composed("scene=quick_excavation", "scene.motion=passes", "scene.duration=8"))
+    draw = {"passes.number": [1, 2], "passes.deepening": [0.0, 0.02], "passes.advance": [0.0, 0.04]}
+    c = plan({"name": "own", "path": str(tmp_path), "draw": draw}, base.to_dict(), EFFECTS, "float32", 0)
+    scenes = list(c.scenes.values())
+    assert (
+        len(scenes) == 8 == len({scene.body_poses().tobytes() for scene in scenes}) + 3
+    )  # one pass has no spacing
+    assert len({scene.arrangement_hash for scene in scenes}) == 1
+    assert warning_summary(c.scenes) == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import signal
+from dataclasses import fields
 from typing import Any
 
 import h5py
@@ -321,6 +322,114 @@ def test_a_damaged_unfinished_run_is_refused(interrupted, tmp_path):
         del file["state"]
     line = refusal(tmp_path, "simulate", *SMALL, "output=run.h5")
     assert "holds no state to go on from" in line and "overwrite=true begins anew" in line
+
+
+# --- Soil of another run --------------------------------------------------------------------------------
+
+
+def test_a_run_starts_from_the_soil_of_another(tmp_path):
+    assert sgns(tmp_path, "simulate", *SMALL, "scene.gravity=5.0", "output=one.h5").returncode == 0
+    assert check_run(tmp_path / "one.h5") == []
+    new = ["scene.blade={length: 0.1, width: 0.12, thickness: 0.08}", "scene.rake=5", "scene.start=0.3"]
+    new += ["scene.duration=0.1"]
+    done = sgns(tmp_path, "simulate", "start_from=one.h5@12", *new, "output=two.h5")
+    assert done.returncode == 0, done.stderr
+    assert check_run(tmp_path / "two.h5") == []
+    with Run(tmp_path / "one.h5") as one, Run(tmp_path / "two.h5") as two:
+        np.testing.assert_array_equal(one.positions(-1), two.positions(0))
+        np.testing.assert_array_equal(one.velocities(-1), two.velocities(0))
+        assert two.scene["bed"] == one.scene["bed"] and two.scene["gravity"] == 5.0
+        assert two.extra["start_from"] == {"run": "one.h5@12", "soil": one.soil.digest}
+        assert two.arrangement_hash != one.arrangement_hash
+        # And from Python.
+        scene = Scene.from_dict(two.scene)
+        effects = Effects(**{effect.name: two.effects[effect.name]["on"] for effect in fields(Effects)})
+        *_, last = Solver(scene, effects, start_from=one.soil).frames()
+        np.testing.assert_array_equal(last.position, two.positions(-1)[0])
+    third = sgns(
+        tmp_path, "simulate", "start_from=two.h5", "scene=wheel", "scene.load=5.0", *ROLLS, "output=three.h5"
+    )
+    assert third.returncode == 0, third.stderr
+
+
+ROLLS = ["scene.width=0.09", "scene.diameter=0.1", "scene.duration=0.1", "scene.settle=0.05"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["start_from=none.h5"], "no such run file: none.h5"),
+        (
+            ["start_from=one.h5@3"],
+            "for its last frame only, number 12; for frame 3 simulate it again with scene.dur",
+        ),
+        (
+            ["start_from=one.h5", "scene.bed.spacing=0.02"],
+            "scene.bed.spacing is 0.02, but 0.04 in the run to start fr",
+        ),
+        (
+            ["start_from=one.h5", "material.youngs_modulus=2e6"],
+            "material.youngs_modulus is 2e+06, but 1e+06 in",
+        ),
+        (["start_from=one.h5", "scene=column"], "a scene of the kind column has a start of its own"),
+        (["start_from=one.h5", "dataset=quick"], "start_from is for single runs"),
+        (
+            ["start_from=bad.h5"],
+            "bad.h5: the soil to start from is not good: log_volume is not finite; repeat the run",
+        ),
+        (["start_from=old.h5"], "old.h5 holds no state to go on from"),
+        (["start_from=shape.h5"], "velocity has shape (3, 3) and not"),
+    ],
+)
+def test_soil_that_a_run_cannot_start_from(run_with_state, arguments, words):
+    tool = [] if "scene=column" in arguments or "dataset=quick" in arguments else SMALL[2:]
+    assert words in refusal(run_with_state, "simulate", *arguments, *tool)
+
+
+@pytest.fixture(scope="module")
+def run_with_state(tmp_path_factory):
+    """A folder with a run and damaged copies of it."""
+    folder = tmp_path_factory.mktemp("soil")
+    assert sgns(folder, "simulate", *SMALL, "output=one.h5").returncode == 0
+    for name in ("bad.h5", "old.h5", "shape.h5"):
+        shutil.copy(folder / "one.h5", folder / name)
+    with h5py.File(folder / "bad.h5", "r+") as file:
+        file["state/log_volume"][5] = np.nan
+    with h5py.File(folder / "old.h5", "r+") as file:
+        del file["state"]
+    with h5py.File(folder / "shape.h5", "r+") as file:
+        del file["state/velocity"]
+        file["state/velocity"] = np.zeros((3, 3))
+    assert check_run(folder / "old.h5") == []  # nothing is wrong with it
+    for name in ("bad.h5", "shape.h5"):
+        (problem,) = check_run(folder / name)
+        assert "the soil to start from is not good" in problem
+    return folder
+
+
+def test_an_interrupted_run_on_the_soil_of_another_goes_on_with_it(run_with_state, interrupted, tmp_path):
+    for name in ("one.h5", "two.h5"):
+        shutil.copy(run_with_state / "one.h5", tmp_path / name)
+    with h5py.File(tmp_path / "two.h5", "r+") as file:
+        file["state/position"][0, 2] += 1e-3
+    command = ["simulate", "start_from=one.h5", "scene.duration=0.2", *SMALL[3:], "output=run.h5"]
+    assert sgns(tmp_path, *command).returncode == 128 + signal.SIGTERM
+    line = refusal(tmp_path, "simulate", "continue_from=run.stopped.h5")
+    assert "run.stopped.h5 started from the soil of one.h5@12; give that, too: start_from=..." in line
+    line = refusal(tmp_path, "simulate", "continue_from=run.stopped.h5", "start_from=two.h5")
+    assert "did not start from the soil of start_from" in line
+    assert "start_from is " in refusal(tmp_path, *command, "start_from=two.h5")
+    shutil.copy(tmp_path / "run.stopped.h5", tmp_path / "other.stopped.h5")
+    way = ["simulate", "continue_from=other.stopped.h5", "start_from=one.h5", "output=other.h5"]
+    assert sgns(tmp_path, *way).returncode == 0
+    assert sgns(tmp_path, *command).returncode == 0
+    assert sgns(tmp_path, *command[:-1], "output=whole.h5").returncode == 0
+    with (
+        Run(tmp_path / "run.h5") as one,
+        Run(tmp_path / "other.h5") as two,
+        Run(tmp_path / "whole.h5") as three,
+    ):
+        assert one.content_hash == two.content_hash == three.content_hash
 
 
 def pushed(file) -> Body:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 from mpm_warp import Decision, Effects, Scene, SceneError, Tolerances, Wheel
 from sgns.config import UserError
@@ -18,6 +21,7 @@ from sgns.simulate.command import simulate_campaign
 from sgns.simulate.scene import (
     asked_effects,
     decided,
+    read_heights,
     read_path,
     scene_from_config,
     scene_from_data,
@@ -278,3 +282,59 @@ def test_numbers_in_another_unit_are_refused_before_the_run(tmp_path):
     with pytest.raises(UserError, match=r"far: .* look like millimetres"):
         warning_summary(scenes)
     assert len(warning_summary(scenes, any_unit=True)) == 1
+
+
+# --- The surface of the bed from a file -----------------------------------------------------------------
+
+HEIGHTS = np.array([[0.0, 0.01, 0.02], [0.03, 0.04, 0.05]])  # 2 along x, 3 along y
+
+
+def write_heights(file: Path) -> None:
+    if file.suffix == ".npy":
+        np.save(file, HEIGHTS)
+    elif file.suffix == ".tif":
+        Image.fromarray(HEIGHTS.T[::-1].astype(np.float32)).save(file)
+    else:
+        np.savetxt(file, HEIGHTS, delimiter="," if file.suffix == ".csv" else " ", header="heights [m]")
+
+
+@pytest.mark.parametrize("name", ["map.npy", "map.csv", "map.txt", "map.tif"])
+def test_a_map_of_heights_is_read(name, tmp_path):
+    write_heights(tmp_path / name)
+    scene = scene_from_config(composed(f"scene.bed.surface={tmp_path / name}"))
+    np.testing.assert_allclose(scene.bed.surface, HEIGHTS, atol=1e-7)
+    assert scene_from_config(composed("scene.bed.surface=-12")).bed.surface == -12.0
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("none.npy", None, "No such file or directory"),
+        ("map.png", b"x", "it is no map of heights in metres; allowed: .npy, .csv, .txt, .tif"),
+        ("map.npy", b"x", "cannot read"),
+        ("map.csv", b"0,1\n2", "cannot read"),
+        ("map.csv", b"0,a\n2,3", "could not convert string 'a'"),
+        ("map.tif", b"x", "cannot identify image file"),
+    ],
+)
+def test_a_map_that_cannot_be_read(name, content, words, tmp_path):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match=words) as caught:
+        scene_from_config(composed(f"scene.bed.surface={tmp_path / name}"))
+    assert str(caught.value).startswith("scene.bed.surface: cannot read") and "\n" not in str(caught.value)
+
+
+def test_maps_of_whole_numbers_or_objects_are_refused(tmp_path):
+    Image.fromarray(np.zeros((3, 3), np.uint8)).save(tmp_path / "map.tif")
+    with pytest.raises(UserError, match="its heights are whole numbers, of no unit"):
+        read_heights(tmp_path / "map.tif")
+    Image.fromarray(np.zeros((400, 300), np.float32)).save(tmp_path / "map.tif")
+    with pytest.raises(UserError, match="it holds 300 x 400 heights, at most 100000"):
+        read_heights(tmp_path / "map.tif")
+    np.save(tmp_path / "map.npy", np.array([[{}]], dtype=object), allow_pickle=True)
+    with pytest.raises(UserError, match="allow_pickle=False"):
+        read_heights(tmp_path / "map.npy")
+    np.save(tmp_path / "map.npy", np.zeros(3))
+    with pytest.raises(UserError, match=r"it holds float64 of shape \(3,\); a map of heights has rows"):
+        read_heights(tmp_path / "map.npy")
