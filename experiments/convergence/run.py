@@ -42,6 +42,7 @@ VARIANTS: dict[str, dict] = {
     "slice, length 10 mm": {"length_scale": 0.010},
     "slice, length 20 mm": {"length_scale": 0.020},
     "slice, length 40 mm": {"length_scale": 0.040},
+    "slice, bevel, margin -0.375": {"edge": "bevel", "margin": -0.375},
     "slice, bevel, margin -0.5": {"edge": "bevel", "margin": -0.5},
     "slice, bevel, margin -0.75": {"edge": "bevel", "margin": -0.75},
     "slice, bevel, length 10 mm": {"edge": "bevel", "length_scale": 0.010},
@@ -50,6 +51,7 @@ VARIANTS: dict[str, dict] = {
     "bin": {"wide": True},
     "bin, level": {"wide": True, "edge": "level"},
     "bin, bevel": {"wide": True, "edge": "bevel"},
+    "bin, bevel, margin -0.375": {"wide": True, "edge": "bevel", "margin": -0.375},
     "bin, bevel, margin -0.5": {"wide": True, "edge": "bevel", "margin": -0.5},
 }
 
