@@ -52,7 +52,7 @@ test: setup ## run the tests, in two processes: 5 minutes on two cores
 stability: setup ## hard cases, kills, full disks and random input (most of an hour of one core; the hard cases go on where they stopped)
 	$(BIN)/python experiments/stability/run.py --workers $(WORKERS)
 	$(BIN)/python experiments/stability/wrong_inputs.py
-	$(BIN)/python -m pytest -m long tests/stability
+	$(BIN)/python -m pytest -m long
 	SGNS_FUZZ=20 $(BIN)/python -m pytest -s --timeout 1200 tests/stability/fuzz
 
 lint: setup ## check the code's style, format and types

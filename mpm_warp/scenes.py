@@ -409,11 +409,6 @@ class Column(Scene):
                 f"half the bin ({room:g} m)"
             )
 
-    @property
-    def aspect_ratio(self) -> float:
-        """Height over radius [-]."""
-        return self.bed.size[2] / self.radius
-
     @cached_property
     def filled(self) -> tuple[np.ndarray, float]:
         positions, volume = self.bed.filled

@@ -26,6 +26,12 @@ def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without pictures, which take seconds; tests/sgns/evaluate looks at them."""
+    monkeypatch.setattr("sgns.evaluate.report.report_figures", lambda evaluation: [])
+
+
 class Trained(NamedTuple):
     """A training and what it was of."""
 

@@ -230,11 +230,6 @@ class Simulator:
         not in it, but in the run (`Run.mesh`)."""
         return copy.deepcopy(self._surrogate.card["scene"])
 
-    @property
-    def step_count(self) -> int:
-        """Steps taken since the last reset."""
-        return self._frame
-
     def reset(
         self,
         scene: Any = None,

@@ -74,6 +74,7 @@ def test_no_two_items_of_a_launch_meet_but_in_atomic_sums():
     assert {name for name, report in found[False].items() if report.conflicts} == {"to_grid", "scatter"}
 
 
+@pytest.mark.long
 def test_threads_agree_with_the_loop():
     *_, one = Solver(small_cut()).frames()
     with on_stand_in(Threads()) as threads:

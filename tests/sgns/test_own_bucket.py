@@ -26,7 +26,7 @@ SMALL = {
 
 
 @pytest.mark.timeout(300)
-def test_the_guide_from_mesh_to_report(tmp_path, monkeypatch):
+def test_the_guide_from_mesh_to_report(tmp_path, monkeypatch, no_pictures):
     monkeypatch.chdir(tmp_path)
     text = PAGE.read_text(encoding="utf-8")
     done = []

@@ -27,9 +27,10 @@ def settings(file, **values):
 
 
 @pytest.mark.parametrize(
-    "scene", [{}, WHEEL, {"blade": None, "kind": "body"}], ids=["plate", "wheel", "body"]
+    ("scene", "frames"),
+    [({}, 1), (WHEEL, 1), ({}, 2), (WHEEL, 14), ({"blade": None, "kind": "body"}, 14)],
+    ids=str,
 )
-@pytest.mark.parametrize("frames", [1, 2, 14])
 def test_a_page_of_every_kind_of_run(tmp_path, scene, frames):
     file = make_run(tmp_path / "run.h5", frames=frames, n=300, scene=scene, producer="rollout")
     plot.main(settings(file))

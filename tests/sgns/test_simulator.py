@@ -70,7 +70,7 @@ def test_stepping_is_the_rollout_at_any_pace(trained, kind, given) -> None:
         assert_same(state, rollout, t)
         np.testing.assert_array_equal(state.pose, path[t])
         assert state.outside == pytest.approx(rollout.excess.amount[t], rel=1e-12)
-    assert simulator.step_count == len(path) - first
+    assert state.frame == len(path) - first
     # From the same file the same comes again.
     assert_same(trained.simulator(kind).rollout(path, latent_history=history), rollout)
 

@@ -35,6 +35,7 @@ def killed_often(table: Path, *arguments: str) -> dict[str, dict[str, str]]:
     return rows
 
 
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_a_killed_training_goes_on_and_ends_as_if_nothing_had_happened(tmp_path):
     make_dataset(tmp_path / "data", frames=40)
@@ -91,6 +92,7 @@ def begin(code: str, *arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-c", code, *arguments], text=True, env=environment(), **pipes)
 
 
+@pytest.mark.long
 def test_two_processes_one_of_them_killed_and_repeated(tmp_path) -> None:
     alone = campaign(tmp_path / "alone", runs=4, draw=DRAW)
     simulate_campaign(alone, device="cpu", workers=1)

@@ -12,6 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -148,6 +149,7 @@ def key_lines(command: str) -> list[str]:
     return lines
 
 
+@cache
 def _settings(command: str) -> dict:
     return yaml.safe_load(files("sgns.conf").joinpath(f"{command}.yaml").read_text(encoding="utf-8"))
 

@@ -297,23 +297,24 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
         UserError: The line names the key.
     """
     own: Any = typed.COMMANDS[command]
-    if odd := set(cfg) - _keys_of(command):
+    keys = _keys_of(command)
+    if odd := set(cfg) - keys:
         # A file of settings may be for several commands.
         if odd := odd.difference(*map(_keys_of, typed.COMMANDS)):
-            known = ", ".join(sorted(_keys_of(command)))
+            known = ", ".join(sorted(keys))
             raise UserError(f"{min(odd)}: no such key; keys of sgns {command}: {known}")
     campaign = command == "simulate" and cfg.get("dataset") is not None  # may draw what its scene lacks
     missing = sorted(
         key for key in OmegaConf.missing_keys(cfg) if not (campaign and key.startswith("scene."))
     )
     if missing:
-        keys = " ".join(f"{key}=..." for key in missing)
+        blanks = " ".join(f"{key}=..." for key in missing)
         what = "a value is" if len(missing) == 1 else "values are"
         takes = {"check": "run files", "plot": "a run file", "render": "a run file"}.get(command)
-        give = keys if takes is None else f"{takes}, as in sgns {command} run.h5"
+        give = blanks if takes is None else f"{takes}, as in sgns {command} run.h5"
         raise UserError(f"{what} missing for {', '.join(missing)}; give {give}; see sgns {command} --help")
     every: Any = OmegaConf.to_container(cfg, resolve=True)
-    plain = {key: value for key, value in every.items() if key in _keys_of(command)}
+    plain = {key: value for key, value in every.items() if key in keys}
     for group, default in groups_of(command).items():
         if default is not None and cfg.get(group) is None:
             allowed = ", ".join(options_of(group))

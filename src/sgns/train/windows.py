@@ -6,7 +6,6 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-import lightning as L
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,6 +16,8 @@ from sgns.model.features import BodyTrack, body_track, context_of, free_axes
 from sgns.model.network_dynamics import LatentDynamics
 
 if TYPE_CHECKING:
+    import lightning as L
+
     from sgns.reduction.reduce import ReducedRun
 
 

@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 from mpm_warp import Bed, Effects, Material, Scene, Solver
 from mpm_warp.kernels.grid import GhostNodes
 from mpm_warp.kernels.nonlocal_fluidity import nonlocal_launches, wall_sink
+from mpm_warp.launch import Threads
 from sgns_testing.solvers import change
 
 STEADY = Effects(nonlocality=True)
@@ -36,6 +37,7 @@ class Column:
             floor * (material.fluidity_at_walls == "zero"),
             *(self.particles, grid, solver._soil, self.field, solver._cooperation),
             GhostNodes(solver._real, solver.device, grid, {}, mirrored=False),
+            Threads(1, solver.device),
         )
         wp.copy(self.particles.home, self.particles.position)  # as a remap does
         self.height = self.particles.position.numpy()[:, 2] + height  # of the particles [m]

@@ -33,6 +33,9 @@ SMALLER = {
 LEFT_OUT = {"frontier": "takes minutes: see tests/sgns/frontier", "submitit": "needs a cluster"}
 
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+
 def examples() -> list[str]:
     found = []
     for command in COMMANDS:
@@ -153,9 +156,11 @@ def test_finished_work_is_replaced_only_when_asked(folder: Path) -> None:
     rollout = ["rollout", "checkpoint=outputs/first/best.ckpt", "output=cut.h5"]
     report = ["evaluate", "dataset.path=data/quick", "checkpoint=outputs/first/best.ckpt", "output=report"]
     table = ["reduce", "dataset.path=data/quick", "reduction.num_modes=3", "output=table"]
-    for made in (cut, report, table):
-        assert sgns(folder, *made).returncode == 0
+    assert sgns(folder, *cut).returncode == 0
     before = (folder / "cut.h5").read_bytes()
+    for result in ("report/report.html", "table/energy.csv"):
+        (folder / result).parent.mkdir()
+        (folder / result).touch()
     for command in (cut, rollout, report, table):
         done = sgns(folder, *command)
         assert done.returncode == 2 and done.stderr.endswith(
@@ -166,3 +171,6 @@ def test_finished_work_is_replaced_only_when_asked(folder: Path) -> None:
         done = sgns(folder, *command, "overwrite=true")
         assert done.returncode == 0, done.stderr
     assert (folder / "cut.h5").read_bytes() != before
+    assert (folder / "report" / "report.html").stat().st_size and (
+        folder / "table" / "energy.csv"
+    ).stat().st_size

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import subprocess
 import sys
 from pathlib import Path
 
 import joblib
 import pytest
+from hydra.core.plugins import Plugins
 
-from sgns_testing.commands import call, python, refused
+from sgns_testing.commands import call, refused
 
 CALL = "{_target_: joblib.load, filename: hostile.pickle}"
 MADE = "${oc.create:'{_target_: joblib.load, filename: hostile.pickle}'}"
@@ -140,7 +141,7 @@ def test_overrides_run_nothing(override, hostile) -> None:
 
 
 LAUNCHER = """
-import dataclasses, typing
+import dataclasses, pathlib, typing
 from hydra.core.config_store import ConfigStore
 from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 
@@ -148,7 +149,7 @@ from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 class Slurm(BasicLauncher):
     def __init__(self, setup, partition, name, nodes):
         super().__init__()
-        open("launched", "w").write(repr((setup, partition, nodes)))
+        pathlib.Path("launched").write_text(repr((setup, partition, nodes)))
 
 
 @dataclasses.dataclass
@@ -164,19 +165,17 @@ ConfigStore.instance().store(group="hydra/launcher", name="elsewhere", node=Conf
 """
 
 
-def test_commands_of_a_launcher_are_taken_from_the_command_line_only(hostile) -> None:
+def test_commands_of_a_launcher_are_taken_from_the_command_line_only(hostile, monkeypatch) -> None:
     plugin = hostile.parent / "path" / "hydra_plugins" / "elsewhere"
     plugin.mkdir(parents=True)
     (plugin / "__init__.py").write_text(LAUNCHER)
-    code = (
-        f"import sys; sys.path.insert(0, {str(hostile.parent / 'path')!r}); "
-        "import sgns.cli, sgns.simulate.command; "
-        "sgns.simulate.command.main = lambda cfg: None; sys.exit(sgns.cli.main())"
-    )
+    monkeypatch.syspath_prepend(plugin.parents[1])
+    Plugins.instance().register(importlib.import_module("hydra_plugins.elsewhere").Slurm)
+    monkeypatch.setattr("sgns.simulate.command.main", lambda cfg: None)
 
     def launch(text: str, *overrides: str) -> subprocess.CompletedProcess[str]:
         head = "defaults: [override /hydra/launcher: elsewhere]\nhydra: {launcher: {%s}}"
-        return python(code, "simulate", "-m", "seed=1", *with_file(head % text), *overrides)
+        return call("simulate", "-m", "seed=1", *with_file(head % text), *overrides)
 
     for text in ("setup: [touch canary]", 'partition: "a\\ntouch canary"'):
         done = launch(text)
@@ -184,7 +183,7 @@ def test_commands_of_a_launcher_are_taken_from_the_command_line_only(hostile) ->
     done = launch("nodes: 2", 'hydra.job.name="a\\ntouch canary"'.replace("\\n", "\n"))
     assert done.returncode == 2 and "hydra.launcher.name" in done.stderr, done.stderr
     assert not Path("launched").exists()
-    done = launch("nodes: 2, partition: gpu-long", "hydra.launcher.setup=[module load x]")
+    done = launch("nodes: 2, partition: gpu-long", "output=x.h5", "hydra.launcher.setup=[module load x]")
     assert done.returncode == 0, done.stderr
     assert Path("launched").read_text() == "(['module load x'], 'gpu-long', 2)"
 
@@ -227,8 +226,9 @@ def test_settings_are_shown(kind, resolve, hostile) -> None:
 
 
 def test_the_launcher_for_several_processes(hostile) -> None:
-    if importlib.util.find_spec("hydra_plugins") is None:
-        pytest.skip("hydra-joblib-launcher is not installed")
+    pytest.importorskip(
+        "hydra_plugins.hydra_joblib_launcher", reason="hydra-joblib-launcher is not installed"
+    )
     launcher = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
     command = [sys.executable, "-m", "sgns", "advise", *launcher, "time=0.01,0.1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100)

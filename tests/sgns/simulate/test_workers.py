@@ -217,7 +217,7 @@ def test_two_processes_may_compile_into_an_empty_cache_at_once(tmp_path):
 
 # --- campaigns that are ended ------------------------------------------------------------------------------
 
-LONG = {"depth": [0.02, 0.03, 0.04, 0.05], "duration": [10.0], "speed": [0.02]}
+LONG = {"depth": [0.02, 0.03], "duration": [0.1, 10.0], "speed": [0.02]}  # the long ones come first
 MAKE = f"""
 import pathlib, sys
 from sgns.config import heeded_signals
@@ -243,7 +243,9 @@ def workers_of(pid: int) -> list[int]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.long)]
+)
 def test_the_workers_of_an_ended_campaign_keep_what_they_have_and_end(tmp_path, number):
     script = tmp_path / "make.py"
     script.write_text(MAKE)

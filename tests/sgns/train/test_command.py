@@ -389,7 +389,7 @@ def test_in_an_allocation_of_several_tasks_it_is_one_process(begin_in_a_job, tmp
     assert list((tmp_path / "out" / "tensorboard").glob("events*"))  # it also logs
 
 
-@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGUSR1, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
 def test_a_cluster_s_signal_ends_it_as_ctrl_c_does(begin_in_a_job, tmp_path, number) -> None:
     process = begin_in_a_job("training.max_steps=1000000")
     deadline = time.monotonic() + 60.0

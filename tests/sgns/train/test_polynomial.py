@@ -95,7 +95,7 @@ def test_what_polynomials_have_no_use_for(data, tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_the_commands(tmp_path) -> None:
+def test_the_commands(tmp_path, no_pictures) -> None:
     make_dataset(tmp_path / "data", n=300)
     dataset = ["dataset=quick", "dataset.path=data"]
     train_it = ["train", *dataset, "model=polynomial", "reduction.num_modes=4", "training.threads=1"]
