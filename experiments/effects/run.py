@@ -35,7 +35,10 @@ SCENES = {
     "incline": ["scene=incline", "scene.duration=0.4"],
     "thin_layer": ["scene=thin_layer", "scene.duration=0.5"],
 }
-EFFECTS = ("yielding", "rate_dependence", "fluidity", "nonlocality", "separation", "symmetry", "torque")
+EFFECTS = (
+    "yielding", "rate_dependence", "fluidity", "nonlocality", "separation", "cohesion", "symmetry", "torque"
+)  # fmt: skip
+COHESION = "material.cohesion=1000"  # in the rows of cohesion
 GRAINS = (1e-4, 3e-4, 5e-4, 7e-4, 1e-3, 2e-3, 5e-3)  # diameters for edge.csv [m]
 AIM = 0.03  # what auto leaves out should change force and displacement by less
 
@@ -74,7 +77,7 @@ def changes(scene: Scene, one: tuple, two: tuple) -> dict[str, float]:
 
 
 def each_effect(name: str, effect: str) -> dict:
-    scene, _ = scene_of(*SCENES[name])
+    scene, _ = scene_of(*SCENES[name], *([COHESION] if effect == "cohesion" else []))
     chosen, decisions = effects_for(scene)
     decision = decisions[effect]
     row = {"scene": name, "effect": effect, "auto": "on" if decision.on else "off", "number": decision.number}

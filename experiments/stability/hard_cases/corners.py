@@ -18,9 +18,17 @@ K0_ANGLE = float(np.degrees(np.arctan(np.sqrt(3.0) * (1.0 - 0.6) / 1.3)))
 """Friction angle at which soil of Poisson's ratio 0.3 just bears its K0 state [degrees]."""
 
 
-def excavation(depth: float, speed: float, rake: float, motion: str) -> tuple[float, str]:
+def excavation(
+    depth: float, speed: float, rake: float, motion: str, cohesion: float = 0.0
+) -> tuple[float, str]:
     scene = Excavation(
-        bed=CUT_BED, blade=Plate(thickness=0.04), depth=depth, speed=speed, rake=rake, motion=motion
+        bed=CUT_BED,
+        material=Material(cohesion=cohesion),
+        blade=Plate(thickness=0.04),
+        depth=depth,
+        speed=speed,
+        rake=rake,
+        motion=motion,
     )
     return blade_shares(scene, frames_of(scene, effects=Effects(symmetry=True)))
 
@@ -97,6 +105,9 @@ MEASURES = {
             (2, 1, 0, "curved"),
         )
     },
+    "blade 10 cm, 15 cm/s, 45°, curved, 2 kPa of cohesion": partial(
+        excavation, 0.10, 0.15, 45.0, "curved", cohesion=2000.0
+    ),
     "wheel 5 cm, 70 %, Moon, 25 N": partial(
         wheel, diameter=0.05, slip=0.7, gravity=1.62, load=25.0, width=0.0833
     ),

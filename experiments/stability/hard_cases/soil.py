@@ -173,10 +173,11 @@ class Rain(Bed):
         return raised * [1.0, 1.0, 12.0], volume
 
 
-def dropped_block(speed: float) -> tuple[float, str]:
+def dropped_block(speed: float, cohesion: float = 0.0) -> tuple[float, str]:
     size, ends = (0.3, 0.3, 0.3), {"low": (0.1, 0.1, -0.28), "high": (0.2, 0.2, -0.18)}
     bed = BlockBed(size=size, spacing=0.01, initial_stress="none", headroom=0.2, **ends)
-    scene = Thrown(bed=bed, upwards=-speed, duration=0.2, frame_rate=400.0)
+    soil = Material(cohesion=cohesion)
+    scene = Thrown(bed=bed, material=soil, upwards=-speed, duration=0.2, frame_rate=400.0)
     return energy_gain(scene)
 
 
@@ -255,9 +256,25 @@ def walls_hold(kind: str | float) -> float:
     return beyond_walls(scene, frames_of(scene))
 
 
-def column_falls() -> tuple[float, str]:
+def cohesive_block_bursts() -> tuple[float, str]:
+    """A block whose particles fly apart at up to 2 m/s: energy that appears, and momentum that does."""
+    scene = Thrown(
+        bed=block().bed, material=Material(cohesion=2000.0), gravity=0.0, spread=2.0, duration=0.03
+    )
+    solver = Solver(scene)
+    before = scene.initial_velocities().mean(axis=0)
+    *_, _ = solver.frames()
+    gained = np.linalg.norm(solver.particles.velocity.numpy().astype(float).mean(axis=0) - before)
+    torn = float((solver.particles.bond.numpy() == 0.0).mean())
+    energy, note = energy_gain(scene)
+    return shares({"energy": (energy, 1.0, "%"), "momentum": (1e3 * gained, 1e-3, "mm/s")})[0], (
+        f"{note}; {100.0 * torn:.0f} % torn"
+    )
+
+
+def column_falls(cohesion: float = 0.0) -> tuple[float, str]:
     bed = Bed(size=(0.8, 0.12, 0.32), spacing=0.02, headroom=0.05, walls=Walls(y="slip"))
-    scene = Column(bed=bed, radius=0.04, shape="slab", duration=0.8)
+    scene = Column(bed=bed, material=Material(cohesion=cohesion), radius=0.04, shape="slab", duration=0.8)
     return energy_gain(scene)
 
 
@@ -305,6 +322,9 @@ MEASURES = {
     "soil pushed against a wall": against_the_wall,
     **{f"soil thrown against walls ({kind})": partial(walls_hold, kind) for kind in ("no_slip", "slip", 0.3)},
     "column four times as high as wide": column_falls,
+    "cohesive column (300 Pa) falls": partial(column_falls, 300.0),
+    "cohesive block (2 kPa) hits the floor at 5 m/s": partial(dropped_block, 5.0, 2000.0),
+    "cohesive block (2 kPa) bursts": cohesive_block_bursts,
     "endless slope of 60 degrees": steep_slope,
     **{
         f"volume after the deepest, fastest cut ({n} per cell)": partial(volume_after_a_deep_cut, n)
