@@ -335,7 +335,7 @@ def test_draws_of_files_it_refuses(paths, draw, words):
 
 
 def test_runs_of_several_passes_share_a_bed(tmp_path):
-    base = scene_from_config(composed("scene=quick_excavation", "scene.motion=passes", "scene.duration=8"))
+    base = scene_from_config(composed("scene=quick_excavation", "scene.motion=passes", "scene.duration=11"))
     draw = {"passes.number": [1, 2], "passes.deepening": [0.0, 0.02], "passes.advance": [0.0, 0.04]}
     c = plan({"name": "own", "path": str(tmp_path), "draw": draw}, base.to_dict(), EFFECTS, "float32", 0)
     scenes = list(c.scenes.values())
