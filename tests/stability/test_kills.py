@@ -112,21 +112,19 @@ def test_two_processes_one_of_them_killed_and_repeated(tmp_path) -> None:
 
 
 def test_of_two_campaigns_with_other_settings_the_second_is_refused(tmp_path) -> None:
-    for attempt in range(2):
-        folder = tmp_path / str(attempt)
-        processes = [begin(RECORD, str(folder), seed) for seed in ("0", "1")]
-        for process in processes:
-            assert process.stdout.readline() == "ready\n"
-        for process in processes:
-            process.stdin.write("\n")
-            process.stdin.flush()
-        said = [process.communicate(timeout=100)[1] for process in processes]
-        assert sorted(process.returncode for process in processes) == [0, 1], said
-        assert sum("made with other settings" in words for words in said) == 1
-        winner = [process.returncode for process in processes].index(0)
-        recorded = yaml.safe_load((folder / "tiny" / "dataset.yaml").read_text())
-        assert recorded == campaign(folder, seed=winner, runs=4).describe()
-        assert sorted(path.name for path in (folder / "tiny").iterdir()) == ["dataset.yaml", "runs.csv"]
+    processes = [begin(RECORD, str(tmp_path), seed) for seed in ("0", "1")]
+    for process in processes:
+        assert process.stdout.readline() == "ready\n"
+    for process in processes:
+        process.stdin.write("\n")
+        process.stdin.flush()
+    said = [process.communicate(timeout=100)[1] for process in processes]
+    assert sorted(process.returncode for process in processes) == [0, 1], said
+    assert sum("made with other settings" in words for words in said) == 1
+    winner = [process.returncode for process in processes].index(0)
+    recorded = yaml.safe_load((tmp_path / "tiny" / "dataset.yaml").read_text())
+    assert recorded == campaign(tmp_path, seed=winner, runs=4).describe()
+    assert sorted(path.name for path in (tmp_path / "tiny").iterdir()) == ["dataset.yaml", "runs.csv"]
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])

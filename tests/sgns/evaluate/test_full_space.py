@@ -180,6 +180,7 @@ def trained(windows, steps: int) -> tuple[FullSpaceDynamics, torch.Tensor]:
     return dynamics, scale
 
 
+@pytest.mark.long
 def test_training_learns(windows):
     errors = []
     for steps in (1, 90):
