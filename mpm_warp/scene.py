@@ -172,7 +172,11 @@ class Scene(Settings):
     @property
     def filled(self) -> tuple[np.ndarray, float]:
         """Particle positions (n, 3) of the bed without a tool [m] and the volume of one [m^3]."""
-        return self.bed.filled if self.soil is None else (self.soil.particles["position"], self.bed.filled[1])
+        return (
+            self.bed.filled
+            if self.soil is None
+            else (self.soil.particles["position"], self.bed.particle_volume)
+        )
 
     @property
     def soil(self) -> Soil | None:

@@ -97,6 +97,9 @@ class Soil:
                 raise SceneError(f"{wrong}what it says of mirror images is of another number of particles")
         if len(arrays["position"]) == 0:
             raise SceneError(f"{wrong}it holds no particle")
+        axle = arrays.get("axle", np.zeros(3))
+        if axle.shape != (3,) or not np.isfinite(axle).all():
+            raise SceneError(f"{wrong}the height of its wheel and its rate are not three finite numbers")
         if np.shape(self.pose) != (7,) or not np.isfinite(self.pose).all():
             raise SceneError(f"{wrong}the pose of its tool is not seven finite numbers")
 

@@ -344,6 +344,7 @@ def test_soil_goes_only_into_its_own_bed():
         ("stress", None, "it lacks stress"),
         ("velocity", np.zeros((4, 3)), r"velocity has shape \(4, 3\) and not \(3840, 3\)"),
         ("log_volume", np.full(3840, np.nan), "log_volume is not finite"),
+        ("axle", np.zeros(2), "the height of its wheel and its rate are not three finite numbers"),
     ],
 )
 def test_soil_that_is_damaged_is_refused(name, value, words):

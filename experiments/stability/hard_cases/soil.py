@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -308,7 +309,41 @@ def out_of_the_grid() -> tuple[float, str]:
     return stopped_with(scene, "raise scene.bed.headroom")
 
 
+def cone(slope: float, duration: float) -> Scene:
+    """A cone 8 cm high with sides of a slope [degrees], on 4 cm of soil."""
+    fall = math.tan(math.radians(slope))
+    bed = Bed(size=(0.32, 0.32, 0.08), spacing=0.01, particles_per_cell=8.0, headroom=0.2)
+    steep = replace(bed, surface=lambda x, y: np.maximum(-0.04, 0.04 - fall * np.hypot(x - 0.16, y - 0.16)))
+    return Scene(bed=steep, duration=duration)
+
+
+def heap_at_repose() -> tuple[float, str]:
+    """As steep as the friction angle tells: how far particles move in 2 s, but one in a thousand [mm]."""
+    scene = cone(math.degrees(math.atan(Material().static_friction)), 2.0)
+    first, *_, last = frames_of(scene, every=60)
+    moved = 1e3 * np.linalg.norm(last.position - first.position, axis=1)
+    words = f"mean {moved.mean():.3g} mm; the furthest, at the tip, {moved.max():.3g} mm"
+    return float(np.quantile(moved, 0.999)), words
+
+
+def steep_heap() -> tuple[float, str]:
+    scene = cone(70.0, 1.0)
+    frames = frames_of(scene, every=5)
+    energy = energies(scene, frames)
+    return shares(
+        {
+            "speed": (top_speed(frames), math.sqrt(2.0 * 9.81 * 0.08), "m/s"),
+            "speed at the end": (top_speed(frames[-1:]), 0.05, "m/s"),
+            "volume gain": (100.0 * volume_gain(scene, frames[-1].position), 3.0, "%"),
+            "energy gained": (100.0 * float(energy.max() / energy[0] - 1.0), 0.1, "%"),
+            "beyond walls and floor": (beyond_walls(scene, frames), 1.0, "mm"),
+        }
+    )
+
+
 MEASURES = {
+    "heap as steep as its friction angle": heap_at_repose,
+    "cone of 70 degrees slumps": steep_heap,
     "one layer of particles at rest": one_layer_at_rest,
     "one layer of particles scraped off": one_layer_scraped,
     "single grains in flight": flight,

@@ -11,6 +11,7 @@ import numpy as np
 from leakage import leakage
 
 from mpm_warp import Body, Effects, Excavation, MeshBody, Plate, Solver
+from mpm_warp.motions import Passes
 from sgns_testing.meshes import box_corners, box_triangles, write_obj
 from sgns_testing.scenes import cut
 
@@ -107,6 +108,29 @@ def leaves_and_comes_back() -> tuple[float, str]:
     return max(share, touch), f"{words}; force in the air {touch:.3g} N (limit 1)"
 
 
+def second_pass(deepening: float) -> tuple[float, str]:
+    """Cuts, is lifted, goes back and cuts again, in the same place or deeper."""
+    passes = Passes(number=2, length=0.08, deepening=deepening, lift=0.06, return_speed=0.4)
+    scene = cut(motion="passes", depth=0.05, duration=2.4, start=0.15, clearance=0.01, passes=passes)
+    frames = frames_of(scene)
+    cutting = passes.cutting(scene.times(), scene.depth, scene.speed)
+    first, second = (
+        float(np.mean([-frames[i].force[0] for i in np.flatnonzero(cutting == k)])) for k in (0, 1)
+    )
+    share, words = blade_shares(scene, frames)
+    return share, f"{words}; mean draft {first:.3g} N, then {second:.3g} N"
+
+
+def another_tool() -> tuple[float, str]:
+    """A cut, then a run that starts from its soil with another plate, which begins in the heap."""
+    first = Solver(cut(duration=0.8))
+    *_, _ = first.frames()
+    wide = replace(cut().blade, width=0.3)
+    scene = cut(blade=wide, start=0.5, rake=30.0, clearance=-0.01, duration=0.6).starting_from(first.soil())
+    share, words = blade_shares(scene, frames_of(scene))
+    return share, f"{words}; {len(scene.displaced)} particles left out"
+
+
 def spins() -> tuple[float, str]:
     times = np.arange(0.0, 0.8, 0.01)
     angle = np.maximum(times - 0.25, 0.0) * 6.0 * np.pi
@@ -188,6 +212,9 @@ MEASURES = {
     "tool shakes at 50 Hz": shakes,
     "tool leaves and comes back": leaves_and_comes_back,
     "tool spins at 3 turns per second": spins,
+    "second pass in the same place": partial(second_pass, 0.0),
+    "second pass 2 cm deeper": partial(second_pass, 0.02),
+    "another tool on the soil of a cut": another_tool,
     **{
         f"plate {cells:g} spacings thick at {speed:g} m/s": partial(thin, cells, speed)
         for cells, speed in ((2.0, 1.0), (0.5, 0.2), (0.5, 1.0))
