@@ -58,11 +58,12 @@ def with_state(scene, effects=None, frame=2):
         (cut(duration=0.1), Effects(symmetry=True)),
         (cut(duration=0.1), Effects(fluidity=True, nonlocality=True)),
         (cut(duration=0.1), Effects(nonlocality=True)),
+        (cut(duration=0.1, clearance=0.0, material=Material(cohesion=100.0)), Effects()),
         (wheel(), Effects()),
         (replace(wheel(), slip_angle=30.0, load=((0.0, 20.0), (0.1, 40.0))), Effects()),
         (slope(), Effects()),
     ],
-    ids=["cut", "half", "fluidity", "nonlocal", "wheel", "turned wheel", "periodic"],
+    ids=["cut", "half", "fluidity", "nonlocal", "cohesive", "wheel", "turned wheel", "periodic"],
 )
 def test_the_rest_is_bit_equal(scene, effects):
     """A second solver that starts from a frame of the first goes on as the first did, every time that it is asked."""
