@@ -52,6 +52,21 @@ def test_the_same_threads_give_the_same_bits():
     assert np.array_equal(frames[0].force, frames[1].force)
 
 
+def test_steps_and_soil_to_start_from_are_those_of_the_frames():
+    poses = CUT.body_poses()
+    rows = np.column_stack([CUT.times(), poses])  # between which a step goes straight, too
+    solver = Solver(replace(CUT, motion="path", path=tuple(map(tuple, rows))), threads=2)
+    *_, frame = solver.frames()
+    soil = solver.soil()
+    solver.reset()
+    for pose in poses[1:]:
+        step = solver.step(pose)
+    assert np.array_equal(step.position, frame.position)
+    assert np.array_equal(step.force, frame.force)
+    goes_on = next(Solver(replace(CUT, motion="rest"), start_from=soil, threads=2).frames())
+    assert np.array_equal(goes_on.position[:9], frame.position[:9])
+
+
 def test_more_threads_than_particles():
     scene = Scene(bed=Bed(size=(0.06, 0.06, 0.04), spacing=0.02, particles_per_cell=1.0), **SHORT)
     assert Solver(scene).computed_count == 18
