@@ -13,6 +13,9 @@ from .scene import Scene
 from .settings import likely_radians
 from .tool_geometry import Odd, odd_size, odd_times, place_unit
 
+_MOST_LOOKED_AT = 500
+"""Poses near a wall."""
+
 
 @dataclass(frozen=True)
 class Preview:
@@ -67,6 +70,7 @@ class Preview:
             )
         if touch is not None:
             warnings += near_floor(scene, float(low[deepest]))
+        warnings += near_wall(scene, times, poses)
         lines = _bin(scene) + ([] if scene.axle is not None else _way(scene, low, times, touch))
         given = scene.path_times()
         if len(given) > 1 and given[-1] < scene.duration - 1.0 / scene.frame_rate:
@@ -116,6 +120,48 @@ def near_floor(scene: Scene, lowest: float) -> list[str]:
         f"the tool's lowest point comes to {_words(above)} above the floor, less than one grid spacing: soil jams "
         "there and forces get too large; use a deeper scene.bed.size"
     ]
+
+
+def near_wall(scene: Scene, times: np.ndarray, poses: np.ndarray) -> list[str]:
+    """A line if a tool pushes soil against a wall ahead of it at some of its poses (T, 7), shape of times (T,) [s].
+
+    The wedge of soil that gives way ahead of it reaches depth tan(45 degrees + half the friction angle) further. Of a
+    wheel, whose depth is not known, a quarter of the radius is taken for it.
+    """
+    body, bed = scene.body, scene.bed
+    assert body is not None
+    outline = body.outline()
+    friction = math.atan(scene.material.static_friction)
+    slope = math.tan(0.25 * math.pi + 0.5 * friction)
+    moved = np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2])
+    ahead = np.abs(moved) > 0.5 * np.linalg.norm(moved, axis=1, keepdims=True)
+    places = poses[:, :3].copy()
+    if scene.axle is not None:
+        places[:, 2] = 0.75 * body.half_size[2]
+    around = np.abs(rotation_matrices(poses[:, 3:])) @ body.half_size
+    for axis in (axis for axis in (0, 1) if bed.walls.conditions[axis] != "periodic"):
+        sign = np.sign(moved[:, axis])
+        left = np.where(sign > 0.0, bed.size[axis] - places[:, axis], places[:, axis])
+        most = np.maximum(2.0 * bed.spacing, slope * np.maximum(0.0, around[:, 2] - places[:, 2]))
+        maybe = np.flatnonzero(
+            ahead[:, axis] & (left - around[:, axis] < most) & (places[:, 2] < around[:, 2])
+        )
+        for pose in maybe[:: 1 + len(maybe) // _MOST_LOOKED_AT]:
+            points = outline @ rotation_matrices(poses[pose, 3:]).T
+            depth = -(points[:, 2] + places[pose, 2])
+            below = depth > 0.0
+            if not below.any():
+                continue
+            room = max(2.0 * bed.spacing, slope * float(depth.max()))
+            gap = left[pose] - float((sign[pose] * points[below, axis]).max())
+            if gap < room - 1e-9:
+                wall = f"{'xy'[axis]} = {bed.size[axis] if sign[pose] > 0.0 else 0.0:g} m"
+                return [
+                    f"from {times[pose]:.3g} s on the tool pushes soil against the wall at {wall}, which makes forces "
+                    f"too large: it needs {_words(room)} of soil ahead and has {_words(max(0.0, gap))}; "
+                    f"scene.duration={max(0.0, times[pose - 1]):.3g} ends before that, or use a longer scene.bed.size"
+                ]
+    return []
 
 
 def _words(length: float) -> str:

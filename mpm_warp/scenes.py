@@ -103,13 +103,24 @@ class Excavation(Scene):
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         words = f"mean draft {-np.mean(force[1:, 0]):.1f} N, vertical force {np.mean(force[1:, 2]):.1f} N"
-        if self.motion != "passes":
-            return words
-        cut = self.passes.cutting(self.times()[: len(force)], self.depth, self.speed)
-        each = [
-            f"{-force[cut == one, 0].mean():.1f}" for one in range(self.passes.number) if (cut == one).any()
-        ]
-        return f"{words}; mean draft of each pass: {', '.join(each)} N"
+        return words + _each_pass(self, force)
+
+
+def _each_pass(scene: Excavation | Body, force: np.ndarray) -> str:
+    """The mean draft of each pass, or how far they got, from the soil's force on the tool [N], shape (T, 3)."""
+    if scene.motion != "passes":
+        return ""
+    times = scene.times()[: len(force)]
+    cut = scene.passes.cutting(times, scene.depth, scene.speed)
+    unfinished = scene.passes.cutting(times[-1:] + 1.0 / scene.frame_rate, scene.depth, scene.speed)[0]
+    each = []
+    for one in range(scene.passes.number):
+        now = cut == one
+        if not force[now].any():
+            each.append("not reached")
+        else:
+            each.append(f"{-force[now, 0].mean():.1f} N" + (" (cut short)" if one == unfinished else ""))
+    return "; mean draft of each pass: " + ", ".join(each)
 
 
 @settings
@@ -176,7 +187,7 @@ class Body(Scene):
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         x, y, z = force[1:].mean(axis=0)
-        return f"mean force ({x:.1f}, {y:.1f}, {z:.1f}) N"
+        return f"mean force ({x:.1f}, {y:.1f}, {z:.1f}) N" + _each_pass(self, force)
 
 
 LEAST_MASS, MOST_MASS = 1.0e-9, 1.0e9

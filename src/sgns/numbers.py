@@ -156,6 +156,18 @@ def elapsed(began: float, now: float) -> float:
     return max(now - began, 1e-9)  # the clocks count in such steps
 
 
+def duration_words(seconds: float) -> str:
+    """A duration to two places at most: 40 s, 12 min, 3 h 20 min, 2 d 5 h."""
+    minutes, hours = round(seconds / 60), round(seconds / 3600)
+    if seconds < 99.5:
+        return f"{max(1, round(seconds))} s"
+    if minutes < 100:
+        return f"{minutes} min"
+    if hours < 48:
+        return f"{minutes // 60} h {minutes % 60} min"
+    return f"{hours // 24} d {hours % 24} h"
+
+
 # --- To a person: how good a prediction is --------------------------------------------------------------
 
 

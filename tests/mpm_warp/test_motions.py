@@ -119,4 +119,19 @@ def test_a_second_pass_in_the_same_place_meets_less_soil():
     cutting = passes.cutting(scene.times(), scene.depth, scene.speed)
     first, second = (-force[cutting == number, 0].mean() for number in (0, 1))
     assert 0.0 < second < 0.7 * first
-    assert f"mean draft of each pass: {first:.1f}, {second:.1f} N" in scene.summary(force, force, force)
+    assert f"mean draft of each pass: {first:.1f} N, {second:.1f} N" in scene.summary(force, force, force)
+
+
+def test_passes_that_a_run_does_not_finish_are_told_in_its_summary():
+    """Of a plate and of a body; `number` 3, of which the second is under way when the run ends."""
+    passes = Passes(number=3, length=0.05)
+    begin = passes.corners(0.05, 0.1)[0][6]
+    bed, box = cut().bed, Box(size=(0.05, 0.15, 0.10))
+    for scene in (
+        cut(motion="passes", depth=0.05, speed=0.1, passes=passes, duration=begin + 0.5),
+        Body(motion="passes", depth=0.05, tool=box, bed=bed, passes=passes, duration=begin + 0.5),
+    ):
+        force = np.tile([-2.0, 0.0, 0.0], (scene.frame_count, 1))
+        assert "each pass: 2.0 N, 2.0 N (cut short), not reached" in scene.summary(force, force, force)
+        force[scene.times() > begin - 0.1] = 0.0  # the second has begun, above the soil
+        assert "each pass: 2.0 N, not reached, not reached" in scene.summary(force, force, force)

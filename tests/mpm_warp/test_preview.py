@@ -169,7 +169,8 @@ def test_a_checkpoints_scene_with_a_mesh_says_where_the_mesh_is():
 
 def test_a_tool_that_comes_to_the_floor_is_told():
     assert not any("floor" in words for words in Preview.of(cut(depth=0.1, duration=1.5, speed=0.1)).warnings)
-    [words] = Preview.of(cut(depth=0.15, duration=1.5, speed=0.1)).warnings
+    deep = Preview.of(cut(depth=0.15, duration=1.5, speed=0.1)).warnings
+    [words] = [one for one in deep if "floor" in one]
     assert "mm above the floor, less than one grid spacing" in words
     assert not any("floor" in words for words in Preview.of(Wheel()).warnings)
     [words] = [one for one in Preview.of(Wheel(clearance=-0.055)).warnings if "floor" in one]
@@ -215,3 +216,19 @@ def test_a_refused_length_in_millimetres_is_told(make, words):
 def test_a_plate_far_above_the_soil_is_told_that_lengths_are_metres():
     [words] = [line for line in Preview.of(cut(clearance=6.65)).warnings if "never touches" in line]
     assert words.endswith("; lengths are in metres")
+
+
+def test_soil_that_will_be_pushed_against_a_wall_is_told():
+    """Not of presets, nor of a tool that moves away from the wall behind it."""
+    assert not any(
+        "against the wall" in one for scene in (Wheel(), cut()) for one in Preview.of(scene).warnings
+    )
+    wheel = Wheel(gravity=1.62, travel_speed=0.05)
+    [told] = [one for one in Preview.of(wheel).warnings if "against the wall at x = 0.4 m" in one]
+    fits = float(re.search(r"scene.duration=([\d.]+)", told)[1])
+    assert 3.5 < fits < 5.0
+    assert Preview.of(Wheel(gravity=1.62, travel_speed=0.05, duration=fits)).warnings == ()
+    back = [(0.0, 0.4, 0.3, 0.12), (0.5, 0.4, 0.3, 0.03), (1.0, 0.4, 0.35, 0.03), (2.0, 0.4, 0.12, 0.03)]
+    assert "against the wall at y = 0 m" in " ".join(Preview.of(body(back)).warnings)
+    channel = Bed(size=(0.8, 0.6, 0.15), spacing=0.02, walls=Walls(y="periodic"))
+    assert Preview.of(body(back, bed=channel)).warnings == ()

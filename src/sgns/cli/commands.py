@@ -14,6 +14,7 @@ import logging
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
@@ -176,7 +177,7 @@ def run_command(cfg: DictConfig) -> float | None:
     name = hydra_cfg.job.config_name
     assert name is not None and hydra_cfg.mode is not None
     in_sweep = hydra_cfg.mode.name == "MULTIRUN"
-    label = f"job {hydra_cfg.job.num} ({_one_line(','.join(hydra_cfg.overrides.task))}): " if in_sweep else ""
+    label = _label(hydra_cfg.job.num, hydra_cfg.overrides.task) if in_sweep else ""
     try:
         _place_output(cfg, hydra_cfg, COMMANDS[name], in_sweep)
         check_shared(cfg, name, COMMANDS[name].needs)
@@ -187,6 +188,8 @@ def run_command(cfg: DictConfig) -> float | None:
         kept = _drop_empty_output(hydra_cfg)
         said = stop.said if isinstance(stop, Interrupted) else ""
         said = said or _interruption(cfg, name, kept, hydra_cfg.sweep.dir if in_sweep else cfg.output)
+        if in_sweep and COMMANDS[name].output == "file" and cfg.get("dataset") is None:
+            said += f"; finished jobs stay in {hydra_cfg.sweep.dir}; the same sweep would begin anew in another folder"
         raise _Stopped(f"{label}interrupted; {said}", _status(stop)) from None
     except Exception as error:
         if (line := _line_of(error)) is None:
@@ -228,6 +231,8 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
             mode = hydra.get_mode(config_name=command, overrides=settings)
             sweep = arguments.multirun or (mode == RunMode.MULTIRUN and not arguments.run)
             require_few_jobs(settings if sweep else [])
+            if sweep:
+                _check_jobs(hydra, command, settings)
             run, mode = (hydra.multirun, RunMode.MULTIRUN) if sweep else (hydra.run, RunMode.RUN)
             done: Any = run(
                 command, task_function=run_command, overrides=[*settings, f"hydra.mode={mode.name}"]
@@ -237,6 +242,48 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
                 from sgns.cli.help import end_sweep
 
                 end_sweep(jobs, COMMANDS[command].value)
+
+
+_MOST_CHECKED = 200
+"""Jobs of a sweep whose settings are looked at before the first begins; composing takes some 0.1 s each."""
+
+
+def _check_jobs(hydra: Any, command: str, settings: Sequence[str]) -> None:
+    """Refuse a sweep of which a job would be refused for its settings, before its first job begins.
+
+    Raises:
+        UserError: It names the job.
+    """
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    from sgns.cli.help import LineFormatter
+    from sgns.cli.settings import check_shared, sweep_jobs
+
+    master = hydra.config_loader.load_configuration(command, settings, RunMode.MULTIRUN)
+    jobs = sweep_jobs(settings)
+    LineFormatter.same = tuple(set(jobs[0]).intersection(*jobs)) if len(jobs) > 1 else ()
+    check = getattr(importlib.import_module(COMMANDS[command].module), "check_settings", None)
+    for number, job in enumerate(jobs if len(jobs) <= _MOST_CHECKED else ()):
+        try:
+            cfg = hydra.config_loader.load_sweep_config(master, job)
+            HydraConfig.instance().set_config(cfg)
+            cfg = hydra.get_sanitized_cfg(cfg, "job")
+            check_shared(cfg, command, COMMANDS[command].needs)
+            if check is not None:
+                check(cfg, job)
+        except Exception as error:
+            if (line := _line_of(error)) is None:
+                raise
+            raise UserError(f"{_label(number, job)}{line}; no job has begun") from error
+
+
+def _label(number: int, overrides: Sequence[str]) -> str:
+    """What a job of a sweep is called: by what differs between the jobs."""
+    from sgns.cli.help import LineFormatter
+
+    own = [one for one in overrides if one not in LineFormatter.same] or overrides
+    return f"job {number} ({_one_line(','.join(own))}): "
 
 
 def _show_settings(hydra: Any, command: str, arguments: argparse.Namespace) -> None:

@@ -16,7 +16,7 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, ClassVar, TextIO
 
 import yaml
 
@@ -33,8 +33,14 @@ if TYPE_CHECKING:
 class LineFormatter(logging.Formatter):
     """Plain text for information, the level's name first for warnings and errors."""
 
+    same: ClassVar[tuple[str, ...]] = ()
+    """Overrides that all jobs of a sweep have; Hydra's line for each job leaves them out."""
+
     def format(self, record: logging.LogRecord) -> str:
         line = super().format(record)
+        if self.same and record.name.startswith("hydra") and line.startswith("\t#"):
+            for one in self.same:
+                line = line.replace(f" {one}", "", 1)
         return f"{record.levelname.lower()}: {line}" if record.levelno >= logging.WARNING else line
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import re
@@ -280,6 +281,20 @@ def require_few_jobs(overrides: Sequence[str]) -> None:
             jobs *= max(1, len(sweep.list))
     if jobs > MOST_JOBS:
         raise UserError(f"the sweep has {jobs:.3g} jobs; at most {MOST_JOBS} are allowed: give fewer values")
+
+
+def sweep_jobs(overrides: Sequence[str]) -> list[list[str]]:
+    """The overrides of every job of a sweep, in the order of Hydra's own sweeper; none where only a sweeper knows."""
+    values = []
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key = override.get_key_element()
+        if not override.is_sweep_override():
+            values.append([f"{key}={override.get_value_element_as_str()}"])
+        elif isinstance(override.value(), (ChoiceSweep, RangeSweep)):
+            values.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+        else:
+            return []
+    return [list(job) for job in itertools.product(*values)]
 
 
 # --- The settings that mean the same in every command, checked before any work is done ------------------

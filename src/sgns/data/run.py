@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 
 from mpm_warp import Scene, Soil, State
-from mpm_warp.motions import along_and_across
+from mpm_warp.motions import Passes, along_and_across
 from sgns.config import UserError, parse_yaml
 from sgns.data.files import one_line
 from sgns.data.hdf5 import BROKEN, own_attribute, own_dataset, own_object
@@ -186,7 +186,8 @@ class Run:
     def forces(self) -> pandas.DataFrame:
         """Force [N], torque [N m] and pose of every frame as a table: columns Fx Fy Fz, Tx Ty Tz, x y z [m] and qx qy
         qz qw, by `time` [s]; for a wheel also `pull` along its heading, `lateral` along its axle [N], and `drive`, the
-        torque about its axle [N m]. Needs pandas.
+        torque about its axle [N m]; of several passes `pass`, which one cuts, from 1 on (0: none). Forces in frame 0
+        are 0: they are means since the frame before. Needs pandas.
 
         Raises:
             UserError: pandas is not installed.
@@ -199,6 +200,9 @@ class Run:
         if scene.get("kind") == "wheel":
             table["pull"], table["lateral"], _ = along_and_across(scene, self.force).T
             table["drive"] = along_and_across(scene, self.torque)[:, 1]
+        if scene.get("motion") == "passes":
+            passes = Passes.from_dict(scene.get("passes") or {})
+            table["pass"] = 1 + passes.cutting(self.time, scene["depth"], scene["speed"])
         return table
 
     def to_xarray(self, frames: slice | int | list[int] | np.ndarray = slice(None)) -> xarray.Dataset:

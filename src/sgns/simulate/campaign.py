@@ -22,7 +22,7 @@ from mpm_warp.settings import short
 from sgns.config import UserError, differences, flattened
 from sgns.data.dataset import SPLITS, read_description
 from sgns.data.files import file_lock, write_whole
-from sgns.numbers import counted
+from sgns.numbers import counted, duration_words
 from sgns.settings import DatasetSettings, Limits
 from sgns.simulate.scene import decided, replaced, scene_from_data
 
@@ -136,18 +136,6 @@ def require_space(folder: Path, size: int) -> None:
             f"{folder} needs {size_words(size)} of disk and {size_words(free)} are free; free some space, choose "
             "another folder, or record fewer particles: scene.bed.store_every=5"
         )
-
-
-def duration_words(seconds: float) -> str:
-    """A duration to two places at most: 40 s, 12 min, 3 h 20 min, 2 d 5 h."""
-    minutes, hours = round(seconds / 60), round(seconds / 3600)
-    if seconds < 99.5:
-        return f"{max(1, round(seconds))} s"
-    if minutes < 100:
-        return f"{minutes} min"
-    if hours < 48:
-        return f"{minutes // 60} h {minutes % 60} min"
-    return f"{hours // 24} d {hours % 24} h"
 
 
 def size_words(size: float) -> str:

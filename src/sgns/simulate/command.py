@@ -26,6 +26,7 @@ from sgns.simulate.campaign import cost_line, plan, require_limits, require_spac
 from sgns.simulate.run import Restart, restart_from, simulate_scene, unfinished
 from sgns.simulate.scene import (
     asked_effects,
+    data_from_config,
     decided,
     effects_line,
     plain,
@@ -52,8 +53,8 @@ def base_scene(settings: dict[str, Any]) -> dict[str, Any]:
         raise UserError(f"dataset={settings['name']} brings its own scene; leave out scene=")
     kept = [o for o in overrides if not o.lstrip("+~").startswith(("dataset", "scene="))]
     change = [f"scene.{key}={json.dumps(value)}" for key, value in (settings.get("change") or {}).items()]
-    cfg = compose("simulate", [f"scene={settings['scene']}", *change, *kept])
-    return plain(cfg.scene) | {"material": plain(cfg.material)}
+    asked = [f"scene={settings['scene']}", *change, *kept]
+    return data_from_config(compose("simulate", asked), asked)
 
 
 def require_undrawn(settings: dict[str, Any], overrides: Sequence[str]) -> None:
@@ -84,6 +85,19 @@ def require_undrawn(settings: dict[str, Any], overrides: Sequence[str]) -> None:
                 f"{key} has no effect: dataset={settings['name']} draws it ({count} values); leave it out, or give "
                 f"what is to be drawn, as in 'dataset.draw={{{name}: [...], ...}}'"
             )
+
+
+def check_settings(cfg: DictConfig, overrides: Sequence[str]) -> None:
+    """Refuse a scene that cannot be, for a sweep before its first job.
+
+    Raises:
+        UserError, SceneError: what is wrong.
+    """
+    if cfg.get("dataset") is None and cfg.continue_from is None and cfg.start_from is None:
+        scene = scene_from_config(cfg, overrides)
+        if not cfg.limits.any_unit:
+            require_meant(Preview.of(scene), "limits.any_unit=true")
+        decided(scene, asked_effects(cfg))
 
 
 def main(cfg: DictConfig) -> float | None:
@@ -128,7 +142,7 @@ def main(cfg: DictConfig) -> float | None:
     if (cfg.shard, cfg.shards) != (0, 1):
         raise UserError("shard and shards divide the runs of a dataset; give dataset=... or leave them out")
     if cfg.start_from is None:
-        scene = scene_from_config(cfg)
+        scene = scene_from_config(cfg, HydraConfig.get().overrides.task)
     else:
         scene = scene_on(soil_of(cfg.start_from), cfg, HydraConfig.get().overrides.task)
     preview = Preview.of(scene)

@@ -34,9 +34,24 @@ _MOST_BYTES = 1 << 26
 _COLUMNS = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 
 
-def scene_from_config(cfg: DictConfig) -> Scene:
-    """The scene in `cfg.scene` with the soil in `cfg.material`; a path file is read into the scene."""
-    return scene_from_data(plain(cfg.scene) | {"material": plain(cfg.material)})
+def scene_from_config(cfg: DictConfig, overrides: Sequence[str] = ()) -> Scene:
+    """The scene in `cfg.scene` with the soil in `cfg.material`; a path file is read into the scene. The command's
+    `overrides` say who decides about a wheel's soil, see `data_from_config`."""
+    return scene_from_data(data_from_config(cfg, overrides))
+
+
+_OF_FRICTION = ("material.friction_angle", "material.static_friction")
+
+
+def data_from_config(cfg: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
+    """Scene and soil of `cfg` as nested data. A soil or friction that the command's `overrides` choose goes before
+    the friction angle that a scene has by default."""
+    data = plain(cfg.scene) | {"material": plain(cfg.material)}
+    given = {key: value for key, _, value in (one.lstrip("+~").partition("=") for one in overrides)}
+    chosen = given.get("material", "sand") != "sand" or any(key in given for key in _OF_FRICTION)
+    if chosen and "friction_angle" in data and "scene.friction_angle" not in given:
+        data["friction_angle"] = None
+    return data
 
 
 def scene_from_data(data: dict[str, Any]) -> Scene:

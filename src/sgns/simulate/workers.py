@@ -27,13 +27,12 @@ from mpm_warp.solver import run_concurrently
 from sgns.config import Interrupted, UserError, flattened, heeded_signals
 from sgns.data.files import file_lock, remove_abandoned
 from sgns.data.run import Run
-from sgns.numbers import counted, elapsed
+from sgns.numbers import counted, duration_words, elapsed
 from sgns.settings import Limits
 from sgns.simulate.campaign import (
     Campaign,
     RunCost,
     cost_line,
-    duration_words,
     finishing_time,
     require_limits,
     require_space,

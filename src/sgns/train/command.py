@@ -12,6 +12,7 @@ import logging
 import math
 import shlex
 import shutil
+import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import OmegaConf
 
 import sgns
-from sgns.config import UserError, differences, flattened, of_dataset
+from sgns.config import Interrupted, UserError, differences, flattened, of_dataset
 from sgns.data.files import only_here, require_replaceable, write_whole
 from sgns.model.checkpoint import SUMMARY, read_checkpoint, read_summary
 from sgns.numbers import counted, error_hint, error_words
@@ -157,22 +158,30 @@ def train(
         output.mkdir(parents=True, exist_ok=True)
         torch.manual_seed(seed)
         logger = TensorBoardLogger(output, name="", version="tensorboard", default_hp_metric=False)
-        fitted = fit.run(
-            Task(
-                reduced=reduced,
-                validation_runs=validation_runs,
-                num_modes=num_modes,
-                model=settings,
-                settings=how,
-                output=output,
-                seed=seed,
-                device=device,
-                start_from=start_from,
-                resumed=resumed == "partial",
-                card=card,
-                logger=logger,
+        try:
+            fitted = fit.run(
+                Task(
+                    reduced=reduced,
+                    validation_runs=validation_runs,
+                    num_modes=num_modes,
+                    model=settings,
+                    settings=how,
+                    output=output,
+                    seed=seed,
+                    device=device,
+                    start_from=start_from,
+                    resumed=resumed == "partial",
+                    card=card,
+                    logger=logger,
+                )
             )
-        )
+        except KeyboardInterrupt as stop:
+            if (output / "last.ckpt").exists():
+                raise
+            every = getattr(how, "validate_every", None)  # polynomials write one at their end
+            first = f"; the first checkpoint comes after {every} steps" if every else ""
+            number = stop.number if isinstance(stop, Interrupted) else signal.SIGINT
+            raise Interrupted(number, f"nothing of the training is kept yet{first}") from None
         score = fitted.score
         metrics = {
             key: getattr(score, key) for key in ("skill", "skill_at_rest", "skill_in_subspace", "force_nrmse")

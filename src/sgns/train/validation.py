@@ -42,7 +42,7 @@ from tqdm import tqdm
 
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate
-from sgns.numbers import elapsed
+from sgns.numbers import duration_words, elapsed
 
 if TYPE_CHECKING:
     from sgns.settings import TrainingSettings
@@ -330,7 +330,9 @@ class StepProgress(L.Callback):
         if not self._said and now - begin >= self.SAID_AFTER:
             self._said = True
             rate = (step - first) / (now - begin)
-            log.info("%.3g steps a second: about %.2g min more", rate, (self.bar.total - step) / rate / 60)
+            log.info(
+                "%.3g steps a second: about %s more", rate, duration_words((self.bar.total - step) / rate)
+            )
 
 
 def logger_of(trainer: L.Trainer) -> TensorBoardLogger:

@@ -18,6 +18,7 @@ from mpm_warp.settings import described
 from sgns import __version__
 from sgns.cli.commands import COMMANDS
 from sgns.cli.help import groups_of, options_of
+from sgns.cli.settings import sweep_jobs
 from sgns.config import UserError
 from sgns_testing.commands import call, composed, python
 
@@ -245,8 +246,27 @@ def test_the_solver_says_what_is_wrong(empty_folder: Path) -> None:
 
 def test_a_job_of_a_sweep_says_what_is_wrong(empty_folder: Path) -> None:
     result = call_fake("if cfg.seed == 2: raise UserError('bad')", "-m", "seed=1,2,3", "output=sweep")
-    assert_one_line(result, "sgns train: job 1 (seed=2,output=sweep): bad\n")
+    assert_one_line(result, "sgns train: job 1 (seed=2): bad\n")
     assert {path.name for path in Path("sweep").iterdir()} == {"multirun.yaml", "0"}
+
+
+def test_all_jobs_of_a_sweep_are_looked_at_before_the_first(empty_folder: Path) -> None:
+    for words, job in (
+        (["scene.depth=0.04,9", "scene.duration=0.02"], "job 1 (scene.depth=9): the plate leaves the bin"),
+        (["scene=wheel", "scene.slip=0,5,0.6"], "job 1 (scene.slip=5): scene.slip is 5"),
+        (["seed=1,-1"], "job 1 (seed=-1): seed is -1"),
+    ):
+        done = call("simulate", "-m", *words)
+        assert_one_line(done, job, "; no job has begun")
+        assert not list(empty_folder.iterdir())
+
+
+def test_a_sweeps_lines_name_what_differs_between_its_jobs(empty_folder: Path) -> None:
+    done = call_fake("return 0.5", "-m", "seed=1,2", "device=cpu", "output=sweep")
+    assert "#1 : seed=2\n" in done.stdout
+    assert [job for job in sweep_jobs(["a=1,2", "b={c: 3}", "d=range(0,2)"])] == [
+        [f"a={a}", "b={c:3}", f"d={d}"] for a in (1, 2) for d in (0, 1)
+    ]
 
 
 def test_a_sweep_ends_with_a_table(empty_folder: Path) -> None:
@@ -300,7 +320,7 @@ def test_given_grids_take_the_place_of_the_datasets(
 def test_drawing_in_a_sweep(empty_folder: Path) -> None:
     sweep = ["dataset=quick,quick_wheel", "dataset.draw={slip: [0.2]}", "limits.disk=1e-9"]
     done = call("simulate", "-m", *sweep)
-    assert_one_line(done, "job 0 (dataset=quick,dataset.draw={slip:[0.2]},limits", "draw gives 1 runs")
+    assert_one_line(done, "job 0 (dataset=quick): ", "draw gives 1 runs")
 
 
 def test_a_bug_keeps_its_traceback(empty_folder: Path) -> None:

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
+from mpm_warp.motions import Passes
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run, soil_surface
@@ -95,6 +96,13 @@ def test_a_table_of_a_wheel_has_its_own_axes_too(tmp_path):
     np.testing.assert_allclose(table.pull, c * force[:, 0] + s * force[:, 1])
     np.testing.assert_allclose(table.lateral, c * force[:, 1] - s * force[:, 0])
     np.testing.assert_allclose(table.drive, c * torque[:, 1] - s * torque[:, 0])
+
+
+def test_a_table_of_passes_says_which_one_cuts(tmp_path):
+    scene = {"motion": "passes", "passes": {"number": 2, "length": 0.0}, "depth": 0.01, "speed": 1.0}
+    with Run(make_run(tmp_path / "a.h5", scene=scene)) as run:
+        expected = 1 + Passes(number=2, length=0.0).cutting(run.time, 0.01, 1.0)
+        assert 1 in expected and run.forces()["pass"].tolist() == expected.tolist()
 
 
 def test_xarray_knows_dimensions_by_name(tmp_path):

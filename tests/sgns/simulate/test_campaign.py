@@ -13,7 +13,8 @@ from omegaconf import OmegaConf
 from mpm_warp import Effects, Scene, effects_for
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
-from sgns.simulate.campaign import Campaign, duration_words, finishing_time, plan, run_cost, size_words
+from sgns.numbers import duration_words
+from sgns.simulate.campaign import Campaign, finishing_time, plan, run_cost, size_words
 from sgns.simulate.run import simulate_scene
 from sgns.simulate.scene import scene_from_config, warning_summary
 from sgns_testing.campaigns import BASE, EFFECTS, campaign

@@ -338,3 +338,19 @@ def test_maps_of_whole_numbers_or_objects_are_refused(tmp_path):
     np.save(tmp_path / "map.npy", np.zeros(3))
     with pytest.raises(UserError, match=r"it holds float64 of shape \(3,\); a map of heights has rows"):
         read_heights(tmp_path / "map.npy")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "angle"),
+    [
+        ([], 37.0),
+        (["material=sand"], 37.0),
+        (["material.youngs_modulus=2e6"], 37.0),
+        (["material=lunar_simulant"], 45.0),
+        (["material.friction_angle=40"], 40.0),
+        (["material=lunar_simulant", "scene.friction_angle=30"], 30.0),
+    ],
+)
+def test_a_chosen_soil_goes_before_the_wheels_own_friction(overrides, angle):
+    asked = ["scene=wheel", *overrides]
+    assert scene_from_config(composed(*asked), asked).material.friction_angle == angle

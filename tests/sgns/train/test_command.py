@@ -19,7 +19,7 @@ import torch
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sgns.config import UserError
+from sgns.config import Interrupted, UserError
 from sgns.data.dataset import Dataset
 from sgns.data.run import Run
 from sgns.evaluate.command import evaluate
@@ -30,7 +30,7 @@ from sgns.settings import TrainingSettings
 from sgns.simulator import Simulator
 from sgns.train import lightning_module as module
 from sgns.train import validation
-from sgns.train.command import main, train
+from sgns.train.command import FITS, main, train
 from sgns.train.validation import ValidationRollouts
 from sgns_testing.commands import TRAIN, environment
 from sgns_testing.tiny import BRIEF, MODEL, REDUCTION, TRAINING, make_dataset
@@ -409,4 +409,24 @@ def test_it_says_once_how_long_it_takes(monkeypatch, caplog) -> None:
     with caplog.at_level("INFO"):
         for step in range(1, 11):
             progress.on_train_batch_end(SimpleNamespace(global_step=step))
-    assert caplog.messages == ["0.25 steps a second: about 1.9 min more"]
+    assert caplog.messages == ["0.25 steps a second: about 2 min more"]
+
+
+def test_before_the_first_checkpoint_an_interruption_says_that_nothing_is_kept(
+    data, tmp_path, monkeypatch
+) -> None:
+    def stop(task) -> None:
+        raise Interrupted(signal.SIGTERM)
+
+    monkeypatch.setitem(FITS, "network", FITS["network"]._replace(run=stop))
+    with pytest.raises(Interrupted) as caught:
+        run(data, tmp_path, validate_every=70)
+    assert (
+        caught.value.said == "nothing of the training is kept yet; the first checkpoint comes after 70 steps"
+    )
+    assert caught.value.number == signal.SIGTERM
+    (tmp_path / "last.ckpt").touch()
+    monkeypatch.setattr("sgns.train.command.what_is_there", lambda *_: "partial")
+    with pytest.raises(Interrupted) as caught:
+        run(data, tmp_path, validate_every=70)
+    assert caught.value.said == ""
