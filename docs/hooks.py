@@ -31,7 +31,7 @@ def reference_page() -> str:
     """The page of all settings with default, unit, range and meaning, from the classes that define them."""
     import mpm_warp as mpm
     import sgns.settings as typed
-    from mpm_warp.motions import Passes
+    from mpm_warp.motions import Other, Passes
     from mpm_warp.settings import reference
 
     soil = [
@@ -45,6 +45,8 @@ def reference_page() -> str:
         mpm.Walls,
         mpm.Plate,
         Passes,
+        Other,
+        mpm.Sphere,
     ]
     soil += [
         mpm.Box,

@@ -4,11 +4,12 @@ Usable alone; needs warp, numpy, scipy, manifold3d and pydantic.
 """
 
 from .bed import Bed, Walls, arrange
-from .bodies import Box, Cylinder, MeshBody, Plate
+from .bodies import Box, Cylinder, MeshBody, Plate, Sphere
 from .discretisation import asymmetry
 from .effects import Decision, Effects, Tolerances, effects_for
 from .limits import substeps_per_frame
 from .material import Material
+from .motions import Other
 from .preview import Preview
 from .scene import Scene
 from .scenes import Body, Column, Excavation, Incline, Wheel
@@ -28,6 +29,7 @@ __all__ = [
     "Incline",
     "Material",
     "MeshBody",
+    "Other",
     "Plate",
     "Preview",
     "Scene",
@@ -35,6 +37,7 @@ __all__ = [
     "Soil",
     "Solver",
     "SolverStopped",
+    "Sphere",
     "State",
     "Tolerances",
     "Walls",

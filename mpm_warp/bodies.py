@@ -42,7 +42,7 @@ class Tool(ABC):
     """What a solver asks of any rigid body. The body frame's origin is its centre of mass."""
 
     surface: ClassVar[str]
-    """Which signed distance it has: box | plate | cylinder | mesh (kernels/signed_distance.py)."""
+    """Which signed distance it has: box | plate | cylinder | sphere | mesh (kernels/signed_distance.py)."""
     friction: float
 
     @property
@@ -217,6 +217,12 @@ class Box(Settings, Tool):
     def half_size(self) -> np.ndarray:
         return 0.5 * np.array(self.size)
 
+    @property
+    def moments(self) -> tuple[float, np.ndarray]:
+        """Volume [m^3], and moments of inertia about the body's axes per density [m^5], shape (3,)."""
+        volume, squares = math.prod(self.size), np.square(self.size)
+        return volume, volume / 12.0 * (squares.sum() - squares)
+
     def points(self) -> np.ndarray:
         return _upright_edges(self.half_size, 2)
 
@@ -270,6 +276,14 @@ class Cylinder(Settings, Tool):
     def reach(self) -> float:
         return math.hypot(self.tip_radius, 0.5 * self.width)
 
+    @property
+    def moments(self) -> tuple[float, np.ndarray]:
+        """As of a box, without grousers."""
+        radius = 0.5 * self.diameter
+        volume = math.pi * radius**2 * self.width
+        across = volume * (3.0 * radius**2 + self.width**2) / 12.0
+        return volume, np.array([across, 0.5 * volume * radius**2, across])
+
     def points(self, count: int = 8) -> np.ndarray:
         """Body nodes: `count` on each of the two rims, shape (2 count, 3)."""
         return self._rims(0.5 * self.diameter, count)
@@ -281,6 +295,41 @@ class Cylinder(Settings, Tool):
         angle = 2.0 * np.pi * np.arange(count) / count
         x, z, half = radius * np.cos(angle), -radius * np.sin(angle), 0.5 * self.width
         return np.concatenate([np.stack([x, np.full(count, y), z], axis=-1) for y in (-half, half)])
+
+
+@settings
+class Sphere(Settings, Tool):
+    """A sphere, for a further body of a scene."""
+
+    group: ClassVar[str] = "tool"
+    surface: ClassVar[str] = "sphere"
+
+    shape: Literal["sphere"] = setting("sphere", "of the body")
+    diameter: float = _length(0.10, "of the sphere")
+    friction: float = same(Plate, "friction")
+
+    @property
+    def half_size(self) -> np.ndarray:
+        return np.full(3, 0.5 * self.diameter)
+
+    @property
+    def reach(self) -> float:
+        return 0.5 * self.diameter
+
+    @property
+    def moments(self) -> tuple[float, np.ndarray]:
+        """As of a box."""
+        volume = math.pi / 6.0 * self.diameter**3
+        return volume, np.full(3, 0.1 * volume * self.diameter**2)
+
+    def points(self) -> np.ndarray:
+        """Body nodes: where the body's axes go through the surface, shape (6, 3)."""
+        return 0.5 * self.diameter * np.vstack([np.eye(3), -np.eye(3)])
+
+    def outline(self) -> np.ndarray:
+        z = np.linspace(-1.0, 1.0, 401)
+        turn, across = math.pi * (3.0 - math.sqrt(5.0)) * np.arange(401), np.sqrt(1.0 - z**2)
+        return 0.5 * self.diameter * np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=-1)
 
 
 # --- Closed triangle meshes from files ------------------------------------------------------------------

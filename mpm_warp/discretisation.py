@@ -114,22 +114,13 @@ def asymmetry(scene: Scene) -> str | None:
     """Why a scene is not mirror symmetric about y = Ly / 2; None if it is."""
     if scene.bed.walls.y == "periodic":
         return "the bed is periodic in y (bed.walls.y)"
-    if scene.body is not None:
-        # A path may turn off the plane between two frames.
-        times = np.concatenate([scene.times(), scene.path_times()])
-        poses = scene.poses_at(times)
-        off = np.abs(poses[:, 1] - 0.5 * scene.bed.size[1]) > _SAME * scene.bed.spacing
-        if off.any():
-            i = int(np.argmax(off))
-            return f"the body is at y = {poses[i, 1]:.4f} m at {times[i]:.3f} s, not at mid-width"
-        turned = np.abs(poses[:, [3, 5]]).max(axis=1) > 1e-9
-        if turned.any():
-            return f"at {times[int(np.argmax(turned))]:.3f} s the body is turned about another axis than y"
-        if (
-            isinstance(scene.body, MeshBody)
-            and (off_by := mesh_asymmetry(scene.body)) > _ALIKE * scene.bed.spacing
-        ):
-            return f"the tool's two sides differ by {1e3 * off_by:.3g} mm"
+    for one in scene.companions:
+        if one.free:
+            return f"{one.place} is free to leave the plane"
+        if reason := _body_asymmetry(one):
+            return reason.replace("the body", one.place)
+    if reason := _body_asymmetry(scene):
+        return reason
     if scene.soil is not None and scene.soil.state.whole is None:
         return "the soil to start from was not computed as one half and its mirror image"
     if half(scene) is None:
@@ -137,6 +128,28 @@ def asymmetry(scene: Scene) -> str | None:
             "the particles are not mirror images of each other (bed.arrangement); use bed.arrangement=lattice or "
             "bed.mirrored=true"
         )
+    return None
+
+
+def _body_asymmetry(scene: Scene) -> str | None:
+    """Why a scene's own body or its motion is not symmetric."""
+    if scene.body is None:
+        return None
+    # A path may turn off the plane between two frames.
+    times = np.concatenate([scene.times(), scene.path_times()])
+    poses = scene.poses_at(times)
+    off = np.abs(poses[:, 1] - 0.5 * scene.bed.size[1]) > _SAME * scene.bed.spacing
+    if off.any():
+        i = int(np.argmax(off))
+        return f"the body is at y = {poses[i, 1]:.4f} m at {times[i]:.3f} s, not at mid-width"
+    turned = np.abs(poses[:, [3, 5]]).max(axis=1) > 1e-9
+    if turned.any():
+        return f"at {times[int(np.argmax(turned))]:.3f} s the body is turned about another axis than y"
+    if (
+        isinstance(scene.body, MeshBody)
+        and (off_by := mesh_asymmetry(scene.body)) > _ALIKE * scene.bed.spacing
+    ):
+        return f"the tool's two sides differ by {1e3 * off_by:.3g} mm"
     return None
 
 

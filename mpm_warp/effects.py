@@ -11,7 +11,7 @@ import numpy as np
 
 from .discretisation import asymmetry, require_symmetry
 from .limits import scene_size
-from .scene import Scene
+from .scene import Companion, Scene
 from .scenes import Column, bagnold_speed
 from .settings import Settings, setting, settings
 from .state import SceneError
@@ -109,7 +109,8 @@ def expected_flow(scene: Scene) -> Flow | None:
     With the speed V and the thickness l of the flowing layer I = (V / l) d sqrt(rho_s / p) at the pressure
     p = rho g l of soil as deep as the layer, and that of its cohesion.
     """
-    found = [flow for flow in (_of_body(scene), _of_column(scene), _of_slope(scene)) if flow]
+    every = [_of_body(scene), _of_column(scene), _of_slope(scene), *map(_of_body, scene.companions)]
+    found = [flow for flow in every if flow]
     return max(found, key=lambda flow: flow.inertial_number, default=None)
 
 
@@ -129,6 +130,9 @@ def _of_body(scene: Scene) -> Flow | None:
     body = scene.body
     if body is None:
         return None
+    quarter = 0.5 * float(body.half_size[:2].min())
+    if isinstance(scene, Companion) and scene.free:
+        return _sheared(scene, scene.place, scene.impact_speed, quarter) if scene.impact_speed else None
     poses = scene.body_poses()
     depth = -scene.lowest_points(poses)
     way, angle = scene.displacement(scene.times())
@@ -136,11 +140,12 @@ def _of_body(scene: Scene) -> Flow | None:
     if scene.axle is None:
         speed, thickness = speed[depth[:-1] > 0.0], float(depth.max())
     else:
-        thickness = 0.5 * float(body.half_size[:2].min())
+        thickness = quarter
     moving = speed[speed > 0.0]
     if not len(moving):
         return None
-    return _sheared(scene, "the body", float(np.percentile(moving, 100.0 - _TOP_SHARE)), thickness)
+    cause = scene.place if isinstance(scene, Companion) else "the body"
+    return _sheared(scene, cause, float(np.percentile(moving, 100.0 - _TOP_SHARE)), thickness)
 
 
 def _of_column(scene: Scene) -> Flow | None:
@@ -174,7 +179,7 @@ def _of_slope(scene: Scene) -> Flow | None:
 # --- Which effects a scene calls for, by named dimensionless numbers ------------------------------------
 
 EFFECTS = (*(f.name for f in fields(Effects)), "free_body")
-"""What can be asked for: the switches of `Effects`, and whether the body's height is free."""
+"""What can be asked for: the switches of `Effects`, and whether a body, or its height, is free."""
 
 
 @settings
@@ -239,7 +244,8 @@ def effects_for(
             asymmetric or "bed, body and motion are their own mirror image about mid-width",
         ),
         "torque": Decision(
-            scene.body is not None, "the body turns soil" if scene.body else "there is no body"
+            scene.body is not None or bool(scene.others),
+            "the body turns soil" if scene.body or scene.others else "there is no body",
         ),
         "free_body": _free_body(scene),
     }
@@ -309,6 +315,14 @@ def _cohesion(scene: Scene) -> Decision:
 
 
 def _free_body(scene: Scene) -> Decision:
+    for one in scene.companions:
+        if one.free:
+            return Decision(True, f"{one.place} is free in six degrees of freedom")
+    for one in scene.companions:
+        if one.axle is not None:
+            return Decision(
+                True, f"the height of {one.place} is free; it carries {one.axle.mass * scene.gravity:.4g} N"
+            )
     if scene.axle is not None:
         return Decision(
             True, f"the body's height is free; it carries {scene.axle.mass * scene.gravity:.4g} N"
@@ -321,12 +335,16 @@ def _require_possible(scene: Scene, asked: Mapping[str, bool | str]) -> None:
         require_symmetry(scene)
     if asked["cohesion"] is True and scene.material.cohesion == 0.0:
         raise SceneError("effects.cohesion needs material.cohesion above 0 Pa; or set effects.cohesion=auto")
-    if asked["torque"] is True and scene.body is None:
+    if asked["torque"] is True and scene.body is None and not scene.others:
         raise SceneError("effects.torque needs a body and this scene has none; set effects.torque=auto")
-    if asked["free_body"] is True and scene.axle is None:
+    free = next((one for one in scene.companions if one.free or one.axle), None)
+    if asked["free_body"] is True and scene.axle is None and free is None:
         raise SceneError(
-            "effects.free_body needs a body whose height is free, as in scene=wheel; set effects.free_body=auto"
+            "effects.free_body needs a body whose height is free, as in scene=wheel, or one in scene.others; set "
+            "effects.free_body=auto"
         )
+    if asked["free_body"] is False and free is not None:
+        raise SceneError(f"effects.free_body is false, but {free.place} is free; set effects.free_body=auto")
     if asked["free_body"] is False and scene.axle is not None:
         raise SceneError(
             f"effects.free_body is false, but the height of the body in a scene of kind {scene.kind} is always free; "

@@ -32,7 +32,7 @@ def substeps_per_frame(scene: Scene) -> int:
     Raises:
         SceneError: more than limits.py allows in a frame or in all.
     """
-    limit = min(_wave_step(scene), longest_step(scene))
+    limit = min(_wave_step(scene), *map(longest_step, (scene, *scene.companions)))
     count = 1.0 / scene.frame_rate / limit - 1e-9 if limit > 0.0 else math.inf
     total = count * (scene.frame_count - 1)
     if not count <= MOST_SUBSTEPS:
@@ -56,6 +56,10 @@ def _wave_step(scene: Scene) -> float:
 
 def _way_out(scene: Scene) -> str:
     """What to change for fewer substeps: the key that asks for most of them beyond what the defaults would."""
+    for one in scene.companions:
+        if longest_step(one) < _wave_step(scene):
+            key = "density" if one.free else "load"
+            return f"the mass of {one.place} is too small for contact this stiff: raise its {key}"
     if scene.axle is not None and longest_step(scene) < _wave_step(scene):
         return (
             f"the body's mass of {scene.axle.mass:.3g} kg is too small for contact this stiff: raise scene.load or "
@@ -85,8 +89,14 @@ def damped_share(scene: Scene) -> float:
 
 
 def top_body_speed(scene: Scene, step: float | None = None) -> float:
-    """Fastest motion of any point of the body between frames and, with `step` [s], along its path within such a time
+    """Fastest motion of any point of a body between frames and, with `step` [s], along its path within such a time
     [m/s]; a free height moves on top of it."""
+    every = [max(_top_speed(one, step), one.top_free_speed) for one in scene.companions]
+    return max(_top_speed(scene, step), *every, 0.0)
+
+
+def _top_speed(scene: Scene, step: float | None) -> float:
+    """Of the scene's own body."""
     if scene.body is None:
         return 0.0
     times = scene.times()
@@ -154,6 +164,9 @@ def scene_size(scene: Scene, precision: str = "float32") -> SceneSize:
     memory = particles * (_REALS_PER_PARTICLE * real + _BYTES_PER_PARTICLE) + nodes * _REALS_PER_NODE * real
     if scene.body is not None:
         memory += substeps * (_REALS_PER_SUBSTEP * real + _BYTES_PER_SUBSTEP)
+    memory += len(scene.others) * (
+        3 * particles * real + substeps * (_REALS_PER_SUBSTEP * real + _BYTES_PER_SUBSTEP)
+    )
     return SceneSize(particles, nodes, substeps, substeps * (scene.frame_count - 1), memory)
 
 

@@ -1,13 +1,14 @@
-"""How tools move: the published cuts, several passes; how a wheel's load, place and forces are read."""
+"""How tools move: the published cuts, several passes, further bodies; how a wheel's load and forces are read."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from .bodies import Box, Cylinder, Sphere
 from .poses import about_y, rotate
 from .settings import Settings, setting, settings, short
 from .state import SceneError
@@ -189,3 +190,62 @@ def as_loads(rows: Any) -> tuple[tuple[float, float], ...]:
             "scene.load is empty; it must be a number above 0 N, or rows of a time [s] and a load [N]"
         )
     return tuple((float(time), float(load)) for time, load in rows)
+
+
+# --- Further bodies -------------------------------------------------------------------------------------
+
+_USED = {
+    "free": ("position", "rotation", "velocity", "spin", "density"),
+    "path": ("path", "load"),
+    "follow": ("position", "load"),
+}
+
+
+def _three(default: tuple[float, float, float], words: str, unit: str) -> Any:
+    return setting(default, words, unit, ge=-1e6, le=1e6, words="; it needs three numbers from -1e6 to 1e6")
+
+
+@settings
+class Other(Settings):
+    """A further body in the soil, beside the one that a kind of scene has. Bodies do not touch each other."""
+
+    group: ClassVar[str] = "scene.others"
+
+    tool: Sphere | Box | Cylinder = setting(Sphere, "the body")
+    motion: Literal["free", "path", "follow"] = setting(
+        "free",
+        "free: it falls, turns and is pushed; path: prescribed; follow: as the scene's own body, beside it",
+    )
+    position: tuple[float, float, float] = _three(
+        (0.0, 0.0, 0.0), "of the centre of mass at the start; with follow, from the scene's own body on", "m"
+    )
+    rotation: tuple[float, float, float, float] = setting(
+        (0.0, 0.0, 0.0, 1.0),
+        "at the start, of a free body: unit quaternion x, y, z, w",
+        words="; it needs a unit quaternion x, y, z, w",
+    )
+    velocity: tuple[float, float, float] = _three((0.0, 0.0, 0.0), "at the start, of a free body", "m/s")
+    spin: tuple[float, float, float] = _three((0.0, 0.0, 0.0), "likewise, about x, y, z", "rad/s")
+    density: float = setting(
+        2650.0, "of a free body: its mass by its volume, grousers left out", "kg/m^3", gt=0, le=1e6
+    )
+    path: tuple[Any, ...] | None = setting(None, "for path: rows as of scene.path")
+    load: float | None = setting(
+        None,
+        "with path or follow: the height is free, and this is the weight; None: as of the body it follows",
+        "N",
+        gt=0,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if abs(math.hypot(*self.rotation) - 1.0) > 1e-3:
+            raise SceneError(f"scene.others.rotation is {self.rotation}; it must be of length 1")
+        for name in sorted(set(sum(_USED.values(), ())) - set(_USED[self.motion])):
+            if getattr(self, name) != getattr(type(self), name):
+                raise SceneError(
+                    f"scene.others.{name} is {short(getattr(self, name))}, but motion={self.motion} does not use it; "
+                    f"allowed: {', '.join(_USED[self.motion])}"
+                )
+        if self.motion == "path" and self.path is None:
+            raise SceneError("scene.others.path is missing: rows t, x, y, z, qx, qy, qz, qw for motion=path")

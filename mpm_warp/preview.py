@@ -47,9 +47,10 @@ class Preview:
     @staticmethod
     def of(scene: Scene) -> Preview:
         """Of a scene; takes milliseconds."""
-        body, warnings = scene.body, [*_radians(scene), *scene.warnings()]
+        body, warnings = scene.body, [*_radians(scene), *scene.warnings(), *_buried(scene)]
+        free = [f"{one.place} is free and has {one.mass:.3g} kg" for one in scene.companions if one.free]
         if body is None:
-            return Preview(warnings=tuple(warnings), lines=tuple(_bin(scene)))
+            return Preview(warnings=tuple(warnings), lines=tuple(_bin(scene) + free))
         times = scene.passing_times()
         poses, outline = scene.poses_at(times), body.outline()
         low = scene.lowest_points(poses)
@@ -62,10 +63,10 @@ class Preview:
         found = [odd_size(body, scene.bed.size, scene.open_sides), *_of_path(scene, low, touch)]
         odd = [one for one in found if one]
         warnings += [one.words for one in odd]
-        if len(scene.displaced):
+        if len(scene.own_displaced):
             deep = f", {_words(-low[0])} deep" if low[0] < 0.0 else ""
             warnings.append(
-                f"the tool is in the soil at the start{deep}: {len(scene.displaced)} particles "
+                f"the tool is in the soil at the start{deep}: {len(scene.own_displaced)} particles "
                 "that would lie inside it are left out; soil closes in on it in the first 0.2 s: let it rest so long"
             )
         if touch is not None:
@@ -106,8 +107,17 @@ class Preview:
             displaced=len(scene.displaced),
             warnings=tuple(warnings),
             not_meant=tuple(one.words for one in odd if one.sure),
-            lines=tuple(lines),
+            lines=tuple(lines + free),
         )
+
+
+def _buried(scene: Scene) -> list[str]:
+    """Of further bodies."""
+    return [
+        f"{one.place} is in the soil at the start: {len(one.displaced)} particles that would lie inside it are left out"
+        for one in scene.companions
+        if len(one.displaced)
+    ]
 
 
 def near_floor(scene: Scene, lowest: float) -> list[str]:

@@ -3,7 +3,8 @@
 Where its height is free it carries a load and rests on the soil. One thread on the device then moves it once per
 substep, so nothing waits for the host and the step can be part of a captured graph. Height and speed are kept in double
 precision whatever the solver's: in single precision a height of 0.15 m moves in steps of 1.5e-8 m, and a wheel that
-sinks slower than one such step per substep would hang in the air.
+sinks slower than one such step per substep would hang in the air. So is all of the motion of a body that is free in
+all six degrees of freedom.
 """
 
 from __future__ import annotations
@@ -14,12 +15,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from .kernels.contact import HOLDING_LAYER, ContactLaw, axle_step, body_struct
+from .kernels.contact import (
+    COUNT,
+    GAINED,
+    HOLDING_LAYER,
+    SPEED,
+    SPIN,
+    TURNED,
+    ContactLaw,
+    axle_step,
+    body_struct,
+    free_step,
+)
 from .kernels.grid import adding_up
 from .kernels.signed_distance import shape_data
 from .launch import Launch, Threads
-from .poses import rotation_vectors, sampled_poses
-from .scene import MOST_COURANT, Scene
+from .poses import in_world_frame, rotation_matrices, rotation_vectors, sampled_poses
+from .scene import MOST_COURANT, Companion, Scene
 from .settings import short
 from .state import SceneError, SolverStopped
 from .tool_geometry import thickening
@@ -55,14 +67,23 @@ def contact_spring(scene: Scene, volume: float) -> tuple[float, float]:
 def longest_step(scene: Scene) -> float:
     """The substep [s] that a free body's mass allows; infinite for a prescribed one.
 
-    Counted as if the whole lower half of the box around the body touched a particle per (particle spacing)^2.
+    Counted as if the whole lower half of the box around the body touched a particle per (particle spacing)^2. Of a body
+    that is free in all directions all of its surface counts, and half of its mass: that is what a rod or a cylinder has
+    at its surface against being turned, and other shapes have more.
     """
-    if scene.axle is None or scene.body is None:
+    if scene.body is None:
         return math.inf
     volume = scene.bed.particle_volume
     hx, hy, hz = scene.body.half_size
-    area = 4.0 * hx * hy + 4.0 * hz * (hx + hy)
-    return stable_step(scene.axle.mass, area / volume ** (2.0 / 3.0), *contact_spring(scene, volume))
+    if isinstance(scene, Companion) and scene.free:
+        box = 8.0 * hx * hy * hz  # of spheres and cylinders, the same share of volume and surface
+        area = 8.0 * (hx * hy + hy * hz + hz * hx) * scene.mass / (scene.settings.density * box)
+        mass = 0.5 * scene.mass
+    elif scene.axle is not None:
+        area, mass = 4.0 * hx * hy + 4.0 * hz * (hx + hy), scene.axle.mass
+    else:
+        return math.inf
+    return stable_step(mass, area / volume ** (2.0 / 3.0), *contact_spring(scene, volume))
 
 
 class RigidBody:
@@ -89,7 +110,10 @@ class RigidBody:
         # Soil's waves and the body together may go so far in a step.
         stable = math.sqrt(1.0 + scene.elastic_damping**2) - scene.elastic_damping
         self._fastest = MOST_COURANT * stable * h / time_step - scene.material.wave_speed
-        self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, effects.torque)
+        self._name = scene.place if isinstance(scene, Companion) else "the body"
+        loose = isinstance(scene, Companion) and scene.free
+        torque = effects.torque or loose
+        self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, torque, loose)
         struct: Any = body_struct(real)
         self.data = data = struct()
         """The struct that kernels take."""
@@ -103,10 +127,11 @@ class RigidBody:
         data.friction = shape.friction
         data.stiffness, data.damping = contact_spring(scene, scene.filled[1])
         data.separation_speed = 0.01 * scene.material.wave_speed
-        data.position, data.velocity, data.spin = (wp.zeros(substeps, vec3, device) for _ in range(3))
-        data.rotation = wp.zeros(substeps, wp.types.quaternion(real), device)
+        known = 1 if loose else substeps
+        data.position, data.velocity, data.spin = (wp.zeros(known, vec3, device) for _ in range(3))
+        data.rotation = wp.zeros(known, wp.types.quaternion(real), device)
         data.stick = wp.zeros(particles, vec3, device)
-        data.impulse = wp.zeros(1 + effects.torque, vec3, device)
+        data.impulse = wp.zeros(1 + torque, vec3, device)
         self.of_threads = [data]
         """The struct for each thread, whose push it adds up."""
         self._given: np.ndarray | None = None  # path rows of the frame under way, if its end was given
@@ -121,6 +146,12 @@ class RigidBody:
             mass = axle.mass * (0.5 if effects.symmetry else 1.0)
             values = [self._axle, data.impulse, time_step, mass, self._fall, axle.damping]
             moving.append(Launch(axle_step(real), 1, values, device))
+        self._motion: wp.array | None = None
+        if isinstance(scene, Companion) and scene.free:
+            self._inertia = scene.inertia
+            self._motion = wp.array(self._at_start(scene), dtype=wp.float64, device=device)
+            given = [time_step, scene.mass, wp.vec3d(*(1.0 / scene.inertia)), wp.vec3d(*scene.gravity_vector)]
+            moving.append(Launch(free_step(real), 1, [data, self._motion, *given], device))
         impulses = threads.copies(data.impulse)
         for impulse in impulses[1:]:
             own = struct()
@@ -133,6 +164,14 @@ class RigidBody:
         ]
         self.launches += moving
         """What has to run in every substep after the soil's push was added up."""
+
+    def _at_start(self, scene: Companion) -> np.ndarray:
+        """As of `free_step`."""
+        found = np.zeros(COUNT)
+        found[:SPEED], found[SPEED:SPIN] = scene.poses_at(np.zeros(1))[0], scene.settings.velocity
+        turn = rotation_matrices(found[TURNED:SPEED])
+        found[SPIN:GAINED] = turn @ (scene.inertia * (np.array(scene.settings.spin) @ turn))
+        return found
 
     def head_for(self, frame: int, pose: np.ndarray) -> None:
         """Go on from frame number `frame` to a pose (7,) one frame later, whatever the scene's motion is.
@@ -176,6 +215,16 @@ class RigidBody:
             SolverStopped: the body jumps.
         """
         self.data.impulse.zero_()
+        if self._motion is not None:
+            motion = self._motion.numpy().copy()
+            motion[GAINED:] = 0.0
+            self._motion.assign(motion)
+            turn = rotation_matrices(motion[TURNED:SPEED])
+            self.data.position.assign(motion[None, :TURNED])
+            self.data.rotation.assign(motion[None, TURNED:SPEED])
+            self.data.velocity.assign(motion[None, SPEED:SPIN])
+            self.data.spin.assign((turn @ (motion[SPIN:GAINED] @ turn / self._inertia))[None])
+            return
         times = (frame * self.substeps + np.arange(self.substeps + 1)) * self.time_step
         if self._axle is not None and self.scene.axle is not None:
             self._axle[2:].zero_()
@@ -195,6 +244,8 @@ class RigidBody:
 
     def pose(self, time: float) -> np.ndarray:
         """Centre of mass [m] and quaternion now, at `time` [s], shape (7,)."""
+        if self._motion is not None:
+            return self._motion.numpy()[:SPEED].copy()
         if self._given is None:
             pose = self.scene.poses_at(np.array([time]))[0]
         else:
@@ -214,6 +265,8 @@ class RigidBody:
         arrays = {"contact_stretch": self.data.stick}
         if self._axle is not None:
             arrays["axle"] = self._axle
+        if self._motion is not None:
+            arrays["motion"] = self._motion
         return arrays
 
     def go_on(self, arrays: dict[str, np.ndarray], stretch: np.ndarray) -> None:
@@ -226,21 +279,48 @@ class RigidBody:
         """Stop at `time` [s] where the soil's push or a free body's motion means nothing any more.
 
         Raises:
-            SolverStopped: the force is not finite; the body reached the floor, or is faster than `top_speed` [m/s].
+            SolverStopped: the force is not finite; the body reached the floor or, if it is free, a wall, or is faster
+                than `top_speed` [m/s].
         """
         if not np.isfinite(self.data.impulse.numpy()).all():
-            raise SolverStopped(f"the force on the body is not finite by {time:.3f} s: lower scene.courant")
+            raise SolverStopped(
+                f"the force on {self._name} is not finite by {time:.3f} s: lower scene.courant"
+            )
+        if self._motion is not None:
+            self._check_free(time, top_speed, self._motion.numpy())
         if self._axle is None:
             return
         height, rate, _ = self._axle.numpy()
         if not abs(rate) <= top_speed:
             raise SolverStopped(
-                f"the body moves up or down at {rate:.3g} m/s by {time:.3f} s, which nothing here can cause "
+                f"{self._name} moves up or down at {rate:.3g} m/s by {time:.3f} s, which nothing here can cause "
                 f"({top_speed:.3g} m/s at most): lower scene.courant or raise scene.damping"
             )
         if not height - self._shape.half_size[2] > -self.scene.bed.size[2]:
             raise SolverStopped(
-                f"the body reached the floor of the bin by {time:.3f} s: make scene.bed.size deeper or the load smaller"
+                f"{self._name} reached the floor of the bin by {time:.3f} s: make scene.bed.size deeper or the load "
+                "smaller"
+            )
+
+    def _check_free(self, time: float, top_speed: float, motion: np.ndarray) -> None:
+        speed = float(np.linalg.norm(motion[SPEED:SPIN]))
+        if not speed <= top_speed:
+            raise SolverStopped(
+                f"{self._name} moves at {speed:.3g} m/s by {time:.3f} s, which nothing here can cause ({top_speed:.3g} "
+                "m/s at most): lower scene.courant"
+            )
+        places = in_world_frame(motion[None, :SPEED], self._shape.outline())[0]
+        lx, ly, lz = self.scene.bed.size
+        if not places[:, 2].min() > -lz:
+            raise SolverStopped(
+                f"{self._name} reached the floor of the bin by {time:.3f} s, which no free body touches: make "
+                "scene.bed.size deeper"
+            )
+        low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
+        if (low < 0.0).any() or (high > (lx, ly)).any():
+            raise SolverStopped(
+                f"{self._name} reached a side of the bin by {time:.3f} s, which no free body touches: make "
+                "scene.bed.size larger or end earlier"
             )
 
     def _require_steady(
@@ -254,7 +334,7 @@ class RigidBody:
         substep = int(np.argmax(far))
         at = ", ".join(f"{c:.4f}" for c in position[substep])
         raise SolverStopped(
-            f"the body jumps by {way[substep]:.3g} m from ({at}) m and turns by {math.degrees(angle[substep]):.3g} "
+            f"{self._name} jumps by {way[substep]:.3g} m from ({at}) m and turns by {math.degrees(angle[substep]):.3g} "
             f"degrees within substep {substep} of frame {frame + 1}, {self.time_step:.3g} s long, at "
             f"{times[substep]:.5f} s: its farthest point moves {farthest[substep]:.3g} m, allowed: {most:.3g} m, half "
             "a grid spacing; make its path smooth or slower there; the frames before it are good"

@@ -14,6 +14,7 @@ import numpy as np
 from .bed import Bed, digest
 from .bodies import Axle, Cylinder, MeshBody, Tool
 from .material import Material
+from .motions import Other
 from .poses import (
     in_body_frame,
     in_world_frame,
@@ -45,6 +46,8 @@ _FREE = ("headroom", "store_every", "initial_stress", "surface")
 """Keys of a bed that may be others than in the run to start from."""
 _SAME_PLACE = 0.01
 """Two places no further from each other are the same [grid spacings]."""
+AXLE_DAMPING = 5.0
+"""Of a further body whose height is free, if it does not follow one that has its own [1/s]."""
 _FARTHEST = 1e13
 """Number in a path, which may hold epoch seconds in milliseconds [s or m]."""
 
@@ -109,6 +112,7 @@ class Scene(Settings):
         words=" s; it must be 0 (every step) or more, or null",
     )
     remap_distance: float = setting(0.1, "soil's way between two remaps", "grid spacings", gt=0, le=0.5)
+    others: tuple[Other, ...] = setting((), "further bodies: a list of groups of keys")
     velocity_memory: float | None = setting(
         None, "time in which velocities below the grid fade to 37 %; None: 18 sqrt(d / g)", "s", gt=0
     )
@@ -134,6 +138,9 @@ class Scene(Settings):
             )
         if self._path is not None:
             object.__setattr__(self, "path", _as_path(self._path))
+        for number, one in enumerate(self.others):
+            if one.motion != "follow":  # what is followed is not known yet
+                Companion(self, number)
 
     @property
     def _path(self) -> tuple[tuple[float, ...], ...] | None:
@@ -247,12 +254,18 @@ class Scene(Settings):
 
     @cached_property
     def displaced(self) -> np.ndarray:
-        """Indices of the particles of `filled` that are left out, because the body is where they would be at time 0,
+        """Indices of the particles of `filled` that are left out, because a body is where they would be at time 0,
         increasing; nearly always none.
 
         Particles in the midst of a body would be thrown out. So where the centre of one is inside it, and more than a
         tenth of a particle spacing beyond where contact begins, all go that contact would push.
         """
+        every = [self.own_displaced, *(one.displaced for one in self.companions)]
+        return np.unique(np.concatenate(every)) if len(every) > 1 else every[0]
+
+    @property
+    def own_displaced(self) -> np.ndarray:
+        """By the scene's own body."""
         body, nobody = self.body, np.zeros(0, dtype=np.int64)
         if body is None or self.goes_on:
             return nobody
@@ -311,6 +324,11 @@ class Scene(Settings):
     def axle(self) -> Axle | None:
         """The body's vertical motion if it is free; None: all of it is prescribed."""
         return None
+
+    @cached_property
+    def companions(self) -> list[Companion]:
+        """The further bodies, each seen as a scene of its own."""
+        return [Companion(self, number) for number in range(len(self.others))]
 
     @property
     def frame_count(self) -> int:
@@ -482,6 +500,99 @@ class Scene(Settings):
                     f"{what} leaves the bin at {times[some[pose]]:.3f} s: {'xyz'[axis]} = {at:.4f} m, "
                     f"allowed {allowed} below the surface; {remedy}"
                 )
+
+
+class Companion(Scene):
+    """One of the further bodies of a scene, seen as if it were the only one in it.
+
+    Raises:
+        SceneError: the body is outside the bin, too thin for the grid, or has nothing to follow.
+    """
+
+    def __init__(self, scene: Scene, number: int) -> None:
+        self.__dict__.update({one.name: getattr(scene, one.name) for one in fields(Scene)}, others=())
+        self.scene, self.settings, self.place = scene, scene.others[number], f"scene.others[{number}]"
+        if self.settings.path is not None:
+            self._rows = _as_path(self.settings.path)
+        if self.settings.motion == "follow" and scene.body is None:
+            raise SceneError(f"{self.place} has nothing to follow: a scene of kind {scene.kind} has no body")
+        if self.settings.load is not None and not self.gravity > 0:
+            raise SceneError(f"{self.place}.load needs scene.gravity above 0 m/s^2")
+        self._check_thickness(self.body, self.place)
+        self._check_inside(self.body, self.place, "change its position or path")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        self.__dict__[name] = value
+
+    @property
+    def body(self) -> Tool:
+        return self.settings.tool
+
+    @property
+    def free(self) -> bool:
+        """Whether it has six degrees of freedom."""
+        return self.settings.motion == "free"
+
+    @property
+    def mass(self) -> float:
+        """Of a free body [kg]."""
+        return self.settings.density * self.settings.tool.moments[0]
+
+    @property
+    def inertia(self) -> np.ndarray:
+        """Of a free body, about its axes [kg m^2], shape (3,)."""
+        return self.settings.density * self.settings.tool.moments[1]
+
+    @property
+    def axle(self) -> Axle | None:
+        main = self.scene.axle if self.settings.motion == "follow" else None
+        if self.settings.load is None:
+            return main
+        return Axle(self.settings.load / self.gravity, AXLE_DAMPING if main is None else main.damping)
+
+    @property
+    def bilateral(self) -> bool:  # type: ignore[override]
+        return self.settings.motion == "follow" and self.scene.bilateral
+
+    @property
+    def filled(self) -> tuple[np.ndarray, float]:
+        return self.scene.filled
+
+    @property
+    def _path(self) -> tuple[tuple[float, ...], ...] | None:
+        return self.__dict__.get("_rows")
+
+    @property
+    def impact_speed(self) -> float:
+        """With which a free body comes to a flat surface, or begins below it [m/s]."""
+        one = self.settings
+        fall = self.lowest_points(self.poses_at(np.zeros(1)))[0]
+        spin = math.hypot(*one.spin) * self.body.reach
+        return math.hypot(*one.velocity) + spin + math.sqrt(2.0 * self.gravity * max(fall, 0.0))
+
+    @property
+    def top_free_speed(self) -> float:
+        """Of any point of a free body that falls to the floor [m/s]; 0 of others."""
+        depth = self.bed.size[2] + abs(math.sin(math.radians(self.tilt))) * self.bed.size[0]
+        return self.impact_speed + math.sqrt(2.0 * self.gravity * depth) if self.free else 0.0
+
+    def poses_at(self, time: np.ndarray) -> np.ndarray:
+        if self.settings.motion == "path":
+            return super().poses_at(time)
+        if self.settings.motion == "follow":
+            poses = self.scene.poses_at(time)
+            poses[:, :3] += self.settings.position
+            return poses
+        rotation = np.array(self.settings.rotation) / math.hypot(*self.settings.rotation)
+        return np.tile([*self.settings.position, *rotation], (len(np.atleast_1d(time)), 1))
+
+    def path_times(self) -> np.ndarray:
+        return self.scene.path_times() if self.settings.motion == "follow" else super().path_times()
+
+    def displacement(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if self.settings.motion == "follow":
+            return self.scene.displacement(time)
+        return super().displacement(time)
 
 
 Scene.classes["bed"] = Scene

@@ -102,7 +102,7 @@ class _Field(NamedTuple):
     setting: Setting
     type: Any
     adapter: TypeAdapter | None
-    """None: a group of settings, or a choice of such groups."""
+    """None: a group of settings, a choice of such groups, or a list of one."""
 
 
 class Settings:
@@ -201,6 +201,12 @@ def build(cls: type[Settings], data: Any, where: str, make: Callable[..., Any] |
         groups = _groups(kind)
         if not groups or isinstance(value, tuple(groups)):
             values[key] = _checked(cls, key, value, place)
+        elif get_origin(kind) is tuple:
+            every = _checked(cls, key, value, place)
+            values[key] = tuple(
+                one if isinstance(one, tuple(groups)) else build(groups[0], one, f"{place}[{i}]")
+                for i, one in enumerate(every)
+            )
         else:
             values[key] = build(_chosen(groups, value, place), value, place)
     return (make or cls)(**values)
@@ -270,6 +276,12 @@ def _limited(hint: Any, known: Setting) -> Any:
 def _checked(cls: type[Settings], name: str, value: Any, place: str = "") -> Any:
     """A value of the right type and in its range; `place` is where it stands if it comes from plain data."""
     known, kind, adapter = _fields_of(cls)[name]
+    if adapter is None and get_origin(kind) is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise cls.raises(
+                f"{place or f'{cls.group}.{name}'} is {value!r}; it must be a list of groups of keys"
+            )
+        return tuple(value)
     if adapter is None:
         return value
     if isinstance(value, (np.ndarray, np.generic)):

@@ -52,6 +52,12 @@ class Frame:
     """By the soil on the body, world frame, mean since the previous frame [N], shape (3,); frame 0: zeros."""
     torque: np.ndarray
     """About the body's centre of mass, likewise [N m], shape (3,); zeros without the effect `torque`."""
+    other_poses: np.ndarray
+    """Of the k further bodies, as `body_pose`, shape (k, 7)."""
+    other_forces: np.ndarray
+    """On them, as `force`, shape (k, 3)."""
+    other_torques: np.ndarray
+    """Likewise as `torque`, shape (k, 3)."""
 
     @property
     def pose(self) -> np.ndarray:
@@ -211,6 +217,10 @@ class Solver:
         """
         if self.body is None:
             raise SceneError("the scene has no tool to move; take its `frames`")
+        if any(one.motion == "follow" for one in self.scene.others):
+            raise SceneError(
+                "a body of scene.others follows the scene's own motion, and `step` has none: give it motion=path"
+            )
         if self._stepped is None:
             self.reset()
         assert self._stepped is not None
@@ -294,14 +304,14 @@ class Solver:
         for axis, turns in self._turns.items():
             if (found := soil.get(f"turns_{'xyz'[axis]}")) is not None:
                 turns.assign(found)
+        given_to = effects, real, self._threads, self.substeps_per_frame, self.time_step, n
         self.body: RigidBody | None = None
         """The tool or wheel; None without one."""
         if scene.body is not None:
-            self.body = RigidBody(
-                scene, effects, real, self._threads, self.substeps_per_frame, self.time_step, n
-            )
+            self.body = RigidBody(scene, *given_to)
             if scene.goes_on and scene.soil is not None:
                 self.body.go_on(scene.soil.state.arrays, soil["contact_stretch"])
+        self._others = [RigidBody(one, *given_to) for one in scene.companions]
         self._remap, self._steps = self._programs(layers)
         self._memory = Memory(self._lasting(), self._half.images if self._half is not None else None)
         if self._start is not None:
@@ -316,7 +326,13 @@ class Solver:
         arrays |= {f"turns_{'xyz'[axis]}": turns for axis, turns in self._turns.items()}
         if self.effects.nonlocality:
             arrays["cooperative_fluidity"] = self._cooperative_field
+        for number, other in enumerate(self._others):
+            arrays |= {f"others_{number}_{name}": array for name, array in other.lasting().items()}
         return arrays | (self.body.lasting() if self.body is not None else {})
+
+    @property
+    def _bodies(self) -> list[RigidBody]:
+        return [*([] if self.body is None else [self.body]), *self._others]
 
     def _programs(self, layers: dict[int, np.ndarray]) -> tuple[Program, Program]:
         """A remap, and the steps from there to the next one."""
@@ -341,9 +357,14 @@ class Solver:
             *threads.share(nodes, (node_kernels.begin, [grid, *moved]), owned="nodes"),
             *ghost_nodes.unfold(before),
         ]
+        presses = [
+            (transfer(real, self.effects, one.law, device.is_cuda).press, [*given, one.of_threads, impulse])
+            for one in self._others
+        ]
+        moving = [launch for one in self._bodies for launch in one.launches]
         step = [
-            *threads.share(soil, (kernels.scatter, [*given, bodies, impulse]), owned="soil"),
-            *threads.share(nodes, *adding_up(impulse), owned="nodes", alone=body.launches if body else ()),
+            *threads.share(soil, (kernels.scatter, [*given, bodies, impulse]), *presses, owned="soil"),
+            *threads.share(nodes, *adding_up(impulse), owned="nodes", alone=moving),
             *ghost_nodes.fold(impulse[0]),
             *threads.share(nodes, (node_kernels.step, [grid, *stepped]), owned="nodes"),
             *(self._nonlocal_launches(layers) if self.effects.nonlocality else ()),
@@ -384,8 +405,8 @@ class Solver:
 
     def _stepped_to(self, index: int) -> Iterator[Job]:
         self.grid.substep.zero_()
-        if self.body is not None:
-            self.body.start_frame(index - 1)
+        for body in self._bodies:
+            body.start_frame(index - 1)
         body_speed = (
             self._top_body_speed if self.body is None else max(self._top_body_speed, self.body.given_speed)
         )
@@ -416,8 +437,8 @@ class Solver:
         found = found or limits.lost_fluidity(particles.excess.numpy())
         if found is not None:
             raise self._stopped(index, self.substeps_per_frame, *found)
-        if self.body is not None:
-            self.body.check(index / self.scene.frame_rate, limits.top_speed)
+        for body in self._bodies:
+            body.check(index / self.scene.frame_rate, limits.top_speed)
 
     def _stopped(self, index: int, substep: int, particle: int, cause: str) -> SolverStopped:
         time = (index - 1) / self.scene.frame_rate + substep * self.time_step
@@ -432,11 +453,10 @@ class Solver:
     def _frame(self, index: int) -> Frame:
         scene = self.scene
         time = index / scene.frame_rate
-        impulse = np.zeros((2, 3))
-        if self.body is None:
-            pose = scene.poses_at(np.array([time]))[0]
-        else:
-            pose, impulse = self.body.pose(time), self.body.impulse() * (scene.frame_rate if index else 0.0)
+        pose = scene.poses_at(np.array([time]))[0] if self.body is None else self.body.pose(time)
+        bodies = [self.body, *self._others]
+        impulses = np.array([np.zeros((2, 3)) if one is None else one.impulse() for one in bodies])
+        impulses *= scene.frame_rate if index else 0.0
         position, velocity = self.particles.position.numpy(), self.particles.felt_velocity.numpy()[:, :3]
         for axis, turns in self._turns.items():
             position = position.copy()  # on the CPU it is the solver's own memory
@@ -444,7 +464,7 @@ class Solver:
         if self._half is not None:
             position, velocity = self._half.whole(position, velocity)
             # The other half doubles force along and moment within the plane of symmetry, and cancels the rest.
-            impulse *= [[2.0, 0.0, 2.0], [0.0, 2.0, 0.0]]
+            impulses *= [[2.0, 0.0, 2.0], [0.0, 2.0, 0.0]]
         return Frame(
             index=index,
             time=time,
@@ -452,8 +472,11 @@ class Solver:
             velocity=velocity.astype(np.float32),
             body_pose=pose,
             body_points=rotate(pose[3:], scene.body_points()) + pose[:3],
-            force=impulse[0],
-            torque=impulse[1],
+            force=impulses[0, 0],
+            torque=impulses[0, 1],
+            other_poses=np.array([one.pose(time) for one in self._others]).reshape(-1, 7),
+            other_forces=impulses[1:, 0],
+            other_torques=impulses[1:, 1],
         )
 
 

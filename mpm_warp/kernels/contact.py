@@ -1,4 +1,4 @@
-"""Contact between soil and a rigid body, and the motion of a body whose height is free.
+"""Contact between soil and a rigid body, and the motion of a body whose height, or all of it, is free.
 
 A particle within the body is pushed out by a stiff damped spring along the body's normal. A second spring holds it back
 along the surface; it is stretched by the sliding since contact began, no further than Coulomb friction allows (Cundall
@@ -32,13 +32,15 @@ class ContactLaw:
     """What the contact kernel is compiled for."""
 
     shape: str = "box"
-    """Of the body: box | cylinder | mesh."""
+    """Of the body, see `Tool.surface`."""
     bilateral: bool = False
     """Soil in contact may not leave along the normal."""
     free: bool = False
     """The body's height is not prescribed but computed (see `axle_step`)."""
     torque: bool = True
     """The moment of the soil's push is added up."""
+    loose: bool = False
+    """All of the body's motion is computed (see `free_step`)."""
 
 
 @cache
@@ -78,7 +80,7 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
     vec3 = wp.types.vector(3, real)
     Body = body_struct(real)
     outward = signed_distance(real, law.shape)
-    bilateral, free, torque = law.bilateral, law.free, law.torque
+    bilateral, free, torque, loose = law.bilateral, law.free, law.torque, law.loose
 
     # Warp's own sum would be rounded otherwise on a CPU, too: its product and sum are fused differently.
     @wp.func
@@ -89,7 +91,10 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
             total[i] = total[i] - amount
 
     @wp.func
-    def push(p: int, x: vec3, v: vec3, mass: real, part: real, dt: real, s: int, body: Body):
+    def push(p: int, x: vec3, v: vec3, mass: real, part: real, dt: real, substep: int, body: Body):
+        s = substep
+        if wp.static(loose):
+            s = 0
         centre = body.position[s]
         if wp.static(free):
             centre = vec3(centre[0], centre[1], real(body.axle[0]))
@@ -156,5 +161,72 @@ def axle_step(real: type) -> SceneKernel:
         axle[2] = total
         axle[1] = (axle[1] + gained / mass - dt * fall[0]) / (wp.float64(1.0) + dt * damping)
         axle[0] = axle[0] + dt * axle[1]
+
+    return step
+
+
+# Of `free_step`'s array, where each begins.
+TURNED, SPEED, SPIN, GAINED, COUNT = 3, 7, 10, 13, 19
+
+
+@cache
+def free_step(real: type) -> SceneKernel:
+    """Kernel of one thread, which moves a free body of six degrees of freedom (rigid_body.py): symplectic Euler; the
+    rotation by that of half a step on, so that what turns without torque keeps its energy to second order, and its
+    angular momentum to rounding."""
+    vec3, quat = wp.types.vector(3, real), wp.types.quaternion(real)
+    Body = body_struct(real)
+
+    @wp.func
+    def spin(q: wp.quatd, momentum: wp.vec3d, inverse_inertia: wp.vec3d):
+        return wp.quat_rotate(q, wp.cw_mul(inverse_inertia, wp.quat_rotate_inv(q, momentum)))
+
+    @wp.func
+    def turned(q: wp.quatd, w: wp.vec3d, dt: wp.float64):
+        rate = wp.length(w)
+        if rate == wp.float64(0.0):
+            return q
+        return wp.normalize(wp.quat_from_axis_angle(w / rate, rate * dt) * q)
+
+    @wp.func
+    def at(motion: wp.array(dtype=wp.float64), i: int):
+        return wp.vec3d(motion[i], motion[i + 1], motion[i + 2])
+
+    @wp.func
+    def put(motion: wp.array(dtype=wp.float64), i: int, v: wp.vec3d):
+        for axis in range(3):
+            motion[i + axis] = v[axis]
+
+    @SceneKernel
+    def step(
+        _: int,
+        body: Body,
+        # Place [m], quaternion, velocity [m/s], angular momentum [kg m^2/s]; of this frame the soil's impulse [N s] and
+        # its moment [N m s].
+        motion: wp.array(dtype=wp.float64),
+        dt: wp.float64,
+        mass: wp.float64,
+        inverse_inertia: wp.vec3d,  # about the body's axes [1 / (kg m^2)]
+        gravity: wp.vec3d,
+    ):
+        push = wp.vec3d(body.impulse[0])
+        moment = wp.vec3d(body.impulse[1])
+        v = at(motion, SPEED) + (push - at(motion, GAINED)) / mass + dt * gravity
+        momentum = at(motion, SPIN) + moment - at(motion, GAINED + 3)
+        x = at(motion, 0) + dt * v
+        q = wp.quatd(motion[TURNED], motion[TURNED + 1], motion[TURNED + 2], motion[TURNED + 3])
+        half = turned(q, spin(q, momentum, inverse_inertia), wp.float64(0.5) * dt)
+        q = turned(q, spin(half, momentum, inverse_inertia), dt)
+        put(motion, 0, x)
+        for i in range(4):
+            motion[TURNED + i] = q[i]
+        put(motion, SPEED, v)
+        put(motion, SPIN, momentum)
+        put(motion, GAINED, push)
+        put(motion, GAINED + 3, moment)
+        body.position[0] = vec3(x)
+        body.rotation[0] = quat(q)
+        body.velocity[0] = vec3(v)
+        body.spin[0] = vec3(spin(q, momentum, inverse_inertia))
 
     return step

@@ -22,7 +22,7 @@ def shape_struct(real: type) -> type:
         half: vec3  # of a box; of the box that holds a mesh and everything in contact with it
         sides: wp.types.matrix((4, 4), real)  # of a plate's section: x, z and direction
         lengths: wp.types.vector(4, real)  # of these sides
-        radius: real  # of a cylinder, like what follows
+        radius: real  # of a sphere or a cylinder; what follows, of a cylinder
         half_width: real
         grousers: int
         tip_radius: real
@@ -52,6 +52,8 @@ def shape_data(
         data.grouser_half = 0.5 * body.grouser_thickness
         # A bar can be thinner than twice the depth at which contact begins; it then begins half-way to its middle.
         data.grouser_offset = min(0.0, margin + 0.25 * body.grouser_thickness)
+    elif body.surface == "sphere":
+        data.radius = body.reach
     elif body.surface == "plate":
         along = np.roll(body.section, -1, axis=0) - body.section
         lengths = np.linalg.norm(along, axis=1)
@@ -77,7 +79,9 @@ def signed_distance(real: type, shape: str) -> wp.Function:
     """Warp function (point in the body frame, struct of the shape) -> outward normal and, as the fourth number,
     signed distance [m], negative inside. Inside a corner the nearest face counts; inside a grouser's root the
     distance is a lower bound."""
-    return {"box": _box, "plate": _plate, "cylinder": _cylinder, "mesh": _mesh}[shape](real)
+    return {"box": _box, "plate": _plate, "cylinder": _cylinder, "sphere": _sphere, "mesh": _mesh}[shape](
+        real
+    )
 
 
 @cache
@@ -222,6 +226,21 @@ def _cylinder(real: type) -> wp.Function:
         return vec4(normal[0], normal[1], normal[2], distance)
 
     return cylinder_distance
+
+
+def _sphere(real: type) -> wp.Function:
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    Size = shape_struct(real)
+
+    @wp.func
+    def sphere_distance(q: vec3, size: Size):
+        away = wp.length(q)
+        n = vec3(real(0.0), real(0.0), real(1.0))  # in the middle any direction will do
+        if away > real(0.0):
+            n = q / away
+        return vec4(n[0], n[1], n[2], away - size.radius)
+
+    return sphere_distance
 
 
 def _mesh(real: type) -> wp.Function:

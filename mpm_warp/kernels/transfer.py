@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 @cache
 def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, atomic: bool) -> SimpleNamespace:
     """Kernels in precision `real` with only the physics in `effects`: `to_grid` and `from_grid` at a remap;
-    `scatter`, `gather` and `material` in every step.
+    `scatter`, `gather` and `material` in every step, and `press` for the push of a further body.
 
     `contact_law` is that with a body, None without one; `atomic` is needed where many threads write to the grid at once
     (a GPU).
@@ -133,6 +133,16 @@ def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, ato
             start += push(p, particles.position[p], u, mass, part(p, grid), grid.dt, grid.substep[0], body)
         swelling = mass * particles.swelling[p]
         deposit(base, f, vec4(start[0], start[1], start[2], swelling), q, grid, impulse)
+
+    @fused_kernel
+    def press(p: int, particles: Particles, grid: Grid, body: Body, impulse: vec4s):
+        felt = particles.felt_velocity[p]
+        u = vec3(felt[0], felt[1], felt[2])
+        mass = part(p, grid) * grid.particle_mass
+        given = push(p, particles.position[p], u, mass, part(p, grid), grid.dt, grid.substep[0], body)
+        if wp.length_sq(given) > real(0.0):
+            base, f = base_and_offset(particles.home[p], grid)
+            deposit(base, f, vec4(given[0], given[1], given[2], real(0.0)), mat33(), grid, impulse)
 
     @fused_kernel
     def gather(p: int, particles: Particles, grid: Grid, velocity: vec4s, cooperation: vec4s, fault: ints):
@@ -271,5 +281,5 @@ def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, ato
         particles.velocity[p] = u + keep[0] * (v - vec3(smooth[0], smooth[1], smooth[2]))
 
     return SimpleNamespace(
-        to_grid=to_grid, scatter=scatter, gather=gather, material=material, from_grid=from_grid
+        to_grid=to_grid, scatter=scatter, press=press, gather=gather, material=material, from_grid=from_grid
     )

@@ -164,7 +164,11 @@ def require_known_bed(simulator: Simulator, scene: Scene, checkpoint: str | Path
 
 
 def require_same_freedom(simulator: Simulator, scene: Scene, checkpoint: str | Path) -> None:
-    """Refuses a wheel for a network that knows of prescribed bodies only, and the other way round."""
+    """Refuses a wheel for a network of prescribed bodies, the other way round, and further bodies."""
+    if scene.others:
+        raise UserError(
+            f"scene.others has {len(scene.others)} further bodies, and {checkpoint} knows one body: leave them out"
+        )
     if (scene.axle is not None) == simulator.predicts_body:
         return
     learned, asked = (

@@ -181,6 +181,8 @@ SOIL = [
     "Plate",
     "Box",
     "Cylinder",
+    "Other",
+    "Sphere",
 ]
 CLASSES = [
     *(getattr(mpm_warp, name) for name in (*SOIL, "MeshBody", "Material", "Effects", "Tolerances")),

@@ -22,12 +22,13 @@ from sgns.data.files import one_line
 from sgns.data.hdf5 import BROKEN, own_dataset, own_object, own_view
 from sgns.data.run import Run
 from sgns.data.run_file import (
+    OTHERS,
     PRODUCERS,
-    SERIES,
     STOPPED,
     open_run,
     read_attributes,
     read_mesh,
+    recorded_in,
     require_mesh_was_read,
     series,
     structure_problems,
@@ -73,7 +74,15 @@ def check_run(path: str | os.PathLike[str]) -> list[str]:
             return [f"the file is damaged ({one_line(error)})"]
         checks = [_check_h5md, _check_attributes]
         if not problems:  # the rest relies on complete datasets of the right shapes
-            checks += [_check_stopped, _check_times, _check_body, _check_mesh, _check_view, _check_frames]
+            checks += [
+                _check_stopped,
+                _check_times,
+                _check_body,
+                _check_others,
+                _check_mesh,
+                _check_view,
+                _check_frames,
+            ]
         for check in checks:
             try:
                 problems += check(file)
@@ -183,7 +192,7 @@ def _verdict(path: Path) -> str:
 
 def _check_times(file: h5py.File) -> Iterator[str]:
     time, step = (series(file, "position", part)[...] for part in ("time", "step"))
-    for name, recorded in SERIES.items():
+    for name, recorded in recorded_in(file).items():
         for part, expected in (("time", time), ("step", step)):
             if not np.array_equal(series(file, name, part)[...], expected, equal_nan=part == "time"):
                 yield f"dataset /{recorded.path}/{part} differs from that of the soil positions"
@@ -226,6 +235,17 @@ def _check_body(file: h5py.File) -> Iterator[str]:
             f"body point {point} of frame {frame} is {error[frame, point]:.3g} m from where the pose puts it "
             f"(allowed {RIGID_TOLERANCE:g} m)"
         )
+
+
+def _check_others(file: h5py.File) -> Iterator[str]:
+    for name in set(recorded_in(file)) & set(OTHERS):
+        values = series(file, name)[...].astype(float)
+        if (frame := _first(~np.isfinite(values).all(axis=(1, 2)))) is not None:
+            yield f"{name} is not finite at frame {frame}"
+        elif name == "other_pose":
+            off = np.abs(np.linalg.norm(values[:, :, 3:], axis=2) - 1.0).max(axis=1, initial=0.0)
+            if (frame := _first(off > QUATERNION_TOLERANCE)) is not None:
+                yield f"a quaternion of the further bodies at frame {frame} is not of length 1"
 
 
 def _check_mesh(file: h5py.File) -> Iterator[str]:
@@ -280,7 +300,7 @@ def _check_view(file: h5py.File) -> Iterator[str]:
 
 def _check_frames(file: h5py.File) -> Iterator[str]:
     """Finite soil, the same numbers through /VTKHDF, and the content hash; memory for a frame only."""
-    small = {name: series(file, name)[...] for name in SERIES if name not in VIEWS}
+    small = {name: series(file, name)[...] for name in recorded_in(file) if name not in VIEWS}
     small["time"] = series(file, "position", "time")[...]
     views = {name: _view(file, f"VTKHDF/{path}") for name, path in VIEWS.items()}
     frames, particles, _ = series(file, "position").shape

@@ -29,6 +29,7 @@ from sgns.data.run_file import (
     open_run,
     read_attributes,
     read_mesh,
+    recorded_in,
     require_mesh_was_read,
     series,
     structure_problems,
@@ -152,6 +153,21 @@ class Run:
     def torque(self) -> np.ndarray:
         """By the soil on the body about its centre of mass [N m], world frame, shape (T, 3), float64."""
         return self._whole("torque")
+
+    @property
+    def other_pose(self) -> np.ndarray:
+        """Of the k further bodies (scene.others), as `pose`, shape (T, k, 7), float64."""
+        return self._of_others("other_pose", 7)
+
+    @property
+    def other_force(self) -> np.ndarray:
+        """By the soil on them, as `force` [N], shape (T, k, 3), float64."""
+        return self._of_others("other_force", 3)
+
+    @property
+    def other_torque(self) -> np.ndarray:
+        """Likewise, each about its centre of mass, as `torque` [N m], shape (T, k, 3), float64."""
+        return self._of_others("other_torque", 3)
 
     @property
     def body_points(self) -> np.ndarray:
@@ -314,6 +330,10 @@ class Run:
             with self._reading(name):
                 self._cache[key] = self._dataset(name, part)[...].astype(np.float64)
         return self._cache[key].copy()
+
+    def _of_others(self, name: str, size: int) -> np.ndarray:
+        there = self._file and name in recorded_in(self._file)
+        return self._whole(name) if there or not self._file else np.zeros((self.frame_count, 0, size))
 
     def _index(self, frames: slice | int | list[int] | np.ndarray) -> np.ndarray:
         """Numbers of the chosen frames, shape (t,)."""

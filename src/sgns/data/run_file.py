@@ -1,6 +1,6 @@
 """What is in a run file, whether the solver or a network made it, and where; opening one that may be anything.
 
-Letters: T frames, n soil particles, M body points; V vertices and F triangles of a tool that is a mesh.
+Letters: T frames, n soil particles, M body points, k further bodies; V vertices and F triangles of a mesh.
 """
 
 from __future__ import annotations
@@ -96,6 +96,12 @@ SERIES = {
     ),
 }
 """What is recorded in every frame."""
+OTHERS = {
+    "other_pose": Recorded("observables/others/pose", ("k", 7), "<f8", "m, 1", "as of the body"),
+    "other_force": Recorded("observables/others/force", ("k", 3), "<f8", "N", "as of the body"),
+    "other_torque": Recorded("observables/others/torque", ("k", 3), "<f8", "N m", "as of the body"),
+}
+"""What a run has besides whose scene has further bodies."""
 MESH = {
     "vertices": Recorded(
         "parameters/tool/vertices", ("V", 3), "<f8", "m", "of the tool, about its centre of mass, body frame"
@@ -108,8 +114,13 @@ MESH = {
 
 
 def series(file: h5py.File, name: str, part: str = "value") -> h5py.Dataset:
-    """A dataset of one of `SERIES`: its `value`, `step` or `time`."""
-    return file[f"{SERIES[name].path}/{part}"]
+    """A dataset of one of `SERIES` or `OTHERS`: its `value`, `step` or `time`."""
+    return file[f"{(SERIES | OTHERS)[name].path}/{part}"]
+
+
+def recorded_in(file: h5py.File) -> dict[str, Recorded]:
+    """`SERIES`, and `OTHERS` where there are further bodies."""
+    return SERIES | (OTHERS if own_object(file, "observables/others") is not None else {})
 
 
 # --- Opening a file that may be anything ----------------------------------------------------------------
@@ -215,7 +226,7 @@ def structure_problems(file: h5py.File) -> list[str]:
     """
     counts: dict[str, int] = {}  # T, n and M, from the first that shows them
     problems = list(_attribute_problems(file))
-    for recorded in SERIES.values():
+    for recorded in recorded_in(file).values():
         problems += _series_problems(file, recorded, counts)
     return problems + _mesh_problems(file)
 

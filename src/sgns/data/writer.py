@@ -26,6 +26,7 @@ from sgns.data.run_file import (
     FORMAT,
     FORMAT_VERSION,
     MESH,
+    OTHERS,
     SERIES,
     STATE,
     STOPPED,
@@ -145,8 +146,8 @@ class ContentHash:
         self._hash = hashlib.blake2b(digest_size=16)
 
     def update(self, frame: Mapping[str, np.ndarray]) -> None:
-        """Add one frame: an array for every name in `ORDER`, in the file's types."""
-        for name in self.ORDER:
+        """Add one frame: an array for every name in `ORDER`, in the file's types, and those of further bodies."""
+        for name in (*self.ORDER, *(name for name in OTHERS if name in frame)):
             self._hash.update(np.ascontiguousarray(frame[name]).data)
 
     def hexdigest(self) -> str:
@@ -172,6 +173,7 @@ class RunWriter:
         producer: "mpm" or "rollout".
         extra: more provenance as plain nested data; "author" also becomes H5MD's author name.
         mesh: of a tool that is one: vertices (V, 3) about its centre of mass [m] and triangles (F, 3).
+        others: k, the number of further bodies.
 
     Raises:
         UserError: the folder cannot be written, the disk is full, something else than a run of before would be
@@ -193,15 +195,17 @@ class RunWriter:
         producer: str,
         extra: Mapping[str, Any] | None = None,
         mesh: tuple[np.ndarray, np.ndarray] | None = None,
+        others: int = 0,
     ) -> None:
         self.path = Path(path)
-        counts = {"n": int(particle_count), "M": int(body_points)}
+        counts = {"n": int(particle_count), "M": int(body_points), "k": others}
+        self._recorded = SERIES | (OTHERS if others else {})
         self._shapes = {  # of one frame
             name: tuple(counts[size] if isinstance(size, str) else size for size in recorded.tail)
-            for name, recorded in SERIES.items()
+            for name, recorded in self._recorded.items()
         }
         self._small: dict[str, list[np.ndarray]] = {
-            name: [] for name in ContentHash.ORDER if name not in VIEWS
+            name: [] for name in (*ContentHash.ORDER, *(OTHERS if others else ())) if name not in VIEWS
         }
         self._hash = ContentHash()
         extra = extra or {}
@@ -251,6 +255,7 @@ class RunWriter:
         body_pose: np.ndarray,
         force: np.ndarray,
         torque: np.ndarray,
+        others: tuple[np.ndarray, ...] = (),
     ) -> None:
         """Write one frame.
 
@@ -262,14 +267,23 @@ class RunWriter:
             body_pose: centre of mass [m] and quaternion x y z w, shape (7,).
             force: by the soil on the body [N], world frame, mean since the frame before, shape (3,).
             torque: likewise about the centre of mass [N m], shape (3,).
+            others: pose (k, 7), force and torque (k, 3) of the further bodies, if there are any.
         """
         file = self._open_file()
         index = self.frame_count
         frame = {"time": np.asarray(time, dtype="<f8")}
         if frame["time"].shape != ():
             raise ValueError(f"time has shape {frame['time'].shape}; it must be one number [s]")
-        given = (position, velocity, body_points, force, torque, body_pose)  # as in SERIES
-        for (name, recorded), values in zip(SERIES.items(), given, strict=True):
+        given = (
+            position,
+            velocity,
+            body_points,
+            force,
+            torque,
+            body_pose,
+            *others,
+        )  # as in SERIES and OTHERS
+        for (name, recorded), values in zip(self._recorded.items(), given, strict=True):
             # A float64 beyond float32's range becomes inf here and is reported below, so numpy need not warn.
             with np.errstate(over="ignore"):
                 convert = np.asarray if name in VIEWS else np.array  # the small ones are kept: copy them
@@ -359,7 +373,7 @@ class RunWriter:
             first["step"] = np.arange(self.frame_count, dtype="<i8")
             first["time"] = np.array(self._small["time"], dtype="<f8")
             _set(first["time"], "si_unit", "s")
-            for name, recorded in SERIES.items():
+            for name, recorded in self._recorded.items():
                 if name in self._small:
                     file[f"{recorded.path}/value"] = np.array(self._small[name], dtype=recorded.dtype)
                     _describe(series(file, name), recorded)

@@ -222,6 +222,10 @@ def check_one_bed(paths: Sequence[Path]) -> tuple[dict[Path, str], float]:
     beds: dict[tuple[str, int, float], Path] = {}
     for path in paths:
         with Run(path) as run:
+            if run.scene.get("others"):
+                raise UserError(
+                    f"{path} has further bodies (scene.others), and a network knows one body: train on runs without"
+                )
             content[path] = run.content_hash
             beds.setdefault((run.arrangement_hash, run.particle_count, run.frame_rate), path)
     if len(beds) > 1:

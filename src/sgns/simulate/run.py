@@ -102,9 +102,11 @@ class Restart:
         """The frames that are there, as `RunWriter.append` takes them."""
         with Run(self.path) as run:
             small = (run.body_points, run.pose, run.force, run.torque)
+            others = (run.other_pose, run.other_force, run.other_torque) if self.scene.others else ()
             for index, time in enumerate(run.time):
                 soil = run.positions(index)[0], run.velocities(index)[0]
-                yield time, *soil, *(series[index] for series in small)
+                further = tuple(series[index] for series in others)
+                yield time, *soil, *(series[index] for series in small), further
 
 
 def restart_from(cfg: DictConfig, overrides: Sequence[str]) -> Restart:
@@ -330,6 +332,7 @@ def scene_stages(
             | ({"continued": restart.record} if restart is not None else {})
             | ({"start_from": _origin(scene)} if scene.soil is not None else {}),
             mesh=scene.mesh,
+            others=len(scene.others),
         ) as writer,
         ExitStack() as to_the_end,
     ):
@@ -354,9 +357,9 @@ def scene_stages(
                     continue
                 clock.start()
                 soil = stage.position[stored], stage.velocity[stored]
-                writer.append(
-                    stage.time, *soil, stage.body_points, stage.body_pose, stage.force, stage.torque
-                )
+                body = stage.body_points, stage.body_pose, stage.force, stage.torque
+                others = stage.other_poses, stage.other_forces, stage.other_torques
+                writer.append(stage.time, *soil, *body, others if scene.others else ())
                 progress()
         except (Interrupted, GeneratorExit) as ending:  # both where a frame is whole
             if writer.frame_count <= max(there, 1):

@@ -132,6 +132,13 @@ def test_a_mixture_of_beds_is_refused(tmp_path) -> None:
         reduce_dataset(dataset, REDUCTION)
 
 
+def test_runs_with_further_bodies_are_refused(tmp_path) -> None:
+    dataset = make_dataset(tmp_path)
+    make_run(dataset.runs("train")[0], frames=14, scene={"others": [{"motion": "free"}]})
+    with pytest.raises(UserError, match=r"has further bodies .* a network knows one body"):
+        reduce_dataset(dataset, REDUCTION)
+
+
 def test_a_device_that_is_not_here_is_one_line_also_with_a_cache(tmp_path) -> None:
     dataset = make_dataset(tmp_path)
     reduce_dataset(dataset, REDUCTION)

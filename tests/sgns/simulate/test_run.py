@@ -16,13 +16,16 @@ from omegaconf import OmegaConf
 from mpm_warp import (
     Bed,
     Body,
+    Cylinder,
     Effects,
     Excavation,
     MeshBody,
+    Other,
     Plate,
     Scene,
     Solver,
     SolverStopped,
+    Sphere,
     Wheel,
     effects_for,
     mesh_files,
@@ -216,6 +219,12 @@ def interrupted(monkeypatch):
 
 
 FAST = small(start=0.3, depth=0.06, speed=1.0)
+SEVERAL = small(
+    others=(
+        Other(tool=Sphere(diameter=0.1), position=(0.3, 0.1, 0.03), spin=(0.0, 5.0, 0.0)),
+        Other(tool=Cylinder(diameter=0.1), motion="follow", position=(0.15, 0.0, 0.0), load=20.0),
+    )
+)
 WHEEL = {"friction_angle": None, "damping": 0.0, "load": 20.0, "settle": 0.02}
 
 
@@ -229,8 +238,9 @@ WHEEL = {"friction_angle": None, "damping": 0.0, "load": 20.0, "settle": 0.02}
         ),
         (small(), Effects(fluidity=True, nonlocality=True)),
         (FAST, Effects()),
+        (SEVERAL, Effects()),
     ],
-    ids=["cut", "wheel", "nonlocal fluidity", "loose soil"],
+    ids=["cut", "wheel", "nonlocal fluidity", "loose soil", "further bodies"],
 )
 def test_an_interrupted_run_goes_on_to_the_same_bits(scene, effects, interrupted, tmp_path):
     output, same = tmp_path / "run.h5", {"effects": effects, "seed": 3, "precision": "float32"}
@@ -248,8 +258,31 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(scene, effects, interrupted
     with Run(output) as one, Run(tmp_path / "whole.h5") as two:
         assert one.content_hash == two.content_hash
         assert two.frame_count == scene.frame_count
+        assert two.other_pose.shape == (scene.frame_count, len(scene.others), 7)
+        if scene.others:
+            assert (two.other_force[:, :, 2].max(axis=0) > 0.0).all()
+            assert two.other_torque[:, 0].any()
+    assert check_run(output) == []
     assert not kept.exists()
     assert unfinished(output, scene, **same) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "value", "words"),
+    [
+        ("force", (1, 0, 2), np.nan, "other_force is not finite at frame 1"),
+        ("pose", (2, 1, 3), 0.5, "a quaternion of the further bodies at frame 2 is not of length 1"),
+    ],
+)
+def test_damaged_further_bodies_are_named(name, at, value, words, tmp_path):
+    simulate_scene(SEVERAL, tmp_path / "run.h5", effects=Effects())
+    with h5py.File(tmp_path / "run.h5", "a") as file:
+        file[f"observables/others/{name}/value"][at] = value
+    assert words in check_run(tmp_path / "run.h5")
+    with h5py.File(tmp_path / "run.h5", "a") as file:
+        del file["observables/others/pose"]
+    with pytest.raises(UserError, match="dataset /observables/others/pose/value is missing"):
+        Run(tmp_path / "run.h5")
 
 
 def test_the_same_command_goes_on_and_another_is_refused_by_key(interrupted, tmp_path):

@@ -166,6 +166,9 @@ def test_a_network_of_prescribed_bodies_cannot_roll_a_wheel_out():
         with pytest.raises(UserError, match=words):
             require_same_freedom(network, scene, "a.ckpt")
     require_same_freedom(blades, blade, "a.ckpt")
+    stone = scene_from_config(composed("scene=stone"))
+    with pytest.raises(UserError, match=r"scene.others has 1 further bodies, and a.ckpt knows one body"):
+        require_same_freedom(blades, stone, "a.ckpt")
     require_same_freedom(wheels, wheel, "a.ckpt")
 
 
