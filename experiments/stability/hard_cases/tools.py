@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from leakage import leakage
 
-from mpm_warp import Body, Effects, Excavation, MeshBody, Plate, Solver
+from mpm_warp import Body, Box, Effects, Excavation, MeshBody, Other, Plate, Solver
 from mpm_warp.motions import Passes
 from sgns_testing.meshes import box_corners, box_triangles, write_obj
 from sgns_testing.scenes import cut
@@ -131,6 +131,20 @@ def another_tool() -> tuple[float, str]:
     return share, f"{words}; {len(scene.displaced)} particles left out"
 
 
+def stone_and_blade() -> tuple[float, str]:
+    """The plate pushes soil against a stone that lies in its way; both touch soil only."""
+    stone = Other(tool=Box(size=(0.06, 0.06, 0.05)), position=(0.25, 0.2, 0.0))
+    scene = cut(duration=1.0, others=(stone,))
+    frames = frames_of(scene)
+    stones = np.array([frame.other_poses[0, :3] for frame in frames])
+    speed = np.linalg.norm(np.diff(stones, axis=0), axis=1).max() * scene.frame_rate
+    share, words = blade_shares(scene, frames)
+    most = 5.0 * scene.speed
+    moved = 1e3 * np.linalg.norm(stones[-1] - stones[0])
+    words += f"; the stone at {speed:.3g} m/s (limit {most:g}), by {moved:.3g} mm in all"
+    return max(share, speed / most), words
+
+
 def spins() -> tuple[float, str]:
     times = np.arange(0.0, 0.8, 0.01)
     angle = np.maximum(times - 0.25, 0.0) * 6.0 * np.pi
@@ -211,6 +225,7 @@ MEASURES = {
     "tool at rest for 60 s": creep,
     "tool shakes at 50 Hz": shakes,
     "tool leaves and comes back": leaves_and_comes_back,
+    "two bodies: a stone in the way of a blade": stone_and_blade,
     "tool spins at 3 turns per second": spins,
     "second pass in the same place": partial(second_pass, 0.0),
     "second pass 2 cm deeper": partial(second_pass, 0.02),
