@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Generator, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice, repeat
 from typing import Any
 
@@ -52,11 +52,11 @@ class Frame:
     """By the soil on the body, world frame, mean since the previous frame [N], shape (3,); frame 0: zeros."""
     torque: np.ndarray
     """About the body's centre of mass, likewise [N m], shape (3,); zeros without the effect `torque`."""
-    other_poses: np.ndarray
+    other_poses: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
     """Of the k further bodies, as `body_pose`, shape (k, 7)."""
-    other_forces: np.ndarray
+    other_forces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     """On them, as `force`, shape (k, 3)."""
-    other_torques: np.ndarray
+    other_torques: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     """Likewise as `torque`, shape (k, 3)."""
 
     @property
