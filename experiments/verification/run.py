@@ -1,6 +1,6 @@
 """The solver against cases with known answers, resolved well enough to see how it converges.
 
-    python experiments/verification/run.py [bagnold cohesion mckyes passive runout silo slope stopping waves]
+    python experiments/verification/run.py [bagnold cohesion crater mckyes passive runout silo slope stopping waves]
 
 Writes NAME.csv beside this script; all of them take about 25 minutes on one core. A case is a module here with a
 function `measure`, which returns the rows of the table; Bagnold's flow is drawn, too.
@@ -21,7 +21,7 @@ import matplotlib.pyplot as plt
 from common import write_rows
 
 HERE = Path(__file__).parent
-CASES = ("bagnold", "cohesion", "mckyes", "passive", "runout", "silo", "slope", "stopping", "waves")
+CASES = ("bagnold", "cohesion", "crater", "mckyes", "passive", "runout", "silo", "slope", "stopping", "waves")
 
 
 def draw(rows: list[dict]) -> None:

@@ -67,6 +67,6 @@ def test_the_help_of_a_scene_lists_settings_with_units_defaults_and_ranges() -> 
     for line in (
         "depth = 0.05 m: the motion reaches this far below the tip's starting height (0 to 1000)",
         "rake = 10.0 degrees: angle of the plate from vertical, tip leading (-60 to 60)",
-        "motion = 'curved': of the tip (curved, ramp, rest, path)",
+        "motion = 'curved': of the tip (curved, ramp, rest, path, passes)",
     ):
         assert line in text
