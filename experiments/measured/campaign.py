@@ -47,7 +47,7 @@ class Setting:
     grid: float = 0.012
     """Of the small wheel; in proportion for the large one [m]."""
     per_cell: float = 4.0
-    speed: float = 0.1
+    speed: float = 0.2
     """Of travel, where the rim is not too fast for it; the trials had 0.01 [m/s]."""
     travel: float = 0.4
     """Of the small wheel where it pushes soil, 0.6 of it where it only rolls; the last quarter is averaged [m]."""
@@ -56,7 +56,7 @@ class Setting:
 STUDIES: dict[str, list[Setting]] = {
     "fix": [Setting()],
     "judged": [Setting()],
-    "speed": [Setting(speed=speed) for speed in (0.05, 0.2)],
+    "speed": [Setting(speed=speed) for speed in (0.1, 0.05)],
     "grid": [Setting(grid=grid) for grid in (0.016, 0.008)],
     "particles": [Setting(per_cell=n) for n in (1.0, 8.0)],
 }
