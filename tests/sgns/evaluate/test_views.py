@@ -415,6 +415,17 @@ def test_soil_at_rest_looks_at_rest(pair):
     assert 2e3 * particle_spacing(start) <= colours.norm.vmax < 5e3 * particle_spacing(start)
 
 
+def test_a_particle_in_the_air_leaves_the_map_its_colours(pair):
+    run, start = pair[0], pair[0].positions(0)[0].astype(float)
+    flying = run.positions(1).copy()
+    flying[0, 0, 2] += 5.0
+    tops = [
+        plot.surface_figure(one, 1, start).axes[0].images[0].norm.vmax
+        for one in (run, changed(run, positions=lambda _: flying))
+    ]
+    assert tops[1] < 1.5 * tops[0]
+
+
 def changed(run, **parts):
     names = "positions velocities force pose scene body_points mesh time producer".split()
     return SimpleNamespace(**{name: getattr(run, name) for name in names} | parts)
