@@ -174,7 +174,7 @@ def test_every_option_of_every_group_composes(command: str) -> None:
         (["evaluate", "checkpoint=a.ckpt", "dataset=null"], ["dataset is null; allowed: ", "quick"]),
         (["simulate", "experiment=x"], ["experiment=x: --config-dir is missing"]),
         (["evaluate", "checkpoint=a.ckpt", "~dataset"], ["dataset is missing", "allowed:", "quick"]),
-        (["evaluate", "checkpoint=a.ckpt", "dataset.path=nope"], ["no dataset in nope"]),
+        (["evaluate", "checkpoint=a.ckpt", "dataset.path=nope"], ["no checkpoint at a.ckpt"]),
         (["simulate", "dataset=published"], ["dataset=published has no scene: its runs come from elsewhere"]),
         (["simulate", "shards=4"], ["give dataset=..."]),
         (["simulate", "effects.gravity=true"], ["effects.gravity: no such key"]),
