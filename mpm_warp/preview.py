@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .bed import PADDING
-from .poses import rotation_matrices
+from .poses import rotation_matrices, rotation_vectors
 from .scene import Scene
 from .settings import likely_radians
 from .tool_geometry import Odd, odd_size, odd_times, place_unit
 
+_NOTICED = 0.25
+"""Depth of a tool's lowest point at the start that is told of [grid spacings]."""
 _MOST_LOOKED_AT = 500
 """Poses near a wall."""
 
@@ -63,26 +65,31 @@ class Preview:
         found = [odd_size(body, scene.bed.size, scene.open_sides), *_of_path(scene, low, touch)]
         odd = [one for one in found if one]
         warnings += [one.words for one in odd]
+        above = _to_begin_above(scene, -float(low[0]))
         if len(scene.own_displaced):
             deep = f", {_words(-low[0])} deep" if low[0] < 0.0 else ""
             warnings.append(
                 f"the tool is in the soil at the start{deep}: {len(scene.own_displaced)} particles "
                 "that would lie inside it are left out; soil closes in on it in the first 0.2 s: let it rest so long"
+                + above
+            )
+        elif touch == 0.0 and above and -low[0] > _NOTICED * scene.bed.spacing:
+            warnings.append(
+                f"the tool is in the soil at the start, its lowest point {_words(-low[0])} deep{above}"
             )
         if touch is not None:
             warnings += near_floor(scene, float(low[deepest]))
         warnings += near_wall(scene, times, poses)
-        lines = _bin(scene) + ([] if scene.axle is not None else _way(scene, low, times, touch))
+        lines = (
+            _bin(scene) + scene.remarks() + ([] if scene.axle is not None else _way(scene, low, times, touch))
+        )
         given = scene.path_times()
         if len(given) > 1 and given[-1] < scene.duration - 1.0 / scene.frame_rate:
             lines.append(
                 f"the path ends at {given[-1]:.4g} s; the tool rests there until {scene.duration:g} s"
             )
         if getattr(scene, "motion", "path") == "path" and given.size:
-            sides = ", ".join(
-                f"{round(1e3 * a)} to {round(1e3 * b)} mm along {axis}"
-                for axis, a, b in zip("xyz", *reach, strict=True)
-            )
+            sides = _sides(reach)
             named = {
                 "com": "centre of mass",
                 "file": "origin in the file",
@@ -95,6 +102,15 @@ class Preview:
                 for name, place in places.items()
                 if name != "com" and any(place)
             )
+            turned = rotation_vectors(np.array([0.0, 0.0, 0.0, 1.0]), poses[0, 3:])
+            angle = float(np.linalg.norm(turned))
+            if angle > 0.01:
+                there = (outline - body.path_point) @ rotation_matrices(poses[0, 3:]).T
+                about = ", ".join(f"{x:.2g}" for x in turned / angle + 0.0)
+                others += (
+                    f"; at the start it is turned by {math.degrees(angle):.0f} degrees about ({about}) and then "
+                    f"reaches from {_sides(np.stack([there.min(axis=0), there.max(axis=0)]))}"
+                )
             lines.insert(
                 0,
                 f"the path is that of the tool's {named[used]}; around it the tool reaches from {sides}{others}",
@@ -130,6 +146,19 @@ def near_floor(scene: Scene, lowest: float) -> list[str]:
         f"the tool's lowest point comes to {_words(above)} above the floor, less than one grid spacing: soil jams "
         "there and forces get too large; use a deeper scene.bed.size"
     ]
+
+
+def _to_begin_above(scene: Scene, depth: float) -> str:
+    """What lets a blade, whose lowest point is this deep at the start [m], begin above the soil."""
+    clearance = getattr(scene, "clearance", None)
+    if (
+        scene.axle is not None
+        or clearance is None
+        or getattr(scene, "motion", "") == "path"
+        or not depth > 0.0
+    ):
+        return ""
+    return f"; scene.clearance={math.ceil(1e3 * (clearance + depth)) / 1e3:g} lets it begin above"
 
 
 def near_wall(scene: Scene, times: np.ndarray, poses: np.ndarray) -> list[str]:
@@ -172,6 +201,13 @@ def near_wall(scene: Scene, times: np.ndarray, poses: np.ndarray) -> list[str]:
                     f"scene.duration={max(0.0, times[pose - 1]):.3g} ends before that, or use a longer scene.bed.size"
                 ]
     return []
+
+
+def _sides(reach: np.ndarray) -> str:
+    return ", ".join(
+        f"{round(1e3 * a)} to {round(1e3 * b)} mm along {axis}"
+        for axis, a, b in zip("xyz", *reach, strict=True)
+    )
 
 
 def _words(length: float) -> str:

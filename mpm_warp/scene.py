@@ -430,6 +430,10 @@ class Scene(Settings):
                 )
         return found
 
+    def remarks(self) -> list[str]:
+        """What holds for this scene by choice, and needs no warning."""
+        return []
+
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         """What came out, in a few words, of the soil's force on the body [N] and its torque about the centre of mass
         [N m], shape (T, 3), and the body's poses (T, 7); empty without a body."""

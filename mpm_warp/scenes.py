@@ -23,6 +23,10 @@ _PATH = "rows t [s], x, y, z [m], qx, qy, qz, qw of the body's centre of mass, o
 _SHARE = ", a share of the bin's length"
 
 
+_COARSE = 1.4
+"""Thickness of a plate that a coarse grid may have without a warning, as by default [grid spacings]."""
+
+
 @settings
 class Excavation(Scene):
     """A plate cuts through the bed along x."""
@@ -94,12 +98,20 @@ class Excavation(Scene):
 
     def warnings(self) -> list[str]:
         found = super().warnings()
-        if self.blade.thickness < 2.0 * self.bed.spacing:
-            found.append(
-                f"the plate is {self.blade.thickness / self.bed.spacing:.1f} grid spacings thick; below 2 the soil "
-                "behind it feels the soil in front of it"
-            )
+        if self.blade.thickness < _COARSE * self.bed.spacing:
+            found.append(self._thickness())
         return found
+
+    def remarks(self) -> list[str]:
+        if _COARSE <= self.blade.thickness / self.bed.spacing < 2.0:
+            return [f"a coarse grid: {self._thickness()}"]
+        return []
+
+    def _thickness(self) -> str:
+        return (
+            f"the plate is {self.blade.thickness / self.bed.spacing:.1f} grid spacings thick; below 2 the soil behind "
+            "it feels the soil in front of it"
+        )
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         words = f"mean draft {-np.mean(force[1:, 0]):.1f} N, vertical force {np.mean(force[1:, 2]):.1f} N"
@@ -275,8 +287,11 @@ class Wheel(Scene):
             slip = 1.0 - slow / fast if fast > 0.0 else 0.0
             slip = -slip if self.travel_speed > self.rim_speed else slip
             if self.slip not in (type(self).slip, slip):
+                wanted = self.travel_speed / (1.0 - self.slip) if 0.0 <= self.slip < 1.0 else None
+                wanted = self.travel_speed * (1.0 + self.slip) if self.slip < 0.0 else wanted
                 notes.append(
                     f"scene.slip {self.slip:g} is not used: travel_speed and rim_speed make it {slip:.3g}"
+                    + (f"; scene.rim_speed={wanted:.4g} makes it {self.slip:g}" if wanted else "")
                 )
             object.__setattr__(self, "slip", slip)
         elif self.rim_speed == 0.0:
@@ -488,6 +503,10 @@ class Incline(Scene):
                 f"scene.tilt is {self.tilt} degrees; this soil flows steadily between {low:.2f} and {high:.2f} "
                 "degrees: choose such a tilt or start at rest with scene.flowing=false"
             )
+
+    def warnings(self) -> list[str]:
+        # A layer that is to flow may yield at once.
+        return [words for words in super().warnings() if not self.tilt or "bed at rest" not in words]
 
     @property
     def _flowing_angles(self) -> tuple[float, float]:

@@ -141,14 +141,6 @@ def advice(points: Sequence[Point], wish: Wish) -> list[str]:
         elif low < high:
             said += f" ({low:.3g} to {high:.3g} from case to case)"
         lines.append(said if limit is None else f"{said}, asked for {limit:.3g}{unit}")
-        largest = max(
-            (error for p in points if not math.isnan(error := wish.error(p, key))), default=math.inf
-        )
-        if limit is not None and unit and limit > _FAR_ABOVE * largest:
-            lines.append(
-                f"    errors are given in metres, the largest of the table is {largest:.3g}{unit}: "
-                f"for {limit / 1e3:g} mm give error.{key}={limit / 1e6:g}"
-            )
         if limit is not None and limit < band:
             lines.append(
                 f"    the reference itself is only known to {band:g}{unit}: nothing can be shown to be better"
@@ -179,9 +171,8 @@ def named(point: Point) -> str:
     what = {"solver": "solver", "surrogate": "network"}.get(point.kind, point.kind)
     if "model=polynomial" in point.settings.split():
         what = "polynomial"
-    if not math.isnan(point.training_s):
-        what += f" trained for {point.training_s:.2g} s"
-    return f'{what}, called "{point.label}" in the study'
+    took = "" if math.isnan(point.training_s) else f"; its training took {point.training_s:.2g} s"
+    return f'{what}, called "{point.label}" in the study{took}'
 
 
 def tasks(points: Sequence[Point]) -> str:
@@ -238,7 +229,15 @@ def wished(cfg: Any, points: Sequence[Point]) -> Wish:
         )
     own = asked.against == "training"
     study = next(p.study for p in points if p.scene == asked.task)
-    return Wish(asked.task, limits, asked.time, asked.particles, own, {} if own else bands(study, asked.task))
+    wish = Wish(asked.task, limits, asked.time, asked.particles, own, {} if own else bands(study, asked.task))
+    for key, limit in limits.items():
+        known = [error for p in points if not math.isnan(error := wish.error(p, key))]
+        if ERRORS[key][3] and known and limit > _FAR_ABOVE * max(known):
+            raise UserError(
+                f"error.{key} is {limit / 1e3:g} m, and the largest of the table is {max(known):.3g} mm; errors are in "
+                f"metres: for {limit / 1e3:g} mm give error.{key}={limit / 1e6:g}; if any error will do, leave it out"
+            )
+    return wish
 
 
 def shipped(study: str, scene: str) -> dict[str, Any]:

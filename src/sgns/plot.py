@@ -95,7 +95,8 @@ def surface_figure(run: Any, frame: int, start: np.ndarray) -> Figure:
     high = np.maximum(start.max(axis=0), soil.max(axis=0)) + 0.5 * spacing
     grid = columns(low, high, max(spacing, float((high - low)[:2].max()) / MOST_COLUMNS))
     heights = 1e3 * (height_map(soil, grid) + 0.5 * spacing)
-    top = nice(max(float(np.nanmax(np.abs(heights))), 2e3 * spacing))  # a flat bed looks flat
+    # A flat bed looks flat, and a few particles in the air leave the scale as it is.
+    top = nice(max(float(np.nanpercentile(np.abs(heights), 99.0)), 2e3 * spacing))
     scale = Normalize(-top, top)
     (left, right), (front, back) = (edges[[0, -1]] for edges in (grid.x_edges, grid.y_edges))
     width = min(PICTURE_WIDTH - WORDS_WIDTH, HIGHEST_VIEW * (right - left) / (back - front))

@@ -416,6 +416,9 @@ class Simulator:
             values: The scene as plain data, as for `reset`, for all.
             paths_at_once: Paths stepped together: bounds the memory beside the result.
 
+        Returns:
+            Modes, force, torque and poses of all paths: (B, T, ...) arrays, see `Rollouts`.
+
         Raises:
             UserError: What is given is not of the shape and kind above.
         """

@@ -13,6 +13,7 @@ from mpm_warp import (
     Excavation,
     Material,
     MeshBody,
+    Plate,
     Preview,
     Scene,
     SceneError,
@@ -232,3 +233,22 @@ def test_soil_that_will_be_pushed_against_a_wall_is_told():
     assert "against the wall at y = 0 m" in " ".join(Preview.of(body(back)).warnings)
     channel = Bed(size=(0.8, 0.6, 0.15), spacing=0.02, walls=Walls(y="periodic"))
     assert Preview.of(body(back, bed=channel)).warnings == ()
+
+
+def test_how_a_tool_is_turned_at_the_start_is_told():
+    """A quaternion written w, x, y, z stands the tool on its head; here its origin is its tip."""
+    upright = Preview.of(body()).lines[0]
+    assert "turned" not in upright
+    over = tuple((*row, 1, 0, 0, 0) for row in np.add(ROWS, [0, 0, 0, 0.1]).tolist())
+    tool = MeshBody.of_mesh(mesh(1.0).mesh[0] * [1, 1, 2], box_triangles(), origin="tip")
+    told = Preview.of(body(tool=tool, path=over)).lines[0]
+    assert "at the start it is turned by 180 degrees about (1, 0, 0) and then reaches from" in told
+    assert told.split("then reaches")[1].count("-200 to 0 mm along z") == 1
+
+
+def test_a_raked_plate_that_starts_in_the_soil_is_told_the_clearance_that_it_needs():
+    blade = Plate(thickness=0.06, width=0.2, length=0.2)
+    [told] = [one for one in Preview.of(cut(blade=blade, rake=45.0)).warnings if "at the start" in one]
+    clearance = float(re.search(r"scene.clearance=([\d.]+) lets it begin above", told)[1])
+    above = Preview.of(cut(blade=blade, rake=45.0, clearance=clearance))
+    assert not any("at the start" in one for one in above.warnings) and above.displaced == 0

@@ -1,6 +1,7 @@
 """Paths, and the kinds of scenes that move a tool."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -485,6 +486,8 @@ def test_a_wheel_says_which_of_two_settings_it_does_not_use():
     )
     [words] = wheel(slip=0.4, rim_speed=0.1, travel_speed=0.1).warnings()
     assert "scene.slip 0.4 is not used: travel_speed and rim_speed make it 0" in words
+    rim = float(re.search(r"scene.rim_speed=([\d.]+) makes it 0.4", words)[1])
+    assert wheel(slip=0.2, rim_speed=rim, travel_speed=0.1).slip == pytest.approx(0.4, abs=1e-3)
     scene = wheel(material=Material(friction_angle=40.0), friction_angle=37.0, slip=0.4, travel_speed=0.1)
     assert not Scene.from_dict(scene.to_dict()).warnings()
     assert wheel(material=Material(friction_angle=40.0), friction_angle=None).material.friction_angle == 40.0

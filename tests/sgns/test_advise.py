@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from sgns.advise import TABLE, advice, bands, main, shipped, wished
+from sgns.advise import TABLE, advice, bands, main, named, shipped, wished
 from sgns.config import UserError
 from sgns.frontier.point import Point, read_points, write_points
 from sgns_testing.commands import composed
@@ -132,9 +132,16 @@ def test_an_error_that_a_task_does_not_have_is_told_with_the_task_that_has_it() 
 
 
 def test_an_error_that_was_likely_meant_in_millimetres_is_told() -> None:
-    lines = answer("error.position=4")
-    assert any("errors are given in metres" in line and "give error.position=0.004" in line for line in lines)
-    assert not any("metres" in line for line in answer("error.position=0.01"))
+    with pytest.raises(
+        UserError, match=r"error\.position is 4 m, .* for 4 mm give error\.position=0\.004; if any"
+    ):
+        answer("error.position=4")
+    assert answer("error.position=0.01")[0].startswith("use: ")
+
+
+def test_how_long_a_training_took_does_not_look_like_its_name() -> None:
+    point = replace(POINTS[3], label="default, 10 s", training_s=15.0)
+    assert named(point) == 'network, called "default, 10 s" in the study; its training took 15 s'
 
 
 def test_the_command_reads_a_table_of_one_s_own(tmp_path: Path) -> None:

@@ -314,6 +314,20 @@ def _composition(error: ConfigCompositionException) -> str:
     return _flat("; ".join(filter(None, (_flat(reason) for reason in reasons))))
 
 
+_SYMBOLS = {
+    "phi": "friction_angle",
+    "c": "cohesion",
+    "e": "youngs_modulus",
+    "nu": "poissons_ratio",
+    "rho": "grain_density",
+    "d": "grain_diameter",
+    "mu": "static_friction",
+}
+"""Of soil → its key."""
+_SURELY = 0.92
+"""Likeness of two keys of which one is surely the other with a slip of the keyboard."""
+
+
 def _unknown_key(cause: ConfigAttributeError | ConfigKeyError) -> str:
     from omegaconf import DictConfig, OmegaConf
 
@@ -324,7 +338,12 @@ def _unknown_key(cause: ConfigAttributeError | ConfigKeyError) -> str:
     known = _keys(parent._get_root())
     name = key.rpartition(".")[2]
     near = [other for other in known if other.rpartition(".")[2] == name]
-    near += [other for other in difflib.get_close_matches(key, known, n=3, cutoff=0.7) if other not in near]
+    symbol = f"{key.rpartition('.')[0]}.{_SYMBOLS.get(name.lower())}"
+    near += [symbol] if symbol in known else []
+    alike = difflib.get_close_matches(key, known, n=3, cutoff=0.7)
+    if alike and difflib.SequenceMatcher(None, key, alike[0]).ratio() > _SURELY:
+        alike = alike[:1]
+    near += [other for other in alike if other not in near]
     siblings = sorted(str(other) for other in parent.keys() if other != "hydra")
     where = key.rpartition(".")[0]
     line = f"{key}: no such key; "

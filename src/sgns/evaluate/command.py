@@ -304,9 +304,9 @@ def main(cfg: DictConfig) -> float:
     new_rollouts = [cfg.new_rollouts] if isinstance(cfg.new_rollouts, str) else cfg.new_rollouts or []
     checkpoint, output = Path(cfg.checkpoint), Path(cfg.output)
     published = cfg.dataset.get("format") == "published"
+    simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
     if not published:
         dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
-    simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
     with only_here(output / "metrics.json"):
         if published:
             return evaluate_published(simulator, cfg.dataset, cfg.split, output, checkpoint)

@@ -90,7 +90,7 @@ def cost_line(costs: Sequence[RunCost]) -> str:
     steps = sum(one.particle_steps for one in costs)
     work = "" if len(costs) > 1 else f"{costs[0].particles} particles in {costs[0].steps} steps: "
     size = size_words(sum(one.size for one in costs))
-    return f"{work}about {duration_words(steps / CORE_RATE)} of one core and {size} of disk"
+    return f"{work}about {duration_words(steps / CORE_RATE)} of one core and {size} of disk (estimated for a fast core)"
 
 
 def require_limits(costs: Mapping[str, RunCost], limits: Limits) -> None:

@@ -183,7 +183,7 @@ class Workers:
         with self._pool:
             try:
                 self._measure()
-                log.info("about %s with %d at once, %s", self.time_left(), self.at_once, disk)
+                log.info("measured here: about %s with %d at once, %s", self.time_left(), self.at_once, disk)
                 # Every run is for itself, but a worker that makes several at once gets its share of them together.
                 shares = self.workers if self.batch > 1 else len(self._jobs)
                 for share in (self._jobs[number::shares] for number in range(shares)):

@@ -12,10 +12,12 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate
@@ -39,6 +41,9 @@ log = logging.getLogger(__name__)
 _CHUNK = 2048
 # An input with less deviation than this after normalisation is fixed, or zero by symmetry: no use as a factor.
 _STILL = 0.01
+
+
+_bar = partial(tqdm, unit="fit", leave=False, disable=None, delay=3.0)
 
 
 class Setting(NamedTuple):
@@ -167,7 +172,10 @@ def candidates(
     settings = [Setting(noise, penalty) for noise in known for penalty in penalties]
     if linear:
         settings += [setting._replace(linear=True) for setting in settings]
-    return {setting: coefficients(known[setting.noise], setting) for setting in settings}
+    return {
+        setting: coefficients(known[setting.noise], setting)
+        for setting in _bar(settings, desc="coefficients")
+    }
 
 
 def select(
@@ -180,7 +188,9 @@ def select(
         take(model, *(found[setting] for setting in selection))
         return rollouts.measure(model)
 
-    motion = body = max(found, key=lambda setting: score(setting, setting, setting).skill)
+    motion = body = max(
+        _bar(found, desc="rollouts"), key=lambda setting: score(setting, setting, setting).skill
+    )
     if model.predicts_body:
         body = min(found, key=lambda setting: score(motion, setting, motion).body_rmse)
     force = min(found, key=lambda setting: score(motion, body, setting).force_nrmse)
@@ -247,8 +257,18 @@ def best_polynomial(
     # A single run has to do for both.
     fitting = [run for run in runs if run.name not in names] or list(runs)
     windows, dynamics = begun(fitting)
-    known = {noise: moments(dynamics, windows, noise, settings.draws) for noise in settings.noises}
     log.info("%d windows, %d monomials of %d inputs", len(windows), len(dynamics.terms), len(dynamics.used))
+    if len(dynamics.terms) > len(windows):
+        log.warning(
+            "there are more coefficients of each output (%d) than windows of training runs (%d): fitting takes long "
+            "and the penalty decides most; use more runs, fewer reduction.num_modes or model.degree=1",
+            len(dynamics.terms),
+            len(windows),
+        )
+    known = {
+        noise: moments(dynamics, windows, noise, settings.draws)
+        for noise in _bar(settings.noises, desc="sums")
+    }
     rollouts = ValidationRollouts(choosing, num_modes, model.history, model.body_nodes, context, basis)
     found = candidates(known, settings.penalties, settings.linear and model.degree > 1)
     selection = select(dynamics, found, rollouts)

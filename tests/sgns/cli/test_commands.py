@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import signal
 import subprocess
@@ -109,6 +110,8 @@ def test_every_option_of_every_group_composes(command: str) -> None:
         (["train", "foo=1"], ["foo: no such key", "keys: checkpoint, dataset, device"]),
         (["train", "reduction.num_mode=3"], ["did you mean reduction.num_modes"]),
         (["train", "num_modes=3"], ["did you mean reduction.num_modes"]),
+        (["simulate", "material.phi=30"], ["did you mean material.friction_angle"]),
+        (["simulate", "scene.rakee=30"], ["did you mean scene.rake? keys of"]),
         (
             ["simulate", "scene.tool.file=a.obj"],
             [
@@ -171,7 +174,7 @@ def test_every_option_of_every_group_composes(command: str) -> None:
         (["evaluate", "checkpoint=a.ckpt", "dataset=null"], ["dataset is null; allowed: ", "quick"]),
         (["simulate", "experiment=x"], ["experiment=x: --config-dir is missing"]),
         (["evaluate", "checkpoint=a.ckpt", "~dataset"], ["dataset is missing", "allowed:", "quick"]),
-        (["evaluate", "checkpoint=a.ckpt", "dataset.path=nope"], ["no dataset in nope"]),
+        (["evaluate", "checkpoint=a.ckpt", "dataset.path=nope"], ["no checkpoint at a.ckpt"]),
         (["simulate", "dataset=published"], ["dataset=published has no scene: its runs come from elsewhere"]),
         (["simulate", "shards=4"], ["give dataset=..."]),
         (["simulate", "effects.gravity=true"], ["effects.gravity: no such key"]),
@@ -267,6 +270,20 @@ def test_a_sweeps_lines_name_what_differs_between_its_jobs(empty_folder: Path) -
     assert [job for job in sweep_jobs(["a=1,2", "b={c: 3}", "d=range(0,2)"])] == [
         [f"a={a}", "b={c:3}", f"d={d}"] for a in (1, 2) for d in (0, 1)
     ]
+
+
+def test_an_interrupted_sweep_of_files_says_what_stays(empty_folder: Path, monkeypatch) -> None:
+    def stop(cfg: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib.import_module(COMMANDS["simulate"].module), "main", stop)
+    done = call("simulate", "-m", "seed=1,2", "scene.duration=0.02")
+    assert done.returncode == 130
+    assert re.search(
+        r"job 0 \(seed=1\): interrupted; nothing new is kept; finished jobs stay in multirun/simulate/[^;]*; the same "
+        "sweep would begin anew in another folder",
+        done.stderr,
+    )
 
 
 def test_a_sweep_ends_with_a_table(empty_folder: Path) -> None:

@@ -415,6 +415,20 @@ def test_soil_at_rest_looks_at_rest(pair):
     assert 2e3 * particle_spacing(start) <= colours.norm.vmax < 5e3 * particle_spacing(start)
 
 
+def test_a_particle_in_the_air_leaves_the_map_its_colours(pair):
+    bed = np.stack(np.meshgrid(*[0.01 * np.arange(n) for n in (30, 30, 3)], indexing="ij"), -1).reshape(-1, 3)
+    flying = bed.copy()
+    flying[0, 2] += 5.0
+    tops = [
+        plot.surface_figure(changed(pair[0], positions=lambda _, soil=soil: soil[None]), 1, bed)
+        .axes[0]
+        .images[0]
+        .norm.vmax
+        for soil in (bed, flying)
+    ]
+    assert tops[1] == tops[0]
+
+
 def changed(run, **parts):
     names = "positions velocities force pose scene body_points mesh time producer".split()
     return SimpleNamespace(**{name: getattr(run, name) for name in names} | parts)

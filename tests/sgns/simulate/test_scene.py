@@ -11,7 +11,8 @@ import pytest
 import yaml
 from PIL import Image
 
-from mpm_warp import Decision, Effects, Scene, SceneError, Tolerances, Wheel
+from mpm_warp import Decision, Effects, Preview, Scene, SceneError, Tolerances, Wheel
+from sgns.cli.help import options_of
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.run import Run
@@ -54,7 +55,7 @@ def test_the_shipped_tolerances_are_the_solvers_own():
 )
 def test_only_the_fastest_of_the_papers_runs_call_for_rate_dependence(scene, rate_dependence):
     effects, _ = chosen(*scene)
-    assert effects == Effects(rate_dependence=rate_dependence, symmetry=True)
+    assert effects == Effects(rate_dependence=rate_dependence, symmetry=True, cohesion=False)
 
 
 @pytest.mark.parametrize("scene", ["incline", "thin_layer"])
@@ -70,7 +71,7 @@ def test_two_names_of_nonlocality():
 
 def test_all_physics():
     effects, decisions = chosen("scene=column", "effects=all")
-    assert effects == Effects(fluidity=True, nonlocality=True, symmetry=True, torque=False)
+    assert effects == Effects(fluidity=True, nonlocality=True, symmetry=True, torque=False, cohesion=False)
     assert decisions["fluidity"].reason.startswith("asked for; auto would turn it off")
 
 
@@ -129,9 +130,11 @@ def test_what_no_run_can_have_is_refused_before_anything_is_written(tmp_path):
 SHORT = ["scene=quick_wheel", "scene.settle=0.05", "scene.duration=0.1", "output=run.h5"]
 
 
-@pytest.mark.parametrize("name", ["wheel", "quick_wheel", "paper_wheel", "published_wheel"])
-def test_wheel_scenes_are_good(name):
-    assert scene_from_config(composed(f"scene={name}")).warnings() == []
+@pytest.mark.parametrize("name", options_of("scene"))
+def test_no_scene_that_ships_warns_of_itself(name):
+    path = ["scene.path=[[0,0.3,0.3,0.2,0,0,0,1],[2,0.4,0.3,0.0,0,0,0,1]]"] if name == "body" else []
+    found = Preview.of(scene_from_config(composed(f"scene={name}", *path)))
+    assert found.warnings == () and found.not_meant == ()
 
 
 def test_the_published_scene():

@@ -105,3 +105,10 @@ def test_the_commands(tmp_path, no_pictures) -> None:
     assert sgns(tmp_path, "evaluate", *dataset, "checkpoint=out/best.ckpt", "output=report").returncode == 0
     assert (tmp_path / "report" / "report.html").exists()
     assert "model has no key 'body_nodes'" in refusal(tmp_path, *train_it, "output=other", "preset=paper")
+
+
+def test_more_coefficients_than_windows_are_told(data, caplog) -> None:
+    fitted(data.runs("train")[:1], data.runs("train")[:1])
+    assert any(
+        "more coefficients of each output" in one and "model.degree=1" in one for one in caplog.messages
+    )
