@@ -155,7 +155,9 @@ class Body(Scene):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.motion == "path" and self.path is None:
-            raise SceneError("scene.path is missing: a CSV file with columns t,x,y,z,qx,qy,qz,qw")
+            raise SceneError(
+                "scene.path is missing; give scene.path=..., a CSV file with columns t,x,y,z,qx,qy,qz,qw"
+            )
         if self.motion == "passes" and self.path is not None:
             raise SceneError("scene.path is given but scene.motion is 'passes'; use scene.motion=path")
         if not isinstance(self.tool, MeshBody):  # whose thin walls are made to hold

@@ -133,4 +133,4 @@ def test_kernels_compile_for_a_gpu(tmp_path):
     kernels = [*vars(particles).values(), *vars(nodes).values()]
     for kernel in kernels:
         wp.compile_aot_module(kernel.together.module, arch=targets[0], module_dir=tmp_path, use_ptx=True)
-    assert len(list(tmp_path.glob("*.ptx"))) == len(kernels) == 7
+    assert len(list(tmp_path.glob("*.ptx"))) == len(kernels) == 8

@@ -31,8 +31,8 @@ class Dataset:
 
     @property
     def title(self) -> str:
-        """What it is called, see `dataset_title`."""
-        return dataset_title(self.name, self.path)
+        """What it is called: by its folder. One of another name was made from the settings of `name`, with others."""
+        return self.path.resolve().name or self.name
 
     @property
     def command(self) -> str:
@@ -82,12 +82,6 @@ class Dataset:
         if split not in SPLITS:
             raise UserError(f"split is {split!r}; allowed: {', '.join(SPLITS)}")
         return [self.path / "runs" / f"{name}.h5" for name in self.split[split]]
-
-
-def dataset_title(name: str, path: Path) -> str:
-    """What a dataset is called: by its name, or its folder where that has another; then it was made from the settings
-    of that name, with others."""
-    return name if path.resolve().name == name else str(path)
 
 
 def _are_names(names: Any) -> bool:

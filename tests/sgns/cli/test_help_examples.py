@@ -58,7 +58,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def interrupt() -> None:
         if next(count) == 3:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)  # a shell in the background ignores SIGINT
 
     with pytest.raises(Interrupted), heeded_signals():
         simulate_scene(

@@ -330,7 +330,8 @@ def test_an_interrupted_sweep_or_continuation_says_how_its_run_goes_on(interrupt
     done = sgns(tmp_path, "simulate", *SMALL, "-m", "scene.rake=5.0", f"output={tmp_path}/run.h5")
     kept, output = tmp_path / "0/run.stopped.h5", tmp_path / "0/run.h5"
     way = f"sgns simulate continue_from={kept} output={output}"
-    assert done.stderr.endswith(f"are kept in {kept}; {way} goes on from there\n")
+    assert f"are kept in {kept}; {way} goes on from there; finished jobs stay in " in done.stderr
+    assert done.stderr.endswith("the same sweep would begin anew in another folder\n")
     again = sgns(tmp_path, *way.split()[1:])
     assert again.returncode == 0 and check_run(output) == [], again.stderr
 
