@@ -159,10 +159,8 @@ class RigidBody:
                 setattr(own, name, getattr(data, name))
             own.impulse = impulse
             self.of_threads.append(own)
-        self.launches = [
-            Launch(kernel, len(data.impulse), given, device) for kernel, given in adding_up(impulses)
-        ]
-        self.launches += moving
+        adding = [Launch(kernel, len(data.impulse), given, device) for kernel, given in adding_up(impulses)]
+        self.launches = [*adding, *moving]
         """What has to run in every substep after the soil's push was added up."""
 
     def _at_start(self, scene: Companion) -> np.ndarray:

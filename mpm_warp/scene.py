@@ -112,10 +112,10 @@ class Scene(Settings):
         words=" s; it must be 0 (every step) or more, or null",
     )
     remap_distance: float = setting(0.1, "soil's way between two remaps", "grid spacings", gt=0, le=0.5)
-    others: tuple[Other, ...] = setting((), "further bodies: a list of groups of keys")
     velocity_memory: float | None = setting(
         None, "time in which velocities below the grid fade to 37 %; None: 18 sqrt(d / g)", "s", gt=0
     )
+    others: tuple[Other, ...] = setting((), "further bodies: a list of groups of keys")
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
