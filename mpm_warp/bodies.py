@@ -124,7 +124,7 @@ class Plate(Settings, Tool):
     thickness: float = _length(0.028, "2 to 3 grid spacings keep the soil on its two sides apart")
     friction: float = setting(0.3, "Coulomb friction between soil and body", ge=0)
     edge: Literal["square", "level", "bevel"] = setting(
-        "square",
+        "bevel",
         f"of the lower end; level: cut level where the motion starts; bevel: ground from the back to {WEDGE:g} degrees",
     )
 

@@ -34,6 +34,7 @@ class Excavation(Scene):
     name: str = "excavation"
     kind: str = "excavation"
     bed: Bed = field(default_factory=lambda: Bed(spacing=0.02, particles_per_cell=4.0))
+    contact_margin: float = -0.375
     blade: Plate = setting(Plate, "the plate")
     depth: float = setting(
         0.05, "the motion reaches this far below the tip's starting height", "m", ge=0, le=1e3

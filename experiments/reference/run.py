@@ -31,6 +31,10 @@ DX = {"20": 0.02, "13.3": 0.8 / 60, "10": 0.01, "6.7": 0.8 / 120}
 
 CUT = ["scene=excavation", "scene.depth=0.08", "scene.duration=2.0"]
 WHEEL = ["scene=wheel", "scene.duration=3.0"]
+BASE = {
+    "cut": "dx 13.3, 4 per cell, margin -0.375",  # what the changes are made to
+    "wheel": "dx 13.3, 4 per cell, margin -0.25",
+}
 QUANTITIES = {
     "cut": {
         "draft": "draft, mean of 2 s [N]",
@@ -71,17 +75,19 @@ def settings(kind: str) -> dict[str, list[str]]:
         "E 5 MPa": ["material.youngs_modulus=5e6"],
         "E 15 MPa": ["material.youngs_modulus=15e6"],
     }
-    sizes = {"cut": ("20", "13.3", "10"), "wheel": ("20", "13.3", "10", "6.7")}[kind]
-    found = {
-        f"dx {dx}, {ppc} per cell, margin {margin}": at(dx, ppc, margin)
-        for margin in ("-0.75", "-0.25", "-0.5", "0")
-        for ppc in (1, 4)
-        for dx in sizes
-    }
-    base = "dx 13.3, 4 per cell, margin -0.25"
-    found |= {f"{base}, {change}": [*at("13.3", 4, "-0.25"), *more] for change, more in changes.items()}
-    others = ("13.3", 8, "-0.25"), ("6.7", 1, "-0.25"), ("6.7", 1, "-0.75"), ("6.7", 4, "-0.25")
-    for dx, ppc, margin in others:
+    base, default = BASE[kind], BASE[kind].split()[-1]
+    if kind == "cut":
+        changes["square end with margin -0.25"] = ["scene.blade.edge=square", "scene.contact_margin=-0.25"]
+        rows = [(dx, ppc, default) for ppc in (1, 4) for dx in ("20", "13.3", "10")]
+        rows += [(dx, 4, margin) for margin in ("-0.75", "-0.5", "-0.25", "0") for dx in ("20", "13.3")]
+        last = [("13.3", 8, default), ("6.7", 4, default)]
+    else:
+        margins = ("-0.75", "-0.25", "-0.5", "0")
+        rows = [(dx, ppc, margin) for margin in margins for ppc in (1, 4) for dx in DX]
+        last = [("13.3", 8, default)]
+    found = {f"dx {dx}, {ppc} per cell, margin {margin}": at(dx, ppc, margin) for dx, ppc, margin in rows}
+    found |= {f"{base}, {change}": [*at("13.3", 4, default), *more] for change, more in changes.items()}
+    for dx, ppc, margin in last:
         found[f"dx {dx}, {ppc} per cell, margin {margin}"] = at(dx, ppc, margin)
     return found
 
@@ -132,7 +138,7 @@ def draw(kind: str, rows: dict[str, dict]) -> None:
     grid = {
         name: m for name in rows if (m := re.fullmatch(r"dx ([\d.]+), (\d) per cell, (margin \S+)", name))
     }
-    base = "dx 13.3, 4 per cell, margin -0.25"
+    base = BASE[kind]
     changed = [name for name in rows if name.startswith(base)]
     for (left, right), (key, label) in zip(axes, QUANTITIES[kind].items(), strict=True):
         for ppc, margin in sorted({(m[2], m[3]) for m in grid.values()}):
@@ -141,7 +147,9 @@ def draw(kind: str, rows: dict[str, dict]) -> None:
             )
             if len(points) > 1:
                 style = {"1": "o--", "4": "o-", "8": "o:"}[ppc]
-                colour = {"-0.75": "C0", "-0.5": "C1", "-0.25": "C2", "0": "C3"}[margin.split()[1]]
+                colour = {"-0.75": "C0", "-0.5": "C1", "-0.375": "C4", "-0.25": "C2", "0": "C3"}[
+                    margin.split()[1]
+                ]
                 left.plot(
                     *zip(*points, strict=True), style, ms=4, color=colour, label=f"{ppc} per cell, {margin}"
                 )

@@ -73,10 +73,10 @@ def _seen_from_body(frame: Frame) -> np.ndarray:
     return rotate(back, frame.position.astype(float) - frame.body_pose[:3])
 
 
-def pushed_plate(thickness: float, margin: float) -> Excavation:
+def pushed_plate(thickness: float, margin: float, edge: str = "square") -> Excavation:
     """A plate that goes 4 cm down and then 10 cm forward."""
     return cut(
-        blade=Plate(length=0.2, width=0.193, thickness=thickness * cut().bed.spacing),
+        blade=Plate(length=0.2, width=0.193, thickness=thickness * cut().bed.spacing, edge=edge),
         contact_margin=margin,
         motion="path",
         path=tuple((t, x, 0.2, z, 0, 0, 0, 1) for t, x, z in PATH),

@@ -22,7 +22,7 @@ class RetainingWall(Scene):
 
     @property
     def body(self) -> Plate:
-        return Plate(length=0.4, width=1.0, thickness=2.0 * BEHIND, friction=0.0)
+        return Plate(length=0.4, width=1.0, thickness=2.0 * BEHIND, friction=0.0, edge="square")
 
     @property
     def filled(self) -> tuple[np.ndarray, float]:

@@ -25,7 +25,7 @@ class Silo(Scene):
 
     @property
     def body(self) -> Plate:
-        return Plate(length=4.0 * self.bed.spacing, width=1.0, thickness=1.0, friction=0.0)
+        return Plate(length=4.0 * self.bed.spacing, width=1.0, thickness=1.0, friction=0.0, edge="square")
 
     @property
     def filled(self) -> tuple[np.ndarray, float]:

@@ -34,7 +34,7 @@ def small_cut():
     """280 particles, with the blade in the soil."""
     return cut(
         bed=Bed(size=(0.28, 0.2, 0.1), spacing=0.02, particles_per_cell=0.4, headroom=0.08),
-        blade=Plate(length=0.1, width=0.1, thickness=0.044),
+        blade=Plate(length=0.1, width=0.1, thickness=0.044, edge="square"),
         clearance=0.0,
         depth=0.03,
         duration=1.0 / 60.0,

@@ -46,3 +46,12 @@ def test_plates_do_not_leak(cells, margin):
     frames = list(Solver(scene).frames())
     assert -np.mean([f.force[0] for f in frames[40:]]) > 20.0
     assert leakage(frames, scene.body, edge=0.01 if margin < cut().contact_margin else 0.0) == 0.0
+
+
+def test_a_plate_with_an_edge_does_not_leak():
+    """Nothing comes through it above where the middle of its thickness leaves it, half-way up the ground face."""
+    scene = pushed_plate(2.0, -0.375, edge="bevel")
+    lower, upper = scene.body.section[0, 1], scene.body.section[3, 1]
+    frames = list(Solver(scene).frames())
+    assert -np.mean([f.force[0] for f in frames[40:]]) > 20.0
+    assert leakage(frames, scene.body, edge=0.5 * (upper - lower)) == 0.0

@@ -247,7 +247,7 @@ def test_how_a_tool_is_turned_at_the_start_is_told():
 
 
 def test_a_raked_plate_that_starts_in_the_soil_is_told_the_clearance_that_it_needs():
-    blade = Plate(thickness=0.06, width=0.2, length=0.2)
+    blade = Plate(thickness=0.06, width=0.2, length=0.2, edge="square")
     [told] = [one for one in Preview.of(cut(blade=blade, rake=45.0)).warnings if "at the start" in one]
     clearance = float(re.search(r"scene.clearance=([\d.]+) lets it begin above", told)[1])
     above = Preview.of(cut(blade=blade, rake=45.0, clearance=clearance))

@@ -69,7 +69,7 @@ def scaled_cut(length: float, gravity: float):
         bed=Bed(
             size=tuple(length * s for s in (0.48, 0.4, 0.16)), spacing=length * 0.02, headroom=length * 0.12
         ),
-        blade=Plate(length=length * 0.2, width=length * 0.193, thickness=length * 0.044),
+        blade=Plate(length=length * 0.2, width=length * 0.193, thickness=length * 0.044, edge="square"),
         material=replace(
             soil,
             youngs_modulus=soil.youngs_modulus * gravity * length,
