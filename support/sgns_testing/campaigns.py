@@ -9,7 +9,7 @@ from sgns.simulate.campaign import Campaign, plan
 BASE = {
     "kind": "excavation",
     "duration": 0.05,
-    "blade": {"length": 0.1, "width": 0.1, "thickness": 0.08},
+    "blade": {"length": 0.1, "width": 0.1, "thickness": 0.08, "edge": "square"},
     "bed": {"size": [0.4, 0.2, 0.16], "spacing": 0.04},
 }
 EFFECTS = {"yielding": True, "rate_dependence": True, "separation": True}

@@ -19,11 +19,19 @@ from sgns_testing.tiny import make_dataset
 
 SMALL = [
     *("scene.bed.size=[0.4,0.2,0.16]", "scene.bed.spacing=0.04", "scene.duration=0.2", "scene.speed=0.05"),
-    *("scene.blade.length=0.1", "scene.blade.width=0.1", "scene.blade.thickness=0.08"),
+    *(
+        "scene.blade.length=0.1",
+        "scene.blade.width=0.1",
+        "scene.blade.thickness=0.08",
+        "scene.blade.edge=square",
+    ),
 ]
 SHORT = [
     *("scene.bed.size=[0.4,0.2,0.16]", "scene.bed.spacing=0.04", "scene.bed.particles_per_cell=1"),
-    *("scene.duration=0.05", "scene.blade={length: 0.1, width: 0.1, thickness: 0.08, friction: 0.3}"),
+    *(
+        "scene.duration=0.05",
+        "scene.blade={length: 0.1, width: 0.1, thickness: 0.08, friction: 0.3, edge: square}",
+    ),
 ]
 REDUCED = ["reduction.max_modes=6", "reduction.num_modes=3"]
 TRAIN = [

@@ -46,7 +46,12 @@ def make_run(path: str | Path, frames: int = 12, n: int = 50, m: int = 15, seed:
         "name": "excavation",
         "kind": "excavation",
         "bed": {"size": BED.tolist(), "spacing": 0.02, "arrangement": "lattice", "seed": 0},
-        "blade": {"thickness": float(PLATE[0]), "width": float(PLATE[1]), "length": float(PLATE[2])},
+        "blade": {
+            "thickness": float(PLATE[0]),
+            "width": float(PLATE[1]),
+            "length": float(PLATE[2]),
+            "edge": "square",
+        },
         "gravity": 9.81,
         "duration": (frames - 1) / frame_rate,
         "frame_rate": frame_rate,

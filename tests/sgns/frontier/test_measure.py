@@ -26,6 +26,7 @@ BED = [
     "scene.bed.particles_per_cell=1",
     "scene.duration=0.2",
     "scene.blade.thickness=0.1",
+    "scene.blade.edge=square",  # meets soil at once
 ]
 SPLIT = {"train": ["a", "b", "c"], "validation": ["d"], "test": ["e"]}
 

@@ -47,7 +47,7 @@ LAST = 3  # frame before the one in which the solver stops
 def small(**kw) -> Excavation:
     return Excavation(
         bed=Bed(size=(0.4, 0.2, 0.16), spacing=0.04, store_every=3),
-        blade=Plate(length=0.1, width=0.1, thickness=0.08),
+        blade=Plate(length=0.1, width=0.1, thickness=0.08, edge="square"),
         duration=0.1,
         **kw,
     )
@@ -364,7 +364,11 @@ def test_a_damaged_unfinished_run_is_refused(interrupted, tmp_path):
 def test_a_run_starts_from_the_soil_of_another(tmp_path):
     assert sgns(tmp_path, "simulate", *SMALL, "scene.gravity=5.0", "output=one.h5").returncode == 0
     assert check_run(tmp_path / "one.h5") == []
-    new = ["scene.blade={length: 0.1, width: 0.12, thickness: 0.08}", "scene.rake=5", "scene.start=0.3"]
+    new = [
+        "scene.blade={length: 0.1, width: 0.12, thickness: 0.08, edge: square}",
+        "scene.rake=5",
+        "scene.start=0.3",
+    ]
     new += ["scene.duration=0.1"]
     done = sgns(tmp_path, "simulate", "start_from=one.h5@12", *new, "output=two.h5")
     assert done.returncode == 0, done.stderr

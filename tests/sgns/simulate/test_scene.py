@@ -95,7 +95,7 @@ def fast_and_slow(tmp_path, asked):
         "duration": 0.05,
         "clearance": 0.0,
         "start": 0.3,
-        "blade": {"length": 0.1, "width": 0.1, "thickness": 0.08},
+        "blade": {"length": 0.1, "width": 0.1, "thickness": 0.08, "edge": "square"},
         "bed": {"size": [0.4, 0.2, 0.16], "spacing": 0.04},
     }
     settings = {"name": "tiny", "path": str(tmp_path / "tiny"), "draw": {"speed": [0.05, 0.06, 0.07, 4.0]}}
