@@ -48,6 +48,8 @@ def imports(name: str, path: Path, known: dict[str, Path]) -> set[str]:
             base = ".".join([*above, *([node.module] if node.module else [])])
             inner = {f"{base}.{one.name}" for one in node.names} & known.keys()
             found |= inner or {base}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and ":" in node.value:
+            found.add(node.value.partition(":")[0])  # of a table of what is loaded when it is needed
     return (found & known.keys()) - {name}
 
 

@@ -9,12 +9,12 @@ import os
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
-from itertools import chain, pairwise
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -446,3 +446,33 @@ class Executor:
             if batch is None or batch.programs != programs:
                 batch = self._batches[kernels] = _Batch(programs, self._device)
             batch.run([job.steps for job in group])
+
+
+def run_concurrently(
+    tasks: Iterable[Generator[Any, None, None]], at_once: int, device: str
+) -> Iterator[tuple[int, Any]]:
+    """Advances `at_once` of the generators side by side, the next one as soon as one has ended.
+
+    Yields:
+        A task's number and what it yielded, unless that was a job. Jobs are run when all tasks have asked for one.
+    """
+    executor = Executor(find_device(device))
+    waiting = enumerate(tasks)
+    running = list(islice(waiting, at_once))
+    try:
+        while running:
+            jobs: list[Job] = []
+            while len(jobs) < len(running):
+                place = len(jobs)
+                number, task = running[place]
+                item = next(task, None)
+                if isinstance(item, Job):
+                    jobs.append(item)
+                elif item is not None:
+                    yield number, item
+                else:
+                    running[place : place + 1] = islice(waiting, 1)
+            executor.run(jobs)
+    finally:
+        for _, task in running:
+            task.close()

@@ -8,10 +8,19 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from .bodies import Box, Cylinder, Sphere
-from .poses import about_y, rotate
+from .bed import Bed
+from .bodies import Box, Cylinder, Sphere, Tool
+from .poses import (
+    about_y,
+    in_world_frame,
+    rotate,
+    rotation_matrices,
+    rotation_vectors,
+    sampled_poses,
+)
 from .settings import Settings, setting, settings, short
 from .state import SceneError
+from .tool_geometry import odd_size, place_unit
 
 CUT_LENGTH = 0.4
 """Horizontal travel of the published cuts [m]."""
@@ -190,6 +199,157 @@ def as_loads(rows: Any) -> tuple[tuple[float, float], ...]:
             "scene.load is empty; it must be a number above 0 N, or rows of a time [s] and a load [N]"
         )
     return tuple((float(time), float(load)) for time, load in rows)
+
+
+# --- Where a body goes in its bin -------------------------------------------------------------------------
+
+_FARTHEST = 1e13
+"""Number in a path, which may hold epoch seconds in milliseconds [s or m]."""
+_ROUNDING = 1e-9
+"""Lengths that differ by less are the same [m]."""
+_MOST_POSES, _MOST_POINTS = 100_000, 1_000_000
+"""That are looked at for walls in a way, and at a time."""
+
+
+def as_path(rows: Any) -> tuple[tuple[float, ...], ...]:
+    """The rows of a path as numbers; whether they are poses is looked at where they are used."""
+    for number, row in enumerate(rows, 1):
+        if not isinstance(row, (list, tuple, np.ndarray)) or len(row) != 8:
+            raise SceneError(
+                f"row {number} of the path is {short(row)}; it needs 8 numbers: t, x, y, z, qx, qy, qz, qw"
+            )
+        for value in row:
+            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+                raise SceneError(f"row {number} of the path holds {short(value)}; allowed: numbers")
+            if _FARTHEST < abs(float(value)) < math.inf:
+                raise SceneError(
+                    f"row {number} of the path holds {value:.3g}; allowed: {-_FARTHEST:g} to {_FARTHEST:g}"
+                )
+    return tuple(tuple(float(v) for v in row) for row in rows)
+
+
+class Moved:
+    """A scene's body along its way: where it is, how far it goes, and whether it stays in the bin."""
+
+    bed: Bed
+    duration: float
+    frame_rate: float
+
+    @property
+    def body(self) -> Tool | None:
+        """The rigid body that touches the soil, if any."""
+        return None
+
+    @property
+    def open_sides(self) -> bool:
+        """Whether nothing is in the way of a body at the sides: walls of a channel stand for more of the same soil."""
+        return self.bed.walls.conditions[1] in ("slip", "periodic")
+
+    @property
+    def frame_count(self) -> int:
+        """T, with the initial state as frame 0."""
+        return round(self.duration * self.frame_rate) + 1
+
+    def times(self) -> np.ndarray:
+        """Times of the frames [s], shape (T,)."""
+        return np.arange(self.frame_count) / self.frame_rate
+
+    @property
+    def _path(self) -> tuple[tuple[float, ...], ...] | None:
+        """The setting `path` of the kinds of scenes that have it."""
+        return getattr(self, "path", None)
+
+    def poses_at(self, time: np.ndarray) -> np.ndarray:
+        """Pose of the body at any times [s]: centre of mass [m] and quaternion x, y, z, w; shape (T, 7).
+
+        Of a body with a free height the z of the start, which the solver replaces.
+        """
+        if self._path is not None:
+            poses = sampled_poses(np.asarray(self._path), np.atleast_1d(np.asarray(time, dtype=float)))
+            if self.body is not None and (point := self.body.path_point).any():
+                poses[:, :3] -= rotate(poses[:, 3:], point)
+            return poses
+        return np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(np.atleast_1d(time)), 1))
+
+    def body_poses(self) -> np.ndarray:
+        """Poses at the frames, shape (T, 7)."""
+        return self.poses_at(self.times())
+
+    def path_times(self) -> np.ndarray:
+        """Times at which a prescribed path may turn [s], increasing, shape (k,); none for a smooth motion."""
+        return np.array([row[0] for row in self._path or ()])
+
+    def _with_turns(self, time: np.ndarray) -> np.ndarray:
+        """Increasing times [s] with those between the first and the last at which a path may turn."""
+        rows = self.path_times()
+        return np.union1d(time, rows[(rows > time[0]) & (rows < time[-1])])
+
+    def displacement(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the body's centre travels [m] and by what angle the body turns [rad] from each of the increasing times
+        (T,) [s] to the next, both of shape (T - 1,).
+
+        A path counts row by row, whatever it comes back to; between rows, and without any, a body turns the shortest
+        way.
+        """
+        every = self._with_turns(time)
+        poses = self.poses_at(every)
+        way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+        angle = np.linalg.norm(rotation_vectors(poses[:-1, 3:], poses[1:, 3:]), axis=1)
+        first = np.searchsorted(every, time[:-1])
+        return np.add.reduceat(way, first), np.add.reduceat(angle, first)
+
+    def largest_displacement(self, time: np.ndarray) -> np.ndarray:
+        """The most that any point of the body travels from each of the increasing times (T,) [s] to the next [m],
+        shape (T - 1,)."""
+        way, angle = self.displacement(time)
+        return way + angle * (self.body.reach if self.body is not None else 0.0)
+
+    def passing_times(self) -> np.ndarray:
+        """Times of the frames and between them [s], so close that no point of the body moves more than a grid spacing
+        from one to the next; of a very long way less close."""
+        times = self._with_turns(self.times())
+        way = self.largest_displacement(times)
+        steps = np.maximum(1.0, np.ceil(way / max(self.bed.spacing, way.sum() / _MOST_POSES)))
+        ends = np.concatenate([[0.0], np.cumsum(steps)])
+        return np.interp(np.arange(ends[-1] + 1.0), ends, times)
+
+    def lowest_points(self, poses: np.ndarray) -> np.ndarray:
+        """z of the body's lowest point at poses (T, 7) [m], shape (T,)."""
+        assert self.body is not None
+        outline, up = self.body.outline(), rotation_matrices(poses[:, 3:])[:, 2]
+        parts = np.array_split(up, 1 + len(up) * len(outline) // _MOST_POINTS)
+        return poses[:, 2] + np.concatenate([(part @ outline.T).min(axis=1) for part in parts])
+
+    def body_points(self) -> np.ndarray:
+        """Body nodes in the body frame [m], shape (M, 3)."""
+        return self.body.points() if self.body is not None else np.zeros((0, 3))
+
+    def _check_inside(self, body: Tool, what: str, remedy: str) -> None:
+        """The part of the body that is below the surface must stay within the bin."""
+        lx, ly, lz = self.bed.size
+        side = math.inf if self.open_sides else 0.0
+        low, high = np.array([0.0, -side, -lz]) - _ROUNDING, np.array([lx, ly + side, math.inf]) + _ROUNDING
+        times = self.passing_times()
+        poses, outline = self.poses_at(times), body.outline()
+        place, around = poses[:, :3], np.abs(rotation_matrices(poses[:, 3:])) @ body.half_size
+        leaving = ((place - around < low) | (place + around > high)).any(axis=1)
+        maybe = np.flatnonzero(leaving & (place[:, 2] < around[:, 2]))
+        for some in np.array_split(maybe, 1 + len(maybe) * len(outline) // _MOST_POINTS):
+            points = in_world_frame(poses[some], outline)
+            outside = ((points < low) | (points > high)) & (points[:, :, 2:] < 0.0)
+            if outside.any():
+                pose = int(np.argmax(outside.any(axis=(1, 2))))
+                axis = int(np.argmax(outside[pose].any(axis=0)))
+                at = points[pose, np.argmax(outside[pose, :, axis]), axis]
+                allowed = (f"0 to {lx:g} m", f"0 to {ly:g} m", f"at least {-lz:g} m")[axis]
+                if self._path and (unit := place_unit(np.array(self._path)[:, 1:4], self.bed.size)):
+                    remedy = f"the path's positions look like {unit} and are taken as metres"
+                elif odd := odd_size(body, self.bed.size, self.open_sides):
+                    remedy = odd.words
+                raise SceneError(
+                    f"{what} leaves the bin at {times[some[pose]]:.3f} s: {'xyz'[axis]} = {at:.4f} m, "
+                    f"allowed {allowed} below the surface; {remedy}"
+                )
 
 
 # --- Further bodies -------------------------------------------------------------------------------------

@@ -14,18 +14,14 @@ import numpy as np
 from .bed import Bed, digest
 from .bodies import Axle, Cylinder, MeshBody, Tool
 from .material import Material
-from .motions import Other
+from .motions import Moved, Other, as_path
 from .poses import (
     in_body_frame,
-    in_world_frame,
-    rotate,
     rotation_matrices,
-    rotation_vectors,
-    sampled_poses,
 )
 from .settings import Settings, build, setting, settings, short
 from .state import SceneError, Soil
-from .tool_geometry import HOLDS, distances, odd_size, place_unit, thickening
+from .tool_geometry import HOLDS, distances, odd_size, thickening
 
 MOST_FRAMES = 1_000_000
 MOST_COURANT = 0.8
@@ -36,41 +32,16 @@ REMAP_TIME, VELOCITY_MEMORY = 4.0e-3, 0.1
 """`remap_time` and `velocity_memory` by default, in the default sand on Earth [s]; elsewhere they are the same shares
 of sqrt(d / g), the time in which a grain falls its own size, so that similar scenes have similar answers."""
 
-_ROUNDING = 1e-9
-"""Lengths that differ by less are the same [m]."""
-_MOST_POSES, _MOST_POINTS = 100_000, 1_000_000
-"""That are looked at for walls in a way, and at a time."""
-
-
 _FREE = ("headroom", "store_every", "initial_stress", "surface")
 """Keys of a bed that may be others than in the run to start from."""
 _SAME_PLACE = 0.01
 """Two places no further from each other are the same [grid spacings]."""
 AXLE_DAMPING = 5.0
 """Of a further body whose height is free, if it does not follow one that has its own [1/s]."""
-_FARTHEST = 1e13
-"""Number in a path, which may hold epoch seconds in milliseconds [s or m]."""
-
-
-def _as_path(rows: Any) -> tuple[tuple[float, ...], ...]:
-    """The rows of a path as numbers; whether they are poses is looked at where they are used."""
-    for number, row in enumerate(rows, 1):
-        if not isinstance(row, (list, tuple, np.ndarray)) or len(row) != 8:
-            raise SceneError(
-                f"row {number} of the path is {short(row)}; it needs 8 numbers: t, x, y, z, qx, qy, qz, qw"
-            )
-        for value in row:
-            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-                raise SceneError(f"row {number} of the path holds {short(value)}; allowed: numbers")
-            if _FARTHEST < abs(float(value)) < math.inf:
-                raise SceneError(
-                    f"row {number} of the path holds {value:.3g}; allowed: {-_FARTHEST:g} to {_FARTHEST:g}"
-                )
-    return tuple(tuple(float(v) for v in row) for row in rows)
 
 
 @settings
-class Scene(Settings):
+class Scene(Settings, Moved):
     """A soil bed, gravity, and for how long; subclasses add the body and its motion.
 
     A subclass with a `kind` of its own is a kind of scene that `from_dict` knows.
@@ -137,15 +108,10 @@ class Scene(Settings):
                 f"bed.surface is given, but a scene of the kind {self.kind} has a start of its own"
             )
         if self._path is not None:
-            object.__setattr__(self, "path", _as_path(self._path))
+            object.__setattr__(self, "path", as_path(self._path))
         for number, one in enumerate(self.others):
             if one.motion != "follow":  # what is followed is not known yet
                 Companion(self, number)
-
-    @property
-    def _path(self) -> tuple[tuple[float, ...], ...] | None:
-        """The setting `path` of the kinds of scenes that have it."""
-        return getattr(self, "path", None)
 
     # --- what a solver or a rollout asks of a scene -------------------------------------------------------
 
@@ -295,11 +261,6 @@ class Scene(Settings):
         return first + np.random.default_rng(0).integers(np.minimum(every, count - first))
 
     @property
-    def open_sides(self) -> bool:
-        """Whether nothing is in the way of a body at the sides: walls of a channel stand for more of the same soil."""
-        return self.bed.walls.conditions[1] in ("slip", "periodic")
-
-    @property
     def soil_volume(self) -> float:
         """Space that the soil takes up at the start [m^3]."""
         return self.bed.soil_volume
@@ -309,11 +270,6 @@ class Scene(Settings):
         if self.soil is not None:
             return np.delete(self.soil.particles["velocity"], self.displaced, axis=0)
         return np.zeros_like(self.initial_positions())
-
-    @property
-    def body(self) -> Tool | None:
-        """The rigid body that touches the soil, if any."""
-        return None
 
     @property
     def mesh(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -329,80 +285,6 @@ class Scene(Settings):
     def companions(self) -> list[Companion]:
         """The further bodies, each seen as a scene of its own."""
         return [Companion(self, number) for number in range(len(self.others))]
-
-    @property
-    def frame_count(self) -> int:
-        """T, with the initial state as frame 0."""
-        return round(self.duration * self.frame_rate) + 1
-
-    def times(self) -> np.ndarray:
-        """Times of the frames [s], shape (T,)."""
-        return np.arange(self.frame_count) / self.frame_rate
-
-    def poses_at(self, time: np.ndarray) -> np.ndarray:
-        """Pose of the body at any times [s]: centre of mass [m] and quaternion x, y, z, w; shape (T, 7).
-
-        Of a body with a free height the z of the start, which the solver replaces.
-        """
-        if self._path is not None:
-            poses = sampled_poses(np.asarray(self._path), np.atleast_1d(np.asarray(time, dtype=float)))
-            if self.body is not None and (point := self.body.path_point).any():
-                poses[:, :3] -= rotate(poses[:, 3:], point)
-            return poses
-        return np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(np.atleast_1d(time)), 1))
-
-    def body_poses(self) -> np.ndarray:
-        """Poses at the frames, shape (T, 7)."""
-        return self.poses_at(self.times())
-
-    def path_times(self) -> np.ndarray:
-        """Times at which a prescribed path may turn [s], increasing, shape (k,); none for a smooth motion."""
-        return np.array([row[0] for row in self._path or ()])
-
-    def _with_turns(self, time: np.ndarray) -> np.ndarray:
-        """Increasing times [s] with those between the first and the last at which a path may turn."""
-        rows = self.path_times()
-        return np.union1d(time, rows[(rows > time[0]) & (rows < time[-1])])
-
-    def displacement(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the body's centre travels [m] and by what angle the body turns [rad] from each of the increasing times
-        (T,) [s] to the next, both of shape (T - 1,).
-
-        A path counts row by row, whatever it comes back to; between rows, and without any, a body turns the shortest
-        way.
-        """
-        every = self._with_turns(time)
-        poses = self.poses_at(every)
-        way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
-        angle = np.linalg.norm(rotation_vectors(poses[:-1, 3:], poses[1:, 3:]), axis=1)
-        first = np.searchsorted(every, time[:-1])
-        return np.add.reduceat(way, first), np.add.reduceat(angle, first)
-
-    def largest_displacement(self, time: np.ndarray) -> np.ndarray:
-        """The most that any point of the body travels from each of the increasing times (T,) [s] to the next [m],
-        shape (T - 1,)."""
-        way, angle = self.displacement(time)
-        return way + angle * (self.body.reach if self.body is not None else 0.0)
-
-    def passing_times(self) -> np.ndarray:
-        """Times of the frames and between them [s], so close that no point of the body moves more than a grid spacing
-        from one to the next; of a very long way less close."""
-        times = self._with_turns(self.times())
-        way = self.largest_displacement(times)
-        steps = np.maximum(1.0, np.ceil(way / max(self.bed.spacing, way.sum() / _MOST_POSES)))
-        ends = np.concatenate([[0.0], np.cumsum(steps)])
-        return np.interp(np.arange(ends[-1] + 1.0), ends, times)
-
-    def lowest_points(self, poses: np.ndarray) -> np.ndarray:
-        """z of the body's lowest point at poses (T, 7) [m], shape (T,)."""
-        assert self.body is not None
-        outline, up = self.body.outline(), rotation_matrices(poses[:, 3:])[:, 2]
-        parts = np.array_split(up, 1 + len(up) * len(outline) // _MOST_POINTS)
-        return poses[:, 2] + np.concatenate([(part @ outline.T).min(axis=1) for part in parts])
-
-    def body_points(self) -> np.ndarray:
-        """Body nodes in the body frame [m], shape (M, 3)."""
-        return self.body.points() if self.body is not None else np.zeros((0, 3))
 
     def initial_positions(self) -> np.ndarray:
         """Soil at time 0 [m], shape (n, 3), float64."""
@@ -466,8 +348,6 @@ class Scene(Settings):
                 )
         return build(Scene.classes[kind], data, "scene")
 
-    # --- checks for scenes with a body --------------------------------------------------------------------
-
     def _check_thickness(self, body: Tool, what: str) -> None:
         """A body must be thick enough for soil to be inside before it is pushed out."""
         if body.half_thickness + self.contact_distance < HOLDS * self.bed.spacing:
@@ -477,33 +357,6 @@ class Scene(Settings):
                 f"{what} of {2.0 * body.half_thickness:g} m is too thin for a grid of {self.bed.spacing:g} m: "
                 f"soil would pass through; {remedy}"
             )
-
-    def _check_inside(self, body: Tool, what: str, remedy: str) -> None:
-        """The part of the body that is below the surface must stay within the bin."""
-        lx, ly, lz = self.bed.size
-        side = math.inf if self.open_sides else 0.0
-        low, high = np.array([0.0, -side, -lz]) - _ROUNDING, np.array([lx, ly + side, math.inf]) + _ROUNDING
-        times = self.passing_times()
-        poses, outline = self.poses_at(times), body.outline()
-        place, around = poses[:, :3], np.abs(rotation_matrices(poses[:, 3:])) @ body.half_size
-        leaving = ((place - around < low) | (place + around > high)).any(axis=1)
-        maybe = np.flatnonzero(leaving & (place[:, 2] < around[:, 2]))
-        for some in np.array_split(maybe, 1 + len(maybe) * len(outline) // _MOST_POINTS):
-            points = in_world_frame(poses[some], outline)
-            outside = ((points < low) | (points > high)) & (points[:, :, 2:] < 0.0)
-            if outside.any():
-                pose = int(np.argmax(outside.any(axis=(1, 2))))
-                axis = int(np.argmax(outside[pose].any(axis=0)))
-                at = points[pose, np.argmax(outside[pose, :, axis]), axis]
-                allowed = (f"0 to {lx:g} m", f"0 to {ly:g} m", f"at least {-lz:g} m")[axis]
-                if self._path and (unit := place_unit(np.array(self._path)[:, 1:4], self.bed.size)):
-                    remedy = f"the path's positions look like {unit} and are taken as metres"
-                elif odd := odd_size(body, self.bed.size, self.open_sides):
-                    remedy = odd.words
-                raise SceneError(
-                    f"{what} leaves the bin at {times[some[pose]]:.3f} s: {'xyz'[axis]} = {at:.4f} m, "
-                    f"allowed {allowed} below the surface; {remedy}"
-                )
 
 
 class Companion(Scene):
@@ -517,7 +370,7 @@ class Companion(Scene):
         self.__dict__.update({one.name: getattr(scene, one.name) for one in fields(Scene)}, others=())
         self.scene, self.settings, self.place = scene, scene.others[number], f"scene.others[{number}]"
         if self.settings.path is not None:
-            self._rows = _as_path(self.settings.path)
+            self._rows = as_path(self.settings.path)
         if self.settings.motion == "follow" and scene.body is None:
             raise SceneError(f"{self.place} has nothing to follow: a scene of kind {scene.kind} has no body")
         if self.settings.load is not None and not self.gravity > 0:

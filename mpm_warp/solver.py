@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import islice, repeat
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from .kernels.fluidity import soil_parameters
 from .kernels.grid import GhostNodes, adding_up, ghost_kernels, grid_step, particle_struct
 from .kernels.nonlocal_fluidity import nonlocal_launches, wall_sink
 from .kernels.transfer import transfer
-from .launch import Executor, Job, Launch, Program, SideBySide, Threads, find_device
+from .launch import Executor, Job, Launch, Program, SideBySide, Threads, find_device, run_concurrently
 from .limits import PhysicalLimits, require_memory, steps_to_remap, substeps_per_frame, top_body_speed
 from .poses import rotate
 from .rigid_body import RigidBody
@@ -519,36 +519,6 @@ def frames_together(
 
     each = repeat(effects) if effects is None or isinstance(effects, Effects) else effects
     return run_concurrently(map(frames, scenes, each), at_once, device)
-
-
-def run_concurrently(
-    tasks: Iterable[Generator[Any, None, None]], at_once: int, device: str
-) -> Iterator[tuple[int, Any]]:
-    """Advances `at_once` of the generators side by side, the next one as soon as one has ended.
-
-    Yields:
-        A task's number and what it yielded, unless that was a job. Jobs are run when all tasks have asked for one.
-    """
-    executor = Executor(find_device(device))
-    waiting = enumerate(tasks)
-    running = list(islice(waiting, at_once))
-    try:
-        while running:
-            jobs: list[Job] = []
-            while len(jobs) < len(running):
-                place = len(jobs)
-                number, task = running[place]
-                item = next(task, None)
-                if isinstance(item, Job):
-                    jobs.append(item)
-                elif item is not None:
-                    yield number, item
-                else:
-                    running[place : place + 1] = islice(waiting, 1)
-            executor.run(jobs)
-    finally:
-        for _, task in running:
-            task.close()
 
 
 def _with_arrays(struct: Any, device: wp.Device, **given: int | np.ndarray) -> Any:

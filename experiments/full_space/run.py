@@ -33,8 +33,15 @@ from torch import Tensor
 
 from sgns.data.dataset import Dataset
 from sgns.data.run import Run
-from sgns.evaluate.costs import forget_peak, full_space_cost, peak_memory
-from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
+from sgns.evaluate.costs import forget_peak, peak_memory
+from sgns.evaluate.full_space import (
+    FullSpaceDynamics,
+    FullSpaceRun,
+    FullSpaceWindows,
+    box_surface,
+    full_space_cost,
+    losses,
+)
 from sgns.evaluate.metrics import VectorErrors, mean_prediction, skill
 from sgns.model.dynamics import Standardiser
 from sgns.model.features import BodyTrack

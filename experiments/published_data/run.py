@@ -28,7 +28,7 @@ import torch
 from common import training_settings, write_rows
 
 from sgns.data.published import published_dataset
-from sgns.evaluate.published import scored
+from sgns.evaluate.command import scored
 from sgns.evaluate.results import aggregate
 from sgns.reduction.reduce import ReducedDataset, ReducedRun
 from sgns.rollout import single_thread

@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sgns import Run
-from sgns.render import moving_picture
+from sgns.plot import moving_picture
 
 HERE = Path(__file__).resolve().parent
 RUN = "0024_motion-curved_rake-3.8_depth-0.08_speed-0.04.h5"

@@ -24,7 +24,7 @@ from torch import Tensor
 from mpm_warp.poses import in_world_frame
 from mpm_warp.settings import short_repr
 from sgns.config import UserError
-from sgns.data.run import Surface, soil_surface
+from sgns.data.surface import Surface, soil_surface
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step
 from sgns.model.features import ToolMotion, context_of, markers

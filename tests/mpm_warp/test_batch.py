@@ -23,8 +23,7 @@ from mpm_warp import (
     frames_together,
 )
 from mpm_warp import launch as work_module
-from mpm_warp.launch import BatchedLaunch, Job, Launch, Program
-from mpm_warp.solver import run_concurrently
+from mpm_warp.launch import BatchedLaunch, Job, Launch, Program, run_concurrently
 from sgns_testing.scenes import UNDAMPED, block, cut
 from sgns_testing.solvers import assert_same_frames
 

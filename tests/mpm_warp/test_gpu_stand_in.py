@@ -30,14 +30,15 @@ def one_more(i: int, a: wp.array(dtype=float)):
     a[i] = a[i] + 1.0
 
 
-def small_cut():
-    """280 particles, with the blade in the soil."""
+def small_cut(duration):
+    """280 particles, with the blade in the soil; one frame."""
     return cut(
         bed=Bed(size=(0.28, 0.2, 0.1), spacing=0.02, particles_per_cell=0.4, headroom=0.08),
         blade=Plate(length=0.1, width=0.1, thickness=0.044, edge="square"),
         clearance=0.0,
         depth=0.03,
-        duration=1.0 / 60.0,
+        duration=duration,
+        frame_rate=1.0 / duration,
         start=0.4,
     )
 
@@ -66,7 +67,7 @@ def test_no_two_items_of_a_launch_meet_but_in_atomic_sums():
     found = {}
     for atomic in (True, False):
         with on_stand_in(Checked(atomic=atomic)) as checked:
-            *_, frame = Solver(small_cut()).frames()
+            *_, frame = Solver(small_cut(1.0 / 240.0)).frames()
         assert abs(frame.force[0]) > 0.1
         found[atomic] = {report.kernel: report for report in checked.reports()}
     assert len(found[True]) == len(found[False]) == 7
@@ -76,9 +77,9 @@ def test_no_two_items_of_a_launch_meet_but_in_atomic_sums():
 
 @pytest.mark.long
 def test_threads_agree_with_the_loop():
-    *_, one = Solver(small_cut()).frames()
+    *_, one = Solver(small_cut(1.0 / 60.0)).frames()
     with on_stand_in(Threads()) as threads:
-        *_, two = Solver(small_cut()).frames()
+        *_, two = Solver(small_cut(1.0 / 60.0)).frames()
     assert threads.launches > 100
     # Fused products and another order of sums: 4e-6 m in longer runs; sums that are not atomic: 2e-4 m.
     assert abs(one.position - two.position).max() < 1e-5

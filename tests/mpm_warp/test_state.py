@@ -24,8 +24,8 @@ from mpm_warp import (
     Walls,
     Wheel,
 )
+from mpm_warp.launch import run_concurrently
 from mpm_warp.limits import PhysicalLimits
-from mpm_warp.solver import run_concurrently
 from sgns_testing.scenes import UNDAMPED, block, cut
 from sgns_testing.solvers import assert_same_frames, change
 

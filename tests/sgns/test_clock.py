@@ -10,7 +10,7 @@ import torch
 
 from mpm_warp import Effects
 from sgns.data.run import Run
-from sgns.evaluate import costs as full_space_cost
+from sgns.evaluate import full_space
 from sgns.numbers import elapsed
 from sgns.simulate import workers as campaign_runs
 from sgns.simulate.run import simulate_scene
@@ -50,4 +50,4 @@ def test_a_trial_ends_and_takes_some_time(tmp_path, odd_clock, monkeypatch):
 
 
 def test_other_times_can_be_divided_by(odd_clock):
-    assert full_space_cost.wall_time(lambda: torch.zeros(1), 3) > 0.0
+    assert full_space.wall_time(lambda: torch.zeros(1), 3) > 0.0

@@ -7,7 +7,7 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
-from sgns import plot, render
+from sgns import plot
 from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.evaluate.figures import DPI, PICTURE_WIDTH
@@ -56,45 +56,45 @@ def test_a_turned_wheel_has_the_forces_and_the_torque_of_its_own_axes(tmp_path):
 
 
 def test_a_moving_picture_plays_in_real_time(run_file, tmp_path):
-    render.main(settings(run_file, output=str(tmp_path / "new.gif")))
+    plot.render(settings(run_file, output=str(tmp_path / "new.gif")))
     with Image.open(tmp_path / "new.gif") as picture:
         assert picture.n_frames == 5 and picture.info["duration"] == 50  # every third frame of 1/60 s
 
 
 def test_a_long_run_gives_a_bounded_number_of_pictures(run_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(render, "MOST_PICTURES", 4)
-    monkeypatch.setattr(render, "LONGEST", 0.02)
+    monkeypatch.setattr(plot, "MOST_PICTURES", 4)
+    monkeypatch.setattr(plot, "LONGEST", 0.02)
     with Run(run_file) as run:
-        assert render.moving_picture({"run": run}, tmp_path / "a.gif") == pytest.approx(4 / 60 / 0.02)
+        assert plot.moving_picture({"run": run}, tmp_path / "a.gif") == pytest.approx(4 / 60 / 0.02)
     with Image.open(tmp_path / "a.gif") as picture:
         assert picture.n_frames == 4
 
 
 def test_a_moving_picture_leaves_out_pictures_to_be_small(tmp_path, monkeypatch):
     noise = [Image.effect_noise((60, 40), 90.0) for _ in range(16)]
-    render.write_gif(noise, tmp_path / "all.gif", 50)
-    monkeypatch.setattr(render, "MOST_BYTES", (tmp_path / "all.gif").stat().st_size // 3)
-    render.write_gif(noise, tmp_path / "some.gif", 50)
+    plot.write_gif(noise, tmp_path / "all.gif", 50)
+    monkeypatch.setattr(plot, "MOST_BYTES", (tmp_path / "all.gif").stat().st_size // 3)
+    plot.write_gif(noise, tmp_path / "some.gif", 50)
     with Image.open(tmp_path / "some.gif") as picture:
         assert picture.n_frames == 4 and picture.info["duration"] == 200
-    assert (tmp_path / "some.gif").stat().st_size <= render.MOST_BYTES
+    assert (tmp_path / "some.gif").stat().st_size <= plot.MOST_BYTES
 
 
-@pytest.mark.parametrize(("command", "suffix"), [(plot, "png"), (render, "gif")])
+@pytest.mark.parametrize(("command", "suffix"), [(plot.main, "png"), (plot.render, "gif")])
 def test_a_picture_is_replaced_only_if_asked(run_file, command, suffix):
     picture = run_file.with_suffix(f".{suffix}")
     picture.write_text("mine")
     with pytest.raises(UserError, match=r"there already; .* overwrite=true"):
-        command.main(settings(run_file))
+        command(settings(run_file))
     assert picture.read_text() == "mine"
-    command.main(settings(run_file, overwrite=True))
+    command(settings(run_file, overwrite=True))
     with pytest.raises(UserError, match=rf"a \.{suffix} file: output=x\.{suffix}"):
-        command.main(settings(run_file, output="x.jpg"))
+        command(settings(run_file, output="x.jpg"))
     with pytest.raises(UserError):
-        command.main(settings("."))
+        command(settings("."))
 
 
-@pytest.mark.parametrize("command", [plot, render])
+@pytest.mark.parametrize("command", [plot.main, plot.render])
 def test_a_run_that_is_not_finite_is_refused(tmp_path, command):
     import h5py
 
@@ -102,7 +102,7 @@ def test_a_run_that_is_not_finite_is_refused(tmp_path, command):
     with h5py.File(file, "r+") as content:
         content["particles/soil/position/value"][0, 3] = np.nan
     with pytest.raises(UserError, match=r"frame 0 is not finite; `sgns check"):
-        command.main(settings(file))
+        command(settings(file))
 
 
 def test_the_commands_take_plain_paths(run_file, tmp_path):

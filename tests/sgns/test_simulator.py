@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sgns.config import UserError
-from sgns.data.run import soil_surface
+from sgns.data.surface import soil_surface
 from sgns.simulator import Simulator
 from sgns_testing.commands import python
 from sgns_testing.tiny import MODEL, POLYNOMIAL

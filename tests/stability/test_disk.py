@@ -7,6 +7,7 @@ permits it. With space again, the same command goes on to the result of one that
 """
 
 import errno
+import json
 import os
 import shutil
 import subprocess
@@ -19,6 +20,7 @@ from pathlib import Path
 import pytest
 from kills import broken, same
 
+from sgns.data.dataset import Dataset
 from sgns.data.files import whole_file, write_whole
 from sgns.evaluate.command import read_log
 from sgns.reduction.reduce import reduce_dataset
@@ -114,44 +116,46 @@ def test_an_error_of_the_disk_names_the_file(tmp_path) -> None:
 # --- folders that cannot be written -----------------------------------------------------------------------
 
 ORDINARY = """
-import sys
+import json, sys
+from sgns_testing.commands import call
 from sgns_testing.permissions import become_ordinary
-from sgns.cli import main
 become_ordinary()
-sys.exit(main())
+for arguments in json.loads(sys.argv[1]):
+    done = call(*arguments)
+    print(json.dumps([done.returncode, done.stderr]))
 """
+UNWRITABLE = [
+    (["simulate", *SMALL, "output={}/run.h5"], "cannot write"),
+    (["simulate", *CAMPAIGN, "dataset.path={}/new"], "cannot write"),
+    (["train", "dataset.path={}/data", *NETWORK, "output={}/out"], "choose another output"),
+]
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="permissions differ")
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["simulate", *SMALL, "output={}/run.h5"], "cannot write"),
-        (["simulate", *CAMPAIGN, "dataset.path={}/new"], "cannot write"),
-        (["train", "dataset.path={}/data", *NETWORK, "output={}/out"], "choose another output"),
-    ],
-)
-def test_folders_that_may_not_be_written(arguments, words, tmp_path) -> None:
+def test_folders_that_may_not_be_written(tmp_path) -> None:
     make_dataset(tmp_path / "data")
     before = files(tmp_path)
     tmp_path.chmod(0o555)
-    done = python(ORDINARY, *(argument.replace("{}", str(tmp_path)) for argument in arguments))
+    commands = [[word.replace("{}", str(tmp_path)) for word in arguments] for arguments, _ in UNWRITABLE]
+    done = python(ORDINARY, json.dumps(commands))
     tmp_path.chmod(0o755)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1, (done.returncode, done.stdout, done.stderr)
-    assert words in done.stderr and files(tmp_path) == before
+    for line, (_, words) in zip(done.stdout.splitlines(), UNWRITABLE, strict=True):
+        status, said = json.loads(line)
+        assert status == 2 and said.count("\n") == 1 and words in said, (words, line)
+    assert (done.returncode, done.stderr) == (0, "") and files(tmp_path) == before
 
 
 # --- the clock --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("days", [-1.0, 1000.0])
-def test_a_clock_that_is_set(days, tmp_path, monkeypatch) -> None:
-    """Between two parts of a training; the files it finds are then of tomorrow, or years old."""
-    data = make_dataset(tmp_path / "data")
+def train_tiny(folder: Path, output: Path) -> None:
+    found = reduce_dataset(Dataset.open(folder / "data"), REDUCTION, progress=False)
+    train(found, num_modes=4, model=MODEL, training=TRAINING, output=output, seed=1)
 
-    def run(output: Path, **changes) -> None:
-        found = reduce_dataset(data, REDUCTION, progress=False)
-        train(found, num_modes=4, model=MODEL, training=TRAINING | changes, output=output, seed=1)
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset, a whole training, and parts of the same that was interrupted."""
 
     class Interrupted(Exception):
         pass
@@ -160,15 +164,24 @@ def test_a_clock_that_is_set(days, tmp_path, monkeypatch) -> None:
         if trainer.global_step == 13:
             raise Interrupted
 
-    run(tmp_path / "whole")
-    with monkeypatch.context() as patch, pytest.raises(Interrupted):
+    folder = tmp_path_factory.mktemp("interrupted")
+    make_dataset(folder / "data")
+    train_tiny(folder, folder / "whole")
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Interrupted):
         patch.setattr("sgns.train.validation.StepProgress.on_train_batch_end", stop)
-        run(tmp_path / "parts")
+        train_tiny(folder, folder / "parts")
+    return folder
+
+
+@pytest.mark.parametrize("days", [-1.0, 1000.0])
+def test_a_clock_that_is_set(days, interrupted, tmp_path, monkeypatch) -> None:
+    """Between two parts of a training; the files it finds are then of tomorrow, or years old."""
+    shutil.copytree(interrupted, tmp_path, dirs_exist_ok=True)
     now = time.time
     monkeypatch.setattr(time, "time", lambda: now() + 86400.0 * days)
     for file in tmp_path.glob("data/**/*"):
         os.utime(file, (now() - 86400.0 * days,) * 2)
-    run(tmp_path / "parts")
+    train_tiny(tmp_path, tmp_path / "parts")
     assert same(tmp_path / "whole", tmp_path / "parts")
     for name, points in read_log(tmp_path / "parts" / "tensorboard").items():
         assert (points[1:, 0] > points[:-1, 0]).all(), name

@@ -30,7 +30,7 @@ class Command(NamedTuple):
     """One command.
 
     Attributes:
-        module: whose `main(cfg)` does it.
+        module: whose `main(cfg)` does it, or the `function` named below.
         summary: a line of help.
         output: what its `output` is: "file", "folder", or None where it has none.
         needs: dotted keys of paths that it cannot do without.
@@ -38,7 +38,8 @@ class Command(NamedTuple):
             `overwrite=true`. None where finished work is kept and gone on from; files of output are looked after by
             the command, once it knows that the other settings are good.
         plain: keys that may be given as plain paths, in this order.
-        value: what `main` returns, as a column of a sweep's table.
+        value: what that function returns, as a column of a sweep's table.
+        function: of the module.
     """
 
     module: str
@@ -48,6 +49,7 @@ class Command(NamedTuple):
     result: str | None = None
     plain: tuple[str, ...] = ()
     value: str | None = None
+    function: str = "main"
 
 
 COMMANDS = {
@@ -91,7 +93,14 @@ COMMANDS = {
     ),
     "check": Command("sgns.data.check", "read run files through and list what is wrong with them", None),
     "plot": Command("sgns.plot", "one picture of a run", "file", ("run",), plain=("run", "output")),
-    "render": Command("sgns.render", "a moving picture of a run", "file", ("run",), plain=("run", "output")),
+    "render": Command(
+        "sgns.plot",
+        "a moving picture of a run",
+        "file",
+        ("run",),
+        plain=("run", "output"),
+        function="render",
+    ),
 }
 
 
@@ -183,7 +192,7 @@ def run_command(cfg: DictConfig) -> float | None:
         check_shared(cfg, name, COMMANDS[name].needs)
         if (result := COMMANDS[name].result) is not None:
             require_new(Path(cfg.output) / result, cfg.overwrite)
-        return importlib.import_module(COMMANDS[name].module).main(cfg)
+        return getattr(importlib.import_module(COMMANDS[name].module), COMMANDS[name].function)(cfg)
     except KeyboardInterrupt as stop:
         kept = _drop_empty_output(hydra_cfg)
         said = stop.said if isinstance(stop, Interrupted) else ""

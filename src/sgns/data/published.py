@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from mpm_warp.inputs import open_file
+from mpm_warp.mesh_files import open_file
 from mpm_warp.poses import fitted_poses
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS

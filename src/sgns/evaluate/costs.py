@@ -8,28 +8,23 @@ import math
 import os
 import platform
 import shlex
-import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import fields
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from mpm_warp import Effects, Scene, SceneError, Solver, SolverStopped
 from mpm_warp.limits import usable_cores
 from sgns import __version__
 from sgns.data.run import Run
-from sgns.evaluate.full_space import FullSpaceDynamics, FullSpaceRun, FullSpaceWindows, box_surface, losses
-from sgns.evaluate.results import Costs, FullSpaceCost
+from sgns.evaluate.results import Costs
 from sgns.model.checkpoint import SUMMARY, load_surrogate, read_summary
 from sgns.numbers import elapsed
-from sgns.rollout import single_thread
-from sgns.settings import ModelSettings
 from sgns.simulator import Simulator
 
 log = logging.getLogger(__name__)
@@ -139,58 +134,3 @@ def solver_rates(run: Run) -> Iterator[float]:
             yield elapsed(began, time.perf_counter()) * scene.frame_rate / SOLVER_FRAMES
     except (SceneError, SolverStopped, KeyError, TypeError, StopIteration) as error:
         log.info("the solver cannot be timed on %s: %s", run.path.name, error)
-
-
-# --- What the same network would cost on every particle: the paper's comparison, measured on this machine
-# Costs do not depend on what a network has learned, so an untrained one is timed.
-
-_BATCH = 2  # windows of a training step, the paper's
-_REACH = 4 / 3  # radius of the neighbourhood in particle spacings: 6 neighbours in a bed at rest
-
-
-def full_space_cost(path: Path, settings: ModelSettings, repeats: int) -> FullSpaceCost:
-    """Time and memory of a step, with the tool half-way along a run; medians of repeats after one to warm up.
-
-    The network's body has nodes on its surface whatever `body_nodes` says.
-    """
-    with Run(path) as run:
-        spacing = float(np.prod(run.scene["bed"]["size"]) / run.particle_count) ** (1 / 3)
-        blade = run.scene.get("blade")
-    # Nodes of a blade as close together as particles, so that none slips between them; of other bodies as recorded.
-    nodes = None
-    if blade is not None:
-        nodes = box_surface(np.array([blade["thickness"], blade["width"], blade["length"]]) / 2, spacing)
-    one_run = FullSpaceRun(path, nodes)
-    dynamics = FullSpaceDynamics(replace(settings, body_nodes="points"), _REACH * spacing, one_run.bin_size)
-    windows = FullSpaceWindows([one_run], dynamics.history)
-    window = windows.window(len(windows) // 2)
-    still = torch.zeros(3, dtype=torch.float64)
-
-    def training_step() -> None:
-        dynamics.zero_grad()
-        acceleration, force = losses(dynamics, windows.batch(0, _BATCH, still))
-        (acceleration + force).backward()
-
-    with single_thread():
-        with torch.inference_mode():
-            frame = wall_time(lambda: dynamics.advance(window.history, window.body), repeats)
-        forget_peak()
-        step = wall_time(training_step, repeats)
-    return FullSpaceCost(
-        parameters=sum(weight.numel() for weight in dynamics.parameters()),
-        training_step=step,
-        batch_size=_BATCH,
-        rollout=frame * one_run.frame_rate,
-        peak_bytes=peak_memory(),
-    )
-
-
-def wall_time(action: Callable[[], object], repeats: int) -> float:
-    """Median after one call to warm up [s]."""
-    action()
-    found = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        action()
-        found.append(elapsed(began, time.perf_counter()))
-    return statistics.median(found)

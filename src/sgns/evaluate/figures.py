@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
 
 from mpm_warp.motions import sinkage
-from sgns.data.run import SurfaceGrid, height_map, particle_spacing
+from sgns.data.surface import SurfaceGrid, height_map, particle_spacing
 from sgns.evaluate.metrics import (
     NEGLIGIBLE_SHARE,
     ParticleErrors,

@@ -5,7 +5,10 @@ Letters: B batch, d history positions, n particles, N body nodes, V = n + N node
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,9 +21,13 @@ from torch.nn.functional import pad
 from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
 from sgns.data.run import Run
+from sgns.evaluate.costs import forget_peak, peak_memory
+from sgns.evaluate.results import FullSpaceCost
 from sgns.model.dynamics import Standardiser
 from sgns.model.features import BodyTrack, body_track
 from sgns.model.network import EncodeProcessDecode
+from sgns.numbers import elapsed
+from sgns.rollout import single_thread
 from sgns.settings import ModelSettings
 from sgns.train.windows import random_walk
 
@@ -239,3 +246,58 @@ def losses(dynamics: FullSpaceDynamics, batch: FullSpaceBatch) -> tuple[Tensor, 
     acceleration = predicted - dynamics.acceleration.normalise(batch.acceleration)
     force = dynamics.force.normalise(forces.sum(-2)) - dynamics.force.normalise(batch.force)
     return acceleration.square().sum(-1).mean(), force.square().sum(-1).mean()
+
+
+# --- What the same network would cost on every particle: the paper's comparison, measured on this machine
+# Costs do not depend on what a network has learned, so an untrained one is timed.
+
+_BATCH = 2  # windows of a training step, the paper's
+_REACH = 4 / 3  # radius of the neighbourhood in particle spacings: 6 neighbours in a bed at rest
+
+
+def full_space_cost(path: Path, settings: ModelSettings, repeats: int) -> FullSpaceCost:
+    """Time and memory of a step, with the tool half-way along a run; medians of repeats after one to warm up.
+
+    The network's body has nodes on its surface whatever `body_nodes` says.
+    """
+    with Run(path) as run:
+        spacing = float(np.prod(run.scene["bed"]["size"]) / run.particle_count) ** (1 / 3)
+        blade = run.scene.get("blade")
+    # Nodes of a blade as close together as particles, so that none slips between them; of other bodies as recorded.
+    nodes = None
+    if blade is not None:
+        nodes = box_surface(np.array([blade["thickness"], blade["width"], blade["length"]]) / 2, spacing)
+    one_run = FullSpaceRun(path, nodes)
+    dynamics = FullSpaceDynamics(replace(settings, body_nodes="points"), _REACH * spacing, one_run.bin_size)
+    windows = FullSpaceWindows([one_run], dynamics.history)
+    window = windows.window(len(windows) // 2)
+    still = torch.zeros(3, dtype=torch.float64)
+
+    def training_step() -> None:
+        dynamics.zero_grad()
+        acceleration, force = losses(dynamics, windows.batch(0, _BATCH, still))
+        (acceleration + force).backward()
+
+    with single_thread():
+        with torch.inference_mode():
+            frame = wall_time(lambda: dynamics.advance(window.history, window.body), repeats)
+        forget_peak()
+        step = wall_time(training_step, repeats)
+    return FullSpaceCost(
+        parameters=sum(weight.numel() for weight in dynamics.parameters()),
+        training_step=step,
+        batch_size=_BATCH,
+        rollout=frame * one_run.frame_rate,
+        peak_bytes=peak_memory(),
+    )
+
+
+def wall_time(action: Callable[[], object], repeats: int) -> float:
+    """Median after one call to warm up [s]."""
+    action()
+    found = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        action()
+        found.append(elapsed(began, time.perf_counter()))
+    return statistics.median(found)

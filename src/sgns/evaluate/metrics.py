@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 from mpm_warp.motions import along_and_across
 from mpm_warp.settings import short_repr
 from sgns.config import UserError
-from sgns.data.run import SurfaceGrid, frame_chunks, height_map
+from sgns.data.run import frame_chunks
+from sgns.data.surface import SurfaceGrid, height_map
 from sgns.model.features import is_wheel
 
 

@@ -16,7 +16,8 @@ from jinja2 import Environment, PackageLoader
 from matplotlib.figure import Figure
 
 from sgns.data.files import whole_file, write_whole
-from sgns.data.run import Run, surface_grid
+from sgns.data.run import Run
+from sgns.data.surface import surface_grid
 from sgns.evaluate.figures import (
     energy_figure,
     error_panels,

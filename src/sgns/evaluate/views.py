@@ -19,7 +19,8 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 
-from sgns.data.run import Run, frame_chunks, particle_spacing
+from sgns.data.run import Run, frame_chunks
+from sgns.data.surface import particle_spacing
 from sgns.evaluate.body_shape import (
     CUBE,
     DepthBuffer,

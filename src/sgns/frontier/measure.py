@@ -20,7 +20,8 @@ from mpm_warp import Scene, Solver, SolverStopped
 from sgns.config import UserError
 from sgns.data.dataset import Dataset
 from sgns.data.files import file_lock
-from sgns.data.run import Run, surface_grid
+from sgns.data.run import Run
+from sgns.data.surface import surface_grid
 from sgns.evaluate.command import roll_out, training_means
 from sgns.evaluate.costs import network_costs
 from sgns.evaluate.metrics import body_errors, position_errors

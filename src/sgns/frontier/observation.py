@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from mpm_warp import Scene
 from sgns.config import UserError
 from sgns.data.files import read_arrays, whole_file
-from sgns.data.run import SurfaceGrid, height_map
+from sgns.data.surface import SurfaceGrid, height_map
 from sgns.evaluate.metrics import VectorErrors, height_error, rms_mm
 from sgns.numbers import require_shapes
 

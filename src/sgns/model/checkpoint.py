@@ -7,6 +7,7 @@ import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import torch
@@ -18,14 +19,16 @@ from sgns.data.files import read_json, whole_file
 from sgns.data.run_file import require_mesh_was_read
 from sgns.model.dynamics import Dynamics
 from sgns.model.features import slowest_travel
-from sgns.model.network_dynamics import LatentDynamics
-from sgns.model.polynomial import PolynomialDynamics
 from sgns.model.training_range import TrainingRange
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset
 
-DYNAMICS: dict[str, type[Dynamics]] = {"network": LatentDynamics, "polynomial": PolynomialDynamics}
-"""Every kind of latent dynamics, by `model.kind`."""
+DYNAMICS = {
+    "network": "sgns.model.network_dynamics:LatentDynamics",
+    "polynomial": "sgns.model.polynomial:PolynomialDynamics",
+}
+"""Every kind of latent dynamics, by `model.kind`. Loaded is that of the checkpoint only: torch-geometric, which
+networks need, takes seconds."""
 
 # A checkpoint is laid out as Lightning's `.ckpt` and loaded with `weights_only`: tensors in its state dict (weights,
 # normalisation, basis, common start, body points) and plain Python values, the card, as its hyperparameters. A
@@ -191,7 +194,8 @@ def load_surrogate(path: str | Path) -> Surrogate:
         if not isinstance(scene := card["scene"], dict) or not isinstance(scene.get("bed", {}), dict):
             raise ValueError("its card does not say what the scene is")
         require_mesh_was_read(scene)
-        dynamics = DYNAMICS[card["model"]["kind"]].from_card(card, _below("dynamics.", state))
+        kind: type[Dynamics] = resolve_name(DYNAMICS[card["model"]["kind"]])
+        dynamics = kind.from_card(card, _below("dynamics.", state))
         tensors = {name: state[f"basis_{name}"] for name in ("mean", "modes", "eigenvalues")}
         basis = Basis.from_state(card["basis"] | tensors, where=str(path))
         surrogate = Surrogate(dynamics, basis, state["start_positions"], state["body_points"], card)

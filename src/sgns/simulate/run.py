@@ -13,8 +13,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mpm_warp import Effects, Scene, Soil, Solver, SolverStopped, State
-from mpm_warp.launch import Job
-from mpm_warp.solver import run_concurrently
+from mpm_warp.launch import Job, run_concurrently
 from sgns.config import Interrupted, UserError, differences, heed, held_back
 from sgns.data.run import Run
 from sgns.data.writer import RunWriter, stopped_path

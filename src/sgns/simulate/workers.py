@@ -21,9 +21,8 @@ import numpy as np
 from tqdm import tqdm
 
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
-from mpm_warp.launch import Job
+from mpm_warp.launch import Job, run_concurrently
 from mpm_warp.limits import usable_cores
-from mpm_warp.solver import run_concurrently
 from sgns.config import Interrupted, UserError, flattened, heeded_signals
 from sgns.data.files import file_lock, remove_abandoned
 from sgns.data.run import Run

@@ -15,6 +15,7 @@ import shutil
 import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -31,8 +32,6 @@ from sgns.numbers import counted, error_hint, error_words
 from sgns.reduction.reduce import ReducedDataset, reduce_dataset
 from sgns.settings import model_settings, training_settings
 from sgns.train import Fit, Task
-from sgns.train.lightning_module import NETWORK
-from sgns.train.polynomial import POLYNOMIAL
 from sgns.train.validation import quiet_writer
 
 if TYPE_CHECKING:
@@ -43,8 +42,8 @@ log = logging.getLogger(__name__)
 
 # Settings that change speed or reporting, not the result.
 _NO_MATTER = ("threads", "log_every", "resume")
-FITS: dict[str, Fit] = {"network": NETWORK, "polynomial": POLYNOMIAL}
-"""How to fit a model, by `model.kind`."""
+FITS = {"network": "sgns.train.lightning_module:NETWORK", "polynomial": "sgns.train.polynomial:POLYNOMIAL"}
+"""How to fit a model, by `model.kind`; loaded as `sgns.model.checkpoint.DYNAMICS` is."""
 
 
 def main(cfg: DictConfig) -> float:
@@ -127,7 +126,7 @@ def train(
     settings, how = model_settings(model), training_settings(model, training)
     if how.threads is not None:
         torch.set_num_threads(how.threads)
-    fit = FITS[settings.kind]
+    fit: Fit = resolve_name(FITS[settings.kind])
     validation_runs = reduced.runs("validation")
     if not validation_runs:
         log.warning("the validation split is empty; %s", fit.stand_ins_do)

@@ -68,11 +68,17 @@ def test_help_lists_every_command_quickly() -> None:
         assert f"  {name} " in result.stdout and command.summary in result.stdout
 
 
-def test_help_and_version_load_no_heavy_library() -> None:
-    code = "import sys, sgns.cli; sys.argv = ['sgns', '--help']; sgns.cli.main(); print(sorted(sys.modules))"
-    loaded = python(code).stdout
-    assert "'sgns.cli'" in loaded
+def test_only_the_libraries_that_are_needed_are_loaded() -> None:
+    code = (
+        "import sys, sgns.cli; sys.argv = ['sgns', '--help']; sgns.cli.main(); print(sorted(sys.modules))\n"
+    )
+    code += "import sgns.simulator, sgns.evaluate.command; print(sorted(sys.modules))"
+    *_, shown, loaded = python(code).stdout.splitlines()
+    assert "'sgns.cli'" in shown
     for name in ("torch", "warp", "lightning", "hydra", "h5py", "numpy"):
+        assert f"'{name}'" not in shown
+    assert "'torch'" in loaded
+    for name in ("torch_geometric", "lightning"):  # of networks and their training
         assert f"'{name}'" not in loaded
 
 

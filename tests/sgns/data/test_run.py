@@ -12,7 +12,8 @@ import pytest
 from mpm_warp.motions import Passes
 from sgns.config import UserError
 from sgns.data.check import check_run
-from sgns.data.run import Run, soil_surface
+from sgns.data.run import Run
+from sgns.data.surface import soil_surface
 from sgns_testing.runs import make_run
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from mpm_warp import Bed, Scene
 from sgns.config import UserError
-from sgns.data.run import SurfaceGrid, height_map, particle_spacing, soil_surface, surface_grid
+from sgns.data.surface import SurfaceGrid, height_map, particle_spacing, soil_surface, surface_grid
 
 
 def lattice(nx=12, ny=8, nz=4, spacing=0.05):

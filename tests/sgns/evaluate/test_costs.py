@@ -11,7 +11,8 @@ import torch
 from mpm_warp import Effects
 from sgns.data.run import Run
 from sgns.evaluate import costs
-from sgns.evaluate.costs import forget_peak, full_space_cost, network_costs, peak_memory, solver_rates
+from sgns.evaluate.costs import forget_peak, network_costs, peak_memory, solver_rates
+from sgns.evaluate.full_space import full_space_cost
 from sgns.settings import ModelSettings
 from sgns.simulate.run import simulate_scene
 from sgns_testing.runs import make_run

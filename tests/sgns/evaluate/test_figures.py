@@ -10,7 +10,8 @@ from tensorboard.summary.writer.record_writer import masked_crc32c
 from torch.utils.tensorboard import SummaryWriter
 
 from sgns.config import UserError
-from sgns.data.run import Run, particle_spacing, surface_grid
+from sgns.data.run import Run
+from sgns.data.surface import particle_spacing, surface_grid
 from sgns.evaluate import figures
 from sgns.evaluate.command import read_log
 from sgns.evaluate.figures import (

@@ -7,7 +7,7 @@ import torch
 
 from sgns.config import UserError
 from sgns.data import run as chunks
-from sgns.data.run import surface_grid
+from sgns.data.surface import surface_grid
 from sgns.evaluate.metrics import (
     PositionErrors,
     VectorErrors,

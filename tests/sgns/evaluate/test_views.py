@@ -13,7 +13,8 @@ from mpm_warp.motions import sinkage
 from mpm_warp.poses import rotation_matrices
 from mpm_warp.scenes import Excavation, Wheel
 from sgns import plot
-from sgns.data.run import Run, particle_spacing
+from sgns.data.run import Run
+from sgns.data.surface import particle_spacing
 from sgns.evaluate import figures
 from sgns.evaluate.body_shape import (
     CAMERA,

@@ -28,8 +28,9 @@ scenes:
   cut:
     scene: quick_excavation
     dataset: quick
-    cases: {deep: [scene.duration=0.1, scene.bed.spacing=0.05, scene.blade.thickness=0.12, scene.blade.edge=square,
-      scene.clearance=0]}
+    cases:
+      deep: [scene.duration=0.1, scene.bed.spacing=0.05, scene.clearance=0,
+        scene.blade.thickness=0.12, scene.blade.edge=square]
     bands: {force_nrmse: 0.2}
     reference: {label: finer, set: [scene.bed.spacing=0.04]}
     solver:

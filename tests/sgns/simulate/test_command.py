@@ -11,7 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from mpm_warp import Effects, Excavation, effects_for
-from mpm_warp.solver import run_concurrently
+from mpm_warp.launch import run_concurrently
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.files import only_here

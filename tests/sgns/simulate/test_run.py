@@ -30,7 +30,7 @@ from mpm_warp import (
     effects_for,
     mesh_files,
 )
-from mpm_warp.solver import run_concurrently
+from mpm_warp.launch import run_concurrently
 from sgns.config import Interrupted, UserError, heeded_signals
 from sgns.data.check import check_run
 from sgns.data.run import Run

@@ -217,7 +217,7 @@ def test_two_processes_may_compile_into_an_empty_cache_at_once(tmp_path):
 
 # --- campaigns that are ended ------------------------------------------------------------------------------
 
-LONG = {"depth": [0.02, 0.03], "duration": [0.1, 10.0], "speed": [0.02]}  # the long ones come first
+LONG = {"depth": [0.02, 0.03], "duration": [0.1, 6.0], "speed": [0.02]}  # the long ones come first
 MAKE = f"""
 import pathlib, sys
 from sgns.config import heeded_signals

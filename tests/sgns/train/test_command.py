@@ -30,7 +30,7 @@ from sgns.settings import TrainingSettings
 from sgns.simulator import Simulator
 from sgns.train import lightning_module as module
 from sgns.train import validation
-from sgns.train.command import FITS, main, train
+from sgns.train.command import main, train
 from sgns.train.validation import ValidationRollouts
 from sgns_testing.commands import TRAIN, environment
 from sgns_testing.tiny import BRIEF, MODEL, REDUCTION, TRAINING, make_dataset
@@ -360,46 +360,38 @@ SECOND_OF_TWO_TASKS = {
 }
 
 
-@pytest.fixture
-def begin_in_a_job(tmp_path):
-    """Begins `sgns train` in an allocation, with settings of its own."""
-    make_dataset(tmp_path / "data", frames=40)
-
-    def begin(*settings: str) -> subprocess.Popen[str]:
-        command = [
-            sys.executable,
-            "-m",
-            "sgns",
-            "train",
-            "dataset.path=data",
-            *TRAIN,
-            "output=out",
-            *settings,
-        ]
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        return subprocess.Popen(command, cwd=tmp_path, env=environment() | SECOND_OF_TWO_TASKS, **pipes)
-
-    return begin
-
-
-def test_in_an_allocation_of_several_tasks_it_is_one_process(begin_in_a_job, tmp_path) -> None:
-    process = begin_in_a_job()
-    _, said = process.communicate(timeout=100)
-    assert (process.returncode, said) == (0, "")
-    assert list((tmp_path / "out" / "tensorboard").glob("events*"))  # it also logs
+IN_A_JOB = f"""
+import sys
+from sgns.cli import main
+from sgns_testing.commands import call
+settings = ["dataset.path=data", *{TRAIN}]
+done = call("train", *settings, "output=whole")
+print(done.returncode, done.stderr, file=sys.stderr)
+sys.argv = ["sgns", "train", *settings, "output=out", "training.max_steps=1000000"]
+sys.exit(main())
+"""
 
 
 @pytest.mark.parametrize("number", [signal.SIGUSR1, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
-def test_a_cluster_s_signal_ends_it_as_ctrl_c_does(begin_in_a_job, tmp_path, number) -> None:
-    process = begin_in_a_job("training.max_steps=1000000")
+def test_in_an_allocation_of_several_tasks_it_is_one_process_that_a_signal_ends_as_ctrl_c(
+    tmp_path, number
+) -> None:
+    make_dataset(tmp_path / "data", frames=40)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(
+        [sys.executable, "-c", IN_A_JOB], cwd=tmp_path, env=environment() | SECOND_OF_TWO_TASKS, **pipes
+    )
     deadline = time.monotonic() + 60.0
     while not (tmp_path / "out" / "last.ckpt").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(number)
     _, said = process.communicate(timeout=60)
+    ended = "sgns train: interrupted; to go on, give the same command with output=out"
+    assert said == f"0 \n{ended}\n"
     assert process.returncode == 128 + number
-    assert said == "sgns train: interrupted; to go on, give the same command with output=out\n"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "out"]  # no checkpoint of Lightning's
+    assert list((tmp_path / "whole" / "tensorboard").glob("events*"))  # it also logs
+    # No checkpoint of Lightning's.
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "out", "whole"]
 
 
 def test_it_says_once_how_long_it_takes(monkeypatch, caplog) -> None:
@@ -418,7 +410,7 @@ def test_before_the_first_checkpoint_an_interruption_says_that_nothing_is_kept(
     def stop(task) -> None:
         raise Interrupted(signal.SIGTERM)
 
-    monkeypatch.setitem(FITS, "network", FITS["network"]._replace(run=stop))
+    monkeypatch.setattr(module, "NETWORK", module.NETWORK._replace(run=stop))
     with pytest.raises(Interrupted) as caught:
         run(data, tmp_path, validate_every=70)
     assert (

@@ -13,7 +13,7 @@ from sgns.config import UserError
 from sgns.model.checkpoint import load_surrogate
 from sgns.model.polynomial import PolynomialDynamics
 from sgns.settings import FitSettings, PolynomialSettings
-from sgns.train import command as module
+from sgns.train import polynomial as module
 from sgns.train.command import train
 from sgns.train.polynomial import best_polynomial
 from sgns.train.validation import ValidationRollouts
@@ -57,7 +57,7 @@ def test_what_is_written_is_what_was_fitted(data, tmp_path) -> None:
 def test_a_complete_fit_is_not_repeated(data, tmp_path, monkeypatch) -> None:
     first = run(data, tmp_path)
     with monkeypatch.context() as patch:
-        patch.setitem(module.FITS, "polynomial", module.FITS["polynomial"]._replace(run=None))
+        patch.setattr(module, "POLYNOMIAL", module.POLYNOMIAL._replace(run=None))
         assert run(data, tmp_path) == first
     with pytest.raises(UserError, match=r"model\.degree is 2 there and 1 here"):
         run(data, tmp_path, POLYNOMIAL | {"degree": 1})
