@@ -198,7 +198,7 @@ def main() -> None:
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     published, campaign = campaign_of(options)
-    if options.kind == "excavation":
+    if options.kind == "excavation" and not options.reference:
         ripples = [ripple(run, campaign.scenes[f"case_{run.case:03d}"]) for run in published]
         write_rows(HERE / "ripple.csv", ripples)
     simulate_campaign(campaign, device="cpu", workers=options.workers)
