@@ -113,7 +113,9 @@ class RigidBody:
         self._name = scene.place if isinstance(scene, Companion) else "the body"
         loose = isinstance(scene, Companion) and scene.free
         torque = effects.torque or loose
-        self.law = ContactLaw(shape.surface, scene.bilateral, axle is not None, torque, loose)
+        self.law = ContactLaw(
+            shape.surface, scene.bilateral, axle is not None, torque, loose, scene.contact == "nodes"
+        )
         struct: Any = body_struct(real)
         self.data = data = struct()
         """The struct that kernels take."""

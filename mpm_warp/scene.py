@@ -54,6 +54,8 @@ class Scene(Settings, Moved):
     """Whether a kind of scene says itself where its soil is and how it moves at the start."""
     bilateral: ClassVar[bool] = False
     """Whether soil in contact with the body is held, too (contact.py); a kind of scene may make it a key."""
+    contact: ClassVar[str] = "particles"
+    """What of the soil the body stops, `particles` or `nodes` (contact.py); likewise."""
 
     name: str = setting("bed", "what reports call the scene")
     kind: str = setting("bed", "of scene: what moves, or how the soil starts")
@@ -132,9 +134,10 @@ class Scene(Settings, Moved):
 
     @property
     def contact_distance(self) -> float:
-        """Distance of a particle's centre from the body's surface at which contact begins [m]: soil reaches half a
-        particle spacing further than the centre."""
-        return self.contact_margin * self.bed.spacing + 0.5 * self.bed.particle_spacing
+        """Distance of a particle's centre, or of a node, from the body's surface at which contact begins [m]: soil
+        reaches half a particle spacing further than the centre."""
+        half = 0.5 * self.bed.particle_spacing if self.contact == "particles" else 0.0
+        return self.contact_margin * self.bed.spacing + half
 
     @property
     def gravity_vector(self) -> np.ndarray:
@@ -349,8 +352,9 @@ class Scene(Settings, Moved):
         return build(Scene.classes[kind], data, "scene")
 
     def _check_thickness(self, body: Tool, what: str) -> None:
-        """A body must be thick enough for soil to be inside before it is pushed out."""
-        if body.half_thickness + self.contact_distance < HOLDS * self.bed.spacing:
+        """A body must be thick enough for soil to be inside before it is pushed out, or for a node to be inside."""
+        holds = 0.5 if self.contact == "nodes" else HOLDS
+        if body.half_thickness + self.contact_distance < holds * self.bed.spacing:
             odd = odd_size(body, self.bed.size, self.open_sides)
             remedy = odd.words if odd else "use a smaller bed.spacing (at most half the thickness is good)"
             raise SceneError(

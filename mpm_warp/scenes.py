@@ -50,6 +50,10 @@ class Excavation(Scene):
         0.00665, "height of the tip above the surface at the start", "m", ge=-1e3, le=1e3
     )
     path: tuple[Any, ...] | None = setting(None, "for motion=path: " + _PATH)
+    contact: Literal["particles", "nodes"] = setting(  # type: ignore[misc]  # a kind of scene makes it a setting
+        "particles",
+        "what of the soil the plate stops; nodes: as in the paper's solver, only to compare with it",
+    )
     body_grid: tuple[int, int] = setting(
         (3, 5),
         "rows and columns of body nodes on the front face",
@@ -68,6 +72,11 @@ class Excavation(Scene):
         elif self.path is not None:
             raise SceneError(
                 f"scene.path is given but scene.motion is {self.motion!r}; use scene.motion=path"
+            )
+        if self.contact == "nodes" and self.blade.edge != "square":
+            raise SceneError(
+                f"scene.contact is 'nodes' and blade.edge {self.blade.edge!r}; it is for a square end: set "
+                "scene.blade.edge=square"
             )
         self._check_thickness(self.body, "blade.thickness")
         remedy = "change scene.depth, speed, start, duration, path or passes"

@@ -14,7 +14,7 @@ import warp as wp
 
 from .discretisation import half, initial_particles, lay_grid, require_symmetry
 from .effects import Effects
-from .kernels.contact import body_struct
+from .kernels.contact import body_struct, node_contact
 from .kernels.fluidity import soil_parameters
 from .kernels.grid import GhostNodes, adding_up, ghost_kernels, grid_step, particle_struct
 from .kernels.nonlocal_fluidity import nonlocal_launches, wall_sink
@@ -338,7 +338,10 @@ class Solver:
         """A remap, and the steps from there to the next one."""
         real, scene, device, body, particles = self._real, self.scene, self.device, self.body, self.particles
         momentum, velocity, before, impulse = self._momentum, self._velocity, self._before, self._impulse
-        kernels = transfer(real, self.effects, body.law if body else None, atomic=device.is_cuda)
+        at_nodes = body is not None and body.law.at_nodes
+        kernels = transfer(
+            real, self.effects, body.law if body and not at_nodes else None, atomic=device.is_cuda
+        )
         node_kernels, wrap = grid_step(real, scene.bed.walls.conditions), ghost_kernels(real).wrap
         ghost_nodes = GhostNodes(real, device, self.grid, layers, mirrored=self._half is not None)
         bodies = body.of_threads if body else [body_struct(real)()] * self._threads.count
@@ -362,11 +365,16 @@ class Solver:
             for one in self._others
         ]
         moving = [launch for one in self._bodies for launch in one.launches]
+        stopping = []
+        if body is not None and at_nodes:
+            kernel = node_contact(real, body.law, self.effects.symmetry, device.is_cuda)
+            stopping = [Launch(kernel, nodes, [grid, body.data, velocity, self._inverse_mass], device)]
         step = [
             *threads.share(soil, (kernels.scatter, [*given, bodies, impulse]), *presses, owned="soil"),
             *threads.share(nodes, *adding_up(impulse), owned="nodes", alone=moving),
             *ghost_nodes.fold(impulse[0]),
             *threads.share(nodes, (node_kernels.step, [grid, *stepped]), owned="nodes"),
+            *stopping,
             *(self._nonlocal_launches(layers) if self.effects.nonlocality else ()),
             *ghost_nodes.unfold(velocity),
             *threads.share(

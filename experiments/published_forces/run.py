@@ -88,6 +88,23 @@ def wheel_case(case: int) -> dict[str, float]:
     return found | {"width": WIDTHS[found["diameter"]]}
 
 
+def ripple(run: PublishedRun, scene: Scene) -> dict[str, float]:
+    """Frequency of a blade's published vertical force while it moves at its forward speed, of its largest part above
+    1.5 Hz, and that at which the blade then reaches grid nodes [Hz]."""
+    assert run.case is not None
+    speed, rate = float(excavation_case(run.case)["speed"]), scene.frame_rate
+    moving = np.abs(rate * np.gradient(run.body_points[:, :, 0].mean(axis=1)) - speed) < 0.02 * speed
+    moving[:FIRST] = False
+    force = run.force[moving, 2]
+    time = np.arange(len(force)) / rate
+    swing = np.abs(
+        np.fft.rfft((force - np.polyval(np.polyfit(time, force, 3), time)) * np.hanning(len(time)), 4096)
+    )
+    frequency = np.fft.rfftfreq(4096, 1.0 / rate)
+    swing[frequency <= 1.5] = 0.0
+    return {"case": run.case, "ripple": float(frequency[swing.argmax()]), "nodes": speed / scene.bed.spacing}
+
+
 CASE = {"excavation": excavation_case, "wheel": wheel_case}
 
 
@@ -181,6 +198,9 @@ def main() -> None:
     options = parser.parse_intermixed_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     published, campaign = campaign_of(options)
+    if options.kind == "excavation" and not options.reference:
+        ripples = [ripple(run, campaign.scenes[f"case_{run.case:03d}"]) for run in published]
+        write_rows(HERE / "ripple.csv", ripples)
     simulate_campaign(campaign, device="cpu", workers=options.workers)
 
     rows: list[dict[str, float | str]] = []

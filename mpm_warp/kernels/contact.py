@@ -21,6 +21,7 @@ from functools import cache
 import warp as wp
 
 from ..launch import SceneKernel
+from .grid import grid_struct, node_functions
 from .signed_distance import shape_struct, signed_distance
 
 HOLDING_LAYER = 0.5
@@ -41,6 +42,8 @@ class ContactLaw:
     """The moment of the soil's push is added up."""
     loose: bool = False
     """All of the body's motion is computed (see `free_step`)."""
+    at_nodes: bool = False
+    """The body stops grid nodes (see `node_contact`) and not particles."""
 
 
 @cache
@@ -71,6 +74,22 @@ def body_struct(real: type) -> type:
 
 
 @cache
+def _taking(real: type, atomic: bool) -> wp.Function:
+    """Warp function that takes an amount from a sum."""
+    vec3 = wp.types.vector(3, real)
+
+    # Warp's own sum would be rounded otherwise on a CPU, too: its product and sum are fused differently.
+    @wp.func
+    def take(total: wp.array(dtype=vec3), i: int, amount: vec3):
+        if wp.static(atomic):
+            wp.atomic_sub(total, i, amount)
+        else:
+            total[i] = total[i] - amount
+
+    return take
+
+
+@cache
 def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
     """Warp function `push(p, x, v, mass, part, dt, s, body)` in precision `real`: impulse on particle p, of which
     `part` is computed, in substep s [N s].
@@ -81,14 +100,7 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
     Body = body_struct(real)
     outward = signed_distance(real, law.shape)
     bilateral, free, torque, loose = law.bilateral, law.free, law.torque, law.loose
-
-    # Warp's own sum would be rounded otherwise on a CPU, too: its product and sum are fused differently.
-    @wp.func
-    def take(total: wp.array(dtype=vec3), i: int, amount: vec3):
-        if wp.static(atomic):
-            wp.atomic_sub(total, i, amount)
-        else:
-            total[i] = total[i] - amount
+    take = _taking(real, atomic)
 
     @wp.func
     def push(p: int, x: vec3, v: vec3, mass: real, part: real, dt: real, substep: int, body: Body):
@@ -138,6 +150,57 @@ def contact(real: type, law: ContactLaw, atomic: bool) -> wp.Function:
         return impulse
 
     return push
+
+
+@cache
+def node_contact(real: type, law: ContactLaw, symmetric: bool, atomic: bool) -> SceneKernel:
+    """Kernel on the nodes, after `grid_step`, for a plate of prescribed motion: a node nearer than the margin does not
+    move further into the plate, and rubs along it as along a wall. There is no memory of sliding. Nodes less than a
+    grid spacing above its square end are pressed along the end's normal, others along that of the nearest face. With
+    `symmetric` a node in the plate's own plane counts half."""
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    Grid, Body, functions = grid_struct(real), body_struct(real), node_functions(real)
+    outward, take = signed_distance(real, law.shape), _taking(real, atomic)
+    place, rub, torque = functions.place, functions.rub, law.torque
+
+    @SceneKernel
+    def step(
+        n: int,
+        grid: Grid,
+        body: Body,
+        velocity: wp.array(dtype=vec4),
+        inverse_mass: wp.array(dtype=real),
+    ):
+        s = grid.substep[0] - 1
+        if inverse_mass[n] > real(0.0):
+            at = place(n, grid)
+            x = grid.origin + grid.spacing * vec3(real(at[0]), real(at[1]), real(at[2]))
+            arm = x - body.position[s]
+            if wp.length_sq(arm) < body.reach * body.reach:
+                rotation = body.rotation[s]
+                q = wp.quat_rotate_inv(rotation, arm)
+                found = outward(q, body.shape)
+                if found[3] < body.margin:
+                    out = vec3(found[0], found[1], found[2])
+                    if q[2] + body.shape.half[2] < grid.spacing:
+                        out = vec3(real(0.0), real(0.0), real(-1.0))
+                    normal = wp.quat_rotate(rotation, out)
+                    now = velocity[n]
+                    own = body.velocity[s] + wp.cross(body.spin[s], arm)
+                    before = vec3(now[0], now[1], now[2]) - own
+                    after = rub(before, normal, body.friction)
+                    mass = real(1.0) / inverse_mass[n]
+                    if wp.static(symmetric):
+                        if wp.abs(arm[1]) < real(1.0e-3) * grid.spacing:
+                            mass = real(0.5) * mass
+                    impulse = mass * (after - before)
+                    after = after + own
+                    velocity[n] = vec4(after[0], after[1], after[2], now[3])
+                    take(body.impulse, 0, impulse)
+                    if wp.static(torque):
+                        take(body.impulse, 1, wp.cross(arm, impulse))
+
+    return step
 
 
 @cache

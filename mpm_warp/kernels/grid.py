@@ -68,26 +68,18 @@ def particle_struct(real: type) -> type:
 
 
 @cache
-def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
-    """Kernels on the nodes in precision `real`.
-
-    - `begin`: momentum and mass to velocity, 1 / mass and the density over that of an undisturbed bed after a remap.
-      A node on a wall sees but a part of what is around it; soil is taken to go on beyond.
-    - `step`: velocity from the step's impulse and gravity, walls and floor; counts the step.
-
-    Both clear what they have used for the next sum. `walls` are the kinds of x walls, y walls and floor
-    (`Walls.conditions`); the kernels hold no code of other kinds.
+def node_functions(real: type) -> SimpleNamespace:
+    """Warp functions on a node in precision `real`: `place`, its three indices from its number; `rub`, its velocity
+    after what it touches, a wall or a body, from that relative to it, the normal out of it and Coulomb's coefficient.
     """
-    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    Grid, vec4s, reals = grid_struct(real), wp.array(dtype=vec4), wp.array(dtype=real)
+    vec3, Grid = wp.types.vector(3, real), grid_struct(real)
 
     @wp.func
-    def no_slip(v: vec3, inward: vec3, friction: real):
-        return vec3()
-
-    @wp.func
-    def slip(v: vec3, inward: vec3, friction: real):
-        return v - wp.dot(v, inward) * inward
+    def place(n: int, grid: Grid):
+        # `/` of whole numbers is one instruction; `//` and `%` follow Python's rule for negative numbers.
+        column = n / grid.nz
+        i = column / grid.ny
+        return wp.vec3i(i, column - i * grid.ny, n - column * grid.nz)
 
     @wp.func
     def rub(v: vec3, inward: vec3, friction: real):
@@ -101,15 +93,34 @@ def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
             return vec3()
         return sliding * (real(1.0) + friction * into / speed)
 
-    conditions = {"no_slip": no_slip, "slip": slip, "friction": rub, "periodic": slip}
-    at_x, at_y, at_floor = (conditions[kind] for kind in walls)
+    return SimpleNamespace(place=place, rub=rub)
+
+
+@cache
+def grid_step(real: type, walls: tuple[str, str, str]) -> SimpleNamespace:
+    """Kernels on the nodes in precision `real`.
+
+    - `begin`: momentum and mass to velocity, 1 / mass and the density over that of an undisturbed bed after a remap.
+      A node on a wall sees but a part of what is around it; soil is taken to go on beyond.
+    - `step`: velocity from the step's impulse and gravity, walls and floor; counts the step.
+
+    Both clear what they have used for the next sum. `walls` are the kinds of x walls, y walls and floor
+    (`Walls.conditions`); the kernels hold no code of other kinds.
+    """
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    Grid, vec4s, reals = grid_struct(real), wp.array(dtype=vec4), wp.array(dtype=real)
+    place, rub = node_functions(real).place, node_functions(real).rub
 
     @wp.func
-    def place(n: int, grid: Grid):
-        # `/` of whole numbers is one instruction; `//` and `%` follow Python's rule for negative numbers.
-        column = n / grid.nz
-        i = column / grid.ny
-        return wp.vec3i(i, column - i * grid.ny, n - column * grid.nz)
+    def no_slip(v: vec3, inward: vec3, friction: real):
+        return vec3()
+
+    @wp.func
+    def slip(v: vec3, inward: vec3, friction: real):
+        return v - wp.dot(v, inward) * inward
+
+    conditions = {"no_slip": no_slip, "slip": slip, "friction": rub, "periodic": slip}
+    at_x, at_y, at_floor = (conditions[kind] for kind in walls)
 
     @wp.func
     def walls_seen(n: int, grid: Grid):

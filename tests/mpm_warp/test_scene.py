@@ -116,6 +116,18 @@ REFUSED = {
             {"blade": Plate(length=0.2, width=0.193, thickness=0.012), "contact_margin": -1.0},
             "too thin for a grid of 0.02 m",
         ),
+        (
+            {
+                "blade": Plate(length=0.2, width=0.193, thickness=0.018, edge="square"),
+                "contact": "nodes",
+                "contact_margin": 0.0,
+            },
+            "too thin for a grid of 0.02 m",
+        ),
+        (
+            {"blade": Plate(length=0.2, width=0.193, thickness=0.044, edge="bevel"), "contact": "nodes"},
+            "scene.contact is 'nodes' and blade.edge 'bevel'; it is for a square end",
+        ),
     ],
     Wheel: [
         ({"load": 0.0}, "scene.load is 0.0 N; a wheel needs more than 0"),

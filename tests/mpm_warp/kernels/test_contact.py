@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpm_warp import Bed, Body, Box, MeshBody, Scene, SceneError, Solver
+from mpm_warp import Bed, Body, Box, Effects, Excavation, MeshBody, Plate, Scene, SceneError, Solver
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 
 BED = Bed(size=(0.32, 0.24, 0.10), spacing=0.02, headroom=0.1)
@@ -42,6 +42,56 @@ def test_sliding_friction_is_coulombs_at_any_speed(speed, friction):
     assert late[2] > 10.0
     assert -late[0] / late[2] == pytest.approx(friction, abs=0.003)
     assert abs(late[1]) < 1e-3 * late[2]
+
+
+@pytest.mark.parametrize("symmetry", [False, True])
+def test_a_plate_that_stops_nodes_takes_the_momentum_of_those_in_it(symmetry):
+    """In one step without gravity: nodes of soil at rest within a plate get its velocity along the normal of the end,
+    or above it of the nearest face, and along the face what Coulomb's friction allows of it, where it moves that way;
+    no others do."""
+    velocity, rate = np.array([0.5, 0.0, -0.4]), 20_000.0
+    place = np.array([0.1565, 0.12, 0.0577])
+    rows = tuple((t, *(place + velocity * t), 0, 0, 0, 1) for t in (0.0, 1.0))
+    scene = Excavation(
+        bed=BED,
+        blade=Plate(length=0.2, width=0.13, thickness=0.05, edge="square"),
+        motion="path",
+        path=rows,
+        contact="nodes",
+        contact_margin=0.0,
+        gravity=0.0,
+        frame_rate=rate,
+        duration=1.0 / rate,
+    )
+    solver = Solver(scene, Effects(symmetry=symmetry), precision="float64")
+    assert solver.substeps_per_frame == 1
+    force = list(solver.frames())[1].force
+
+    h = BED.spacing
+    mass = {}
+    for x in np.add(scene.initial_positions(), (0.0, 0.0, BED.size[2])):  # nodes: whole multiples of h
+        base = np.floor(x / h - 0.5).astype(int)
+        f = x / h - base
+        w = np.array([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
+        for i, j, k in np.ndindex(3, 3, 3):
+            node = (base[0] + i, base[1] + j, base[2] + k)
+            mass[node] = mass.get(node, 0.0) + w[i, 0] * w[j, 1] * w[k, 2]
+    particle = scene.filled[1] * scene.material.bulk_density
+    wanted = np.zeros(3)
+    for node, share in mass.items():
+        q = np.array(node) * h - (0.0, 0.0, BED.size[2]) - place
+        depth = np.abs(q) - scene.body.half_size
+        if depth.max() < 0.0:
+            at_end = q[2] + scene.body.half_size[2] < h
+            normal = np.sign(q) * (np.arange(3) == (2 if at_end else depth.argmax()))
+            pushed = velocity @ normal
+            if pushed > 0.0:
+                along = velocity - pushed * normal
+                size = np.linalg.norm(along)
+                change = pushed * normal + along * min(1.0, scene.blade.friction * pushed / size)
+                wanted -= share * particle * change
+    assert abs(wanted[[0, 2]]).min() > 0.0
+    np.testing.assert_allclose(force / rate, wanted, rtol=1e-9, atol=1e-12)
 
 
 def test_a_mesh_box_feels_what_a_box_feels(tmp_path):

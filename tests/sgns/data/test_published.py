@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mpm_warp import Wheel
+from mpm_warp import Excavation, Wheel
 from sgns.config import UserError
-from sgns.data.published import fingerprint, published_dataset, read_published
+from sgns.data.published import PublishedRun, fingerprint, published_dataset, read_published
 from sgns_testing.commands import refusal, sgns
 from sgns_testing.published import record
 
@@ -153,3 +153,15 @@ def test_training_and_judging_from_the_command_line(tmp_path):
     done = sgns(tmp_path, *judge, f"dataset.path={train}")
     assert done.returncode == 0 and "was trained on all of these runs" in done.stdout + done.stderr
     assert "it needs metadata.json" in refusal(tmp_path, *judge, f"dataset.path={tmp_path}")
+
+
+def test_the_ripple_of_a_published_force_is_found_where_the_blade_has_its_speed():
+    time = np.arange(320) / 60.0
+    points = np.zeros((320, 15, 3))
+    points[:, :, 0] = (0.08 * np.maximum(time - 1.0, 0.0))[:, None]  # case 123 has 8 cm/s
+    force = np.zeros((320, 3))
+    force[:, 2] = 50.0 + 20.0 * time + np.where(time < 1.0, 90.0, 5.0) * np.sin(2.0 * np.pi * 7.0 * time)
+    force[:60, 2] += 90.0 * np.sin(2.0 * np.pi * 3.0 * time[:60])
+    run = PublishedRun("excavation", points, np.zeros((320, 8, 3)), force, np.zeros((320, 0)), 123)
+    found = SCRIPT["ripple"](run, Excavation())
+    assert found == {"case": 123, "ripple": pytest.approx(7.0, abs=0.05), "nodes": pytest.approx(4.0)}
