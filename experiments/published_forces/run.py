@@ -131,8 +131,9 @@ def campaign_of(options: argparse.Namespace) -> tuple[list[PublishedRun], Campai
             OmegaConf.update(config, f"scene.{key}", value)
         scenes[f"case_{run.case:03d}"] = scene_from_config(config)
     folder = options.runs or Path("data") / name
-    split, effects = dict.fromkeys(scenes, "test"), asked_effects(config)
-    campaign = Campaign("published_forces", folder, scenes, split, effects, config.solver.precision, seed=0)
+    split, drawn = dict.fromkeys(scenes, "test"), dict.fromkeys(scenes, {})
+    effects, precision = asked_effects(config), config.solver.precision
+    campaign = Campaign("published_forces", folder, scenes, split, drawn, effects, precision, seed=0)
     return published, campaign
 
 
