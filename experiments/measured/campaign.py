@@ -4,7 +4,8 @@
 
 STUDY: `fix` (the three conditions that fix parameters; with keys of Setting to try), `judged` (32 of the 63 conditions
 with every slip angle and rim speed, then the larger wheel, then the rest; stop it when it is enough), `speed`, `grid`,
-`particles` (two conditions each). `count=N` stops after N conditions, `workers=N` runs so many at once.
+`particles` (two conditions each), `larger` (one of the larger wheel in a smaller bin, so on finer grids). `count=N`
+stops after N conditions, `workers=N` runs so many at once.
 """
 
 from __future__ import annotations
@@ -51,14 +52,22 @@ class Setting:
     """Of travel, where the rim is not too fast for it; the trials had 0.01 [m/s]."""
     travel: float = 0.4
     """Of the small wheel where it pushes soil, 0.6 of it where it only rolls; the last quarter is averaged [m]."""
+    room: float = 1.0
+    """Of the soil behind, ahead, beside and below the wheel; 1 is 2.5, 4.5, 2 and 2.5 radii."""
+    cohesion: float = 0.0
+    """Share of what the soil's authors give."""
 
 
 STUDIES: dict[str, list[Setting]] = {
     "fix": [Setting()],
     "judged": [Setting()],
     "speed": [Setting(speed=speed) for speed in (0.1, 0.05)],
-    "grid": [Setting(grid=grid) for grid in (0.016, 0.008)],
+    "grid": [Setting(grid=grid) for grid in (0.016, 0.012, 0.008)],
     "particles": [Setting(per_cell=n) for n in (1.0, 8.0)],
+    "larger": [
+        Setting(grid=grid, travel=0.15, room=0.3, cohesion=cohesion)
+        for grid, cohesion in ((0.006, 0.0), (0.006, 1.0), (0.004, 0.0), (0.003, 0.0))
+    ],
 }
 
 
@@ -72,6 +81,8 @@ def chosen(study: str) -> list[Condition]:
         return mixed + ding() + [c for c in small if c not in even]
     if study == "fix":
         return [c for c in small if c.fixed]
+    if study == "larger":
+        return [c for c in ding() if c.slip == 0.4]
     return [c for c in small if (c.slip_angle, c.slip) in ((0.0, 0.5), (45.0, -0.5))]
 
 
@@ -84,8 +95,9 @@ def scene_for(condition: Condition, setting: Setting) -> tuple[Scene, Effects]:
     travel = larger * setting.travel * (1.0 if pushes else 0.6)
     spacing = larger * setting.grid
     across = wheel.width * math.cos(condition.angle) + 2.0 * radius * math.sin(condition.angle)
-    length = travel + 7.0 * radius
-    cells = [round(side / spacing) for side in (length, across + 4.0 * radius, 2.5 * radius)]
+    room = setting.room * radius
+    length = travel + 7.0 * room
+    cells = [round(side / spacing) for side in (length, across + 4.0 * room, 2.5 * room)]
     settle = 0.5
     overrides = {
         "diameter": 2.0 * radius,
@@ -98,7 +110,7 @@ def scene_for(condition: Condition, setting: Setting) -> tuple[Scene, Effects]:
         "friction_angle": soil.friction_angle + setting.friction_excess,
         "settle": settle,
         "duration": settle + travel / speed,
-        "start": 2.5 * radius / length,
+        "start": 2.5 * room / length,
         "frame_rate": 30.0,
         "bed.size": "[" + ",".join(f"{count * spacing:.6g}" for count in cells) + "]",
         "bed.spacing": spacing,
@@ -110,6 +122,7 @@ def scene_for(condition: Condition, setting: Setting) -> tuple[Scene, Effects]:
         "grain_density": GRAIN_DENSITY,
         "packing": soil.density / GRAIN_DENSITY,
         "friction_map": setting.friction_map,
+        "cohesion": setting.cohesion * soil.cohesion,
     }
     words = [f"scene.{key}={value}" for key, value in overrides.items()]
     return scene_of("scene=wheel", *words, *(f"material.{key}={value}" for key, value in material.items()))

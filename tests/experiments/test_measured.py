@@ -314,6 +314,19 @@ def test_the_fastest_rim_travels_slower_and_the_larger_wheel_has_as_many_cells()
     assert large.bed.spacing / large.diameter == pytest.approx(small.bed.spacing / small.diameter)
 
 
+def test_the_larger_wheel_gets_a_smaller_bin_on_finer_grids_and_its_cohesion() -> None:
+    (c,) = campaign.chosen("larger")
+    usual = campaign.scene_for(c, campaign.Setting())[0]
+    free, cohesive, finer, finest = (campaign.scene_for(c, s)[0] for s in campaign.STUDIES["larger"])
+    assert [s.bed.spacing / s.diameter * 116.0 for s in (free, finer, finest)] == pytest.approx(
+        [6.0, 4.0, 3.0]
+    )
+    assert [s.material.cohesion for s in (usual, free, cohesive)] == [0.0, 0.0, 250.0]
+    beside = 0.5 * (free.bed.size[1] - free.width)
+    assert beside == pytest.approx(0.3 * (usual.bed.size[1] - usual.width) / 2.0, rel=0.1)
+    assert free.start * free.bed.size[0] == pytest.approx(0.3 * 2.5 * c.wheel.radius, rel=0.02)
+
+
 def test_the_solver_has_the_tables_signs() -> None:
     """Locked at a slip angle: pulled back, pushed along the axle, turned by the soil; coarse and short."""
     c = next(c for c in cmu() if c.slip_angle == 45.0 and c.slip == -1.0)
@@ -331,4 +344,4 @@ def test_a_campaign_goes_on_where_it_stopped(tmp_path) -> None:
     for name, _, _ in asked[:3]:
         campaign.append(name | campaign.written({"fx": 1.0, "seconds": 60.0}), file)
     assert campaign.missing("speed", settings, file) == asked[3:]
-    assert len(campaign.missing("grid", campaign.STUDIES["grid"], file)) == 4
+    assert len(campaign.missing("grid", campaign.STUDIES["grid"], file)) == 6
