@@ -3,9 +3,10 @@
     python experiments/measured/campaign.py STUDY [key=value ...]
 
 STUDY: `fix` (the three conditions that fix parameters; with keys of Setting to try), `judged` (32 of the 63 conditions
-with every slip angle and rim speed, then the larger wheel, then the rest; stop it when it is enough), `speed`, `grid`,
-`particles` (two conditions each), `larger` (one of the larger wheel in a smaller bin, so on finer grids). `count=N`
-stops after N conditions, `workers=N` runs so many at once.
+with every slip angle and rim speed, then the rest; stop it when it is enough), `speed`, `grid`, `particles` (two
+conditions each); of the larger wheel `larger` (six conditions, in a smaller bin, so on a finer grid), `larger_grid`
+(coarser; then in the small wheel's setting), `larger_soil` (one condition, a stronger soil without and with cohesion).
+`count=N` stops after N conditions, `workers=N` runs so many at once.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Setting:
     """What the tables do not say, and how finely it is computed. The defaults are the campaign's."""
 
     wheel_friction: float = 0.35
-    """Of smooth metal: tan(2/3 of the angle of repose)."""
+    """Of smooth metal: tan(2/3 of the soil's angle)."""
     friction_map: str = "tan"
     friction_excess: float = 2.0
     """Of the soil, above its angle of repose [degrees]: fixed, so that the rolling wheel sinks as deep as measured."""
@@ -58,15 +59,19 @@ class Setting:
     """Share of what the soil's authors give."""
 
 
+LARGER = Setting(wheel_friction=0.39, friction_excess=0.0, grid=0.004, travel=0.15, room=0.3)
+"""Of the larger wheel: its soil's angle of friction is measured, so none is added to it; it sinks little."""
+
 STUDIES: dict[str, list[Setting]] = {
     "fix": [Setting()],
     "judged": [Setting()],
     "speed": [Setting(speed=speed) for speed in (0.1, 0.05)],
     "grid": [Setting(grid=grid) for grid in (0.016, 0.012, 0.008)],
     "particles": [Setting(per_cell=n) for n in (1.0, 8.0)],
-    "larger": [
-        Setting(grid=grid, travel=0.15, room=0.3, cohesion=cohesion)
-        for grid, cohesion in ((0.006, 0.0), (0.006, 1.0), (0.004, 0.0), (0.003, 0.0))
+    "larger": [LARGER],
+    "larger_grid": [replace(LARGER, grid=0.006), Setting()],
+    "larger_soil": [
+        replace(LARGER, grid=0.006, wheel_friction=0.35, friction_excess=2.0, cohesion=c) for c in (0.0, 1.0)
     ],
 }
 
@@ -78,11 +83,11 @@ def chosen(study: str) -> list[Condition]:
     if study == "judged":
         even = [c for c in small if (angles.index(c.slip_angle) + SLIPS.index(c.slip)) % 2 == 0]
         mixed = [c for first in range(3) for c in even[first::3]]
-        return mixed + ding() + [c for c in small if c not in even]
+        return mixed + [c for c in small if c not in even]
     if study == "fix":
         return [c for c in small if c.fixed]
-    if study == "larger":
-        return [c for c in ding() if c.slip == 0.4]
+    if study.startswith("larger"):
+        return [c for c in ding() if study != "larger_soil" or c.slip == 0.4]
     return [c for c in small if (c.slip_angle, c.slip) in ((0.0, 0.5), (45.0, -0.5))]
 
 

@@ -82,10 +82,10 @@ def rivals() -> dict[str, Rival]:
 
 
 def ours(file: Path = HERE / "ours.csv") -> Answers:
-    """Answers of the solver in the campaign's own setting."""
+    """Answers of the solver in the campaign's own settings."""
     found: Answers = {}
     for row in read_rows(file):
-        if row["study"] == "judged":
+        if row["study"] in ("judged", "larger"):
             key = (row["source"], float(row["slip_angle"]), float(row["slip"]))
             found[key] = {name: float(row[name]) for name in QUANTITIES}
     return found
