@@ -289,6 +289,8 @@ LOOSE, DENSE = 0.9, 0.98
 the round-off, and nothing jumps where soil comes apart."""
 APART = 0.005
 """ln J above its bond from which on soil has no say at all in the mean volume change."""
+FAR = 0.1
+"""ln J from which on the grid alone says how loose soil near dense soil is; from `APART` on it has a say."""
 
 
 @cache
@@ -296,12 +298,14 @@ def loose_soil(real: type) -> SimpleNamespace:
     """Warp functions in precision `real` for particles whose ln J is above their bond, which bear no stress:
 
     - `apart(above)`: 0 for dense soil to 1 for soil that is loose for good, by ln J above its bond,
-    - `volume(ln_j, first, f, nodes, grid)`: its ln J.
+    - `volume(ln_j, base, f, nodes, grid)`: its ln J.
 
-    `first` is the lowest of its 27 nodes, `f` its offset from there [cells], and the fourth number of `nodes` is the
+    `base` is the lowest of its 27 nodes, `f` its offset from there [cells], and the fourth number of `nodes` is the
     density over that of an undisturbed bed. With a dense node among them the particle is at a surface, or next to a
-    body, where the mean density says how much soil is missing around it and nothing about the particle: its own ln J
-    holds.
+    body, and the mean density says how much soil is missing around it, too: it is taken to be in a half space of one
+    density, whose surface is as near as the slope of the density tells. That is right to 10 % in the topmost layer. So
+    it tells how loose a particle is that has been far from the others, and sets a bound to the ln J of one that has
+    not, which would grow from bounce to bounce.
     """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     Grid, weights = grid_struct(real), splines(real).weights
@@ -315,19 +319,45 @@ def loose_soil(real: type) -> SimpleNamespace:
         return ramp(above, real(0.0), real(APART))
 
     @wp.func
-    def volume(ln_j: real, first: int, f: vec3, nodes: wp.array(dtype=vec4), grid: Grid):
+    def slopes(f: real):
+        return vec3(f - real(1.5), real(2.0) - real(2.0) * f, f - real(0.5))
+
+    @wp.func
+    def mirrored(at: int, low: int, high: int):
+        # Soil goes on beyond a wall as its mirror image.
+        return wp.min(wp.max(at, 2 * low - at), high - (at - high))
+
+    @wp.func
+    def volume(ln_j: real, base: wp.vec3i, f: vec3, nodes: wp.array(dtype=vec4), grid: Grid):
         wx = weights(f[0])
         wy = weights(f[1])
         wz = weights(f[2])
+        dx = slopes(f[0])
+        dy = slopes(f[1])
+        dz = slopes(f[2])
         mean = real(0.0)
+        slope = vec3()
         densest = real(0.0)
         for i in range(3):
+            x = mirrored(base[0] + i, grid.low[0], grid.high[0])
             for j in range(3):
+                y = mirrored(base[1] + j, grid.low[1], grid.high[1])
                 for k in range(3):
-                    density = nodes[first + (i * grid.ny + j) * grid.nz + k][3]
+                    z = mirrored(base[2] + k, grid.low[2], grid.high[2])
+                    density = nodes[(x * grid.ny + y) * grid.nz + z][3]
                     densest = wp.max(densest, density)
                     mean += wx[i] * wy[j] * wz[k] * density
+                    slope += density * vec3(
+                        dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k], wx[i] * wy[j] * dz[k]
+                    )
+        mean = wp.max(mean, real(1.0e-6))
+        # Two splines smear a step into the normal distribution F of variance h^2 / 2, nearly: mean and slope are those
+        # of density F and density F'. -ln F is r / 2 + 0.466 r^2 to 0.01, r = sqrt(1/2) F' / F.
+        r = wp.sqrt(real(0.5)) * wp.length(slope) / mean
+        found = wp.max(-wp.log(mean) - r * (real(0.5) + real(0.466) * r), real(APART))
+        far = ramp(ln_j, real(APART), real(FAR))
+        near_dense = far * found + (real(1.0) - far) * wp.min(ln_j, found)
         own = ramp(densest, real(LOOSE), real(DENSE))
-        return own * ln_j - (real(1.0) - own) * wp.log(wp.max(mean, real(1.0e-6)))
+        return own * near_dense - (real(1.0) - own) * wp.log(mean)
 
     return SimpleNamespace(apart=apart, volume=volume)

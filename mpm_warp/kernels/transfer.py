@@ -275,8 +275,7 @@ def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, ato
         ln_j = particles.log_volume[p]
         if wp.static(effects.separation):
             if ln_j > bond_of(p, particles):
-                first = node_index(base, 0, 0, grid)
-                particles.log_volume[p] = loose_volume(ln_j, first, f, before, grid)
+                particles.log_volume[p] = loose_volume(ln_j, base, f, before, grid)
         v = particles.velocity[p]
         particles.velocity[p] = u + keep[0] * (v - vec3(smooth[0], smooth[1], smooth[2]))
 
