@@ -131,7 +131,7 @@ def campaign_of(options: argparse.Namespace) -> tuple[list[PublishedRun], Campai
             OmegaConf.update(config, f"scene.{key}", value)
         scenes[f"case_{run.case:03d}"] = scene_from_config(config)
     folder = options.runs or Path("data") / name
-    split, drawn = dict.fromkeys(scenes, "test"), dict.fromkeys(scenes, {})
+    split, drawn = dict.fromkeys(scenes, "test"), {name: {} for name in scenes}
     effects, precision = asked_effects(config), config.solver.precision
     campaign = Campaign("published_forces", folder, scenes, split, drawn, effects, precision, seed=0)
     return published, campaign
