@@ -179,9 +179,9 @@ def test_a_concave_face_keeps_its_opening(tmp_path, first):
 
 @pytest.mark.parametrize("outline", [STAR, MIDPOINTS], ids=["20 000 corners", "corners in a line"])
 def test_faces_of_many_corners(tmp_path, outline):
-    begin = time.perf_counter()
+    begin = time.process_time()
     check_prism(tmp_path, outline)
-    assert time.perf_counter() - begin < 10.0
+    assert time.process_time() - begin < 10.0
 
 
 def check_prism(tmp_path, outline):
