@@ -3,7 +3,8 @@
     python experiments/measured/campaign.py STUDY [key=value ...]
 
 STUDY: `fix` (the three conditions that fix parameters; with keys of Setting to try), `judged` (32 of the 63 conditions
-with every slip angle and rim speed, then the rest; stop it when it is enough), `speed`, `grid`, `particles` (two
+with every slip angle and rim speed, then the rest; stop it when it is enough), `repeated` (those after a change of the
+solver), `speed`, `grid`, `particles` (two
 conditions each); of the larger wheel `larger` (six conditions, in a smaller bin, so on a finer grid), `larger_grid`
 (coarser; then in the small wheel's setting), `larger_soil` (one condition, a stronger soil without and with cohesion).
 `count=N` stops after N conditions, `workers=N` runs so many at once.
@@ -65,6 +66,7 @@ LARGER = Setting(wheel_friction=0.39, friction_excess=0.0, grid=0.004, travel=0.
 STUDIES: dict[str, list[Setting]] = {
     "fix": [Setting()],
     "judged": [Setting()],
+    "repeated": [Setting()],
     "speed": [Setting(speed=speed) for speed in (0.1, 0.05)],
     "grid": [Setting(grid=grid) for grid in (0.016, 0.012, 0.008)],
     "particles": [Setting(per_cell=n) for n in (1.0, 8.0)],
@@ -80,7 +82,7 @@ def chosen(study: str) -> list[Condition]:
     """The conditions of a study, in the order in which they are run."""
     small = cmu()
     angles = sorted({c.slip_angle for c in small})
-    if study == "judged":
+    if study in ("judged", "repeated"):
         even = [c for c in small if (angles.index(c.slip_angle) + SLIPS.index(c.slip)) % 2 == 0]
         mixed = [c for first in range(3) for c in even[first::3]]
         return mixed + [c for c in small if c not in even]
