@@ -41,17 +41,19 @@ def leaked(frames: Sequence[Frame], body: Tool, edge: float = 0.0) -> np.ndarray
 
     Args:
         frames: of one run, in order.
-        body: whose outline counts; its shape is taken as the box around it.
+        body: whose outline counts; its shape is taken as the box around it, but a plate's end as it is cut.
         edge: width of a strip along the outline's edges that does not count [m]. Contact may begin inside the body,
             and then soil flows around an edge that lies that far inside.
     """
-    _, half_y, half_z = body.half_size - edge
+    _, half_y, top = body.half_size - edge
+    # Below the middle of a ground face the plane lies behind the plate.
+    end = 0.5 * (body.section[0, 1] + body.section[3, 1]) if isinstance(body, Plate) else -body.half_size[2]
     crossings = np.zeros(len(frames[0].position), dtype=int)
     for before, now in pairwise(map(_seen_from_body, frames)):
         crossed = np.flatnonzero(before[:, 0] * now[:, 0] < 0.0)
         a, b = before[crossed], now[crossed]
         at = a + (a[:, 0] / (a[:, 0] - b[:, 0]))[:, None] * (b - a)
-        inside = (np.abs(at[:, 1]) < half_y) & (np.abs(at[:, 2]) < half_z)
+        inside = (np.abs(at[:, 1]) < half_y) & (at[:, 2] > end + edge) & (at[:, 2] < top)
         crossings[crossed[inside]] += np.sign(b[inside, 0]).astype(int)
     return crossings
 
