@@ -21,7 +21,7 @@ from sgns.cli import COMMANDS
 from sgns.train.command import train
 from sgns_testing.commands import composed
 from sgns_testing.runs import make_run
-from sgns_testing.tiny import MODEL, TRAINING, reduced
+from sgns_testing.tiny import BRIEF, MODEL, TRAINING, reduced
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -110,7 +110,8 @@ def hooks() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what the pages' Python reads: run.h5, wheel.h5, basis.h5, best.ckpt and outputs/demo/best.ckpt."""
+    """A folder with what the pages' Python reads: run.h5, wheel.h5, basis.h5, best.ckpt, and best.ckpt of outputs/demo
+    and outputs/ensemble."""
     folder = tmp_path_factory.mktemp("workplace")
     scene = mpm_warp.Excavation(
         bed=mpm_warp.Bed(size=(0.4, 0.4, 0.12), spacing=0.04, headroom=0.1),
@@ -126,6 +127,8 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     particles = {"n": len(scene.initial_positions()), "arrangement_hash": scene.arrangement_hash}
     data = reduced(folder / "data", scene=fixed, **particles)
     train(data, num_modes=4, model=MODEL, training=TRAINING, output=folder / "outputs" / "demo")
+    several = BRIEF | {"members": 2}
+    train(data, num_modes=4, model=MODEL, training=several, output=folder / "outputs" / "ensemble")
     shutil.copy(folder / "outputs" / "demo" / "best.ckpt", folder / "best.ckpt")
     shutil.copy(folder / "data" / "runs" / "a.h5", folder / "run.h5")
     data.basis.save(folder / "basis.h5")

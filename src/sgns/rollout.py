@@ -114,6 +114,7 @@ def write_rollout(
             "outside_training_words": None if excess is None else excess.words(),
         },
         mesh=mesh,
+        spread=rollout.force_spread is not None,
     ) as writer:
         previous = None
         for frames in frame_chunks(particle_count, len(latent)):
@@ -126,6 +127,7 @@ def write_rollout(
                     rollout.poses[frame],
                     rollout.force[frame],
                     rollout.torque[frame],
+                    () if rollout.force_spread is None else (rollout.force_spread[frame],),
                 )
                 previous = position
         wall_time = float(rollout.wall_time_s) + elapsed(began, time.perf_counter())
@@ -266,7 +268,7 @@ def main(cfg: DictConfig) -> float:
     output = Path(cfg.output)
     # First: without a checkpoint the scene is not the one that the settings were written for.
     simulator = Simulator.load(
-        cfg.checkpoint, device=cfg.device, num_modes=cfg.num_modes, rate_independent=cfg.rate_independent
+        cfg.checkpoint, cfg.device, cfg.num_modes, rate_independent=cfg.rate_independent, spread=cfg.spread
     )
     scene = scene_from_config(cfg)
     require_same_freedom(simulator, scene, cfg.checkpoint)

@@ -194,7 +194,12 @@ class TrainingSettings(Group):
 
     group: ClassVar[str] = "training"
     max_steps: int = setting(6000, "optimiser steps", ge=1, le=10**9)
-    batch_size: int = setting(32, "windows of one step", ge=1, le=10**9)
+    batch_size: int = setting(
+        32, "windows of one step; of several members each takes half of it", ge=1, le=10**9
+    )
+    members: int = setting(
+        1, "networks that are trained side by side, for a spread of force and soil", ge=1, le=64
+    )
     learning_rate: float = setting(2e-3, "highest, after the warm-up", gt=0)
     final_learning_rate: float = setting(1e-6, "at max_steps", gt=0)
     warmup_steps: int = setting(200, "steps of linear rise", ge=0, le=10**9)
@@ -216,6 +221,11 @@ class TrainingSettings(Group):
         "auto", "go on from last.ckpt in `output`; false: start anew and overwrite"
     )
     threads: int | None = _threads()
+
+    @property
+    def windows(self) -> int:
+        """Of one step, those of all members."""
+        return self.batch_size if self.members == 1 else self.members * math.ceil(self.batch_size / 2)
 
     def rate(self, step: int) -> float:
         """Learning rate of a step (from 0) as a share of the highest: a linear rise, then the fall."""
@@ -394,6 +404,10 @@ class Train(_Command):
     device: str = _device()
 
 
+def _spread() -> bool:
+    return setting(False, "true: all members of an ensemble, with the spread of the force; false: the first")
+
+
 @settings
 class Rollout(_Command):
     """`sgns rollout`."""
@@ -401,6 +415,7 @@ class Rollout(_Command):
     checkpoint: str = setting("", "file.ckpt of `sgns train`")
     num_modes: int | None = _num_modes()
     rate_independent: bool = setting(True, "under a slow tool soil follows its way")
+    spread: bool = _spread()
     output: str = setting("rollout.h5", "run file to write, of the same kind as the solver's")
     overwrite: bool = setting(False, "true: replace a rollout that is there at `output`")
     seed: int = _seed("of the particle arrangement")
@@ -413,6 +428,7 @@ class Evaluate(_Command):
 
     checkpoint: str = setting("", "file.ckpt of `sgns train`")
     num_modes: int | None = _num_modes()
+    spread: bool = _spread()
     split: Literal["train", "validation", "test"] = setting("test", "which runs")
     new_rollouts: list[str] | str | None = setting(
         list,

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from mpm_warp.settings import short_repr
 from sgns.config import UserError
 from sgns.data.surface import Surface, soil_surface
 from sgns.model.checkpoint import Surrogate, load_surrogate
-from sgns.model.dynamics import Step
+from sgns.model.dynamics import Step, Stepper, together
 from sgns.model.features import ToolMotion, context_of, markers
 from sgns.model.training_range import FAR, Excess
 from sgns.numbers import check_pose, check_poses, elapsed, finite_array, first_pose, is_whole, real_array
@@ -49,6 +49,9 @@ class State:
         force: By the soil on the tool over the last frame [N], world frame, shape (3,); zero at the reset.
         torque: About the tool's centre of mass [N m], shape (3,).
         pose: Tool's centre of mass [m] and quaternion x, y, z, w, shape (7,).
+        force_spread: With `spread`, half the width of the band around the force that is to hold 90 % [N], shape (3,);
+            else None.
+        latent_spread: Likewise of the modes [m], shape (r, 3).
     """
 
     def __repr__(self) -> str:
@@ -62,6 +65,8 @@ class State:
     _basis: Basis = field(repr=False)
     _scene: Mapping[str, Any] = field(repr=False)
     _excess: Callable[[], Excess | None] = field(repr=False)
+    force_spread: np.ndarray | None = None
+    latent_spread: np.ndarray | None = None
 
     @property
     def outside(self) -> float:
@@ -91,6 +96,8 @@ class Rollout:
         poses: Of the tool, shape (T, 7); predicted where the tool is free.
         body_points: World frame [m], shape (T, M, 3).
         wall_time_s: Time of all steps, force included, decoding not [s].
+        force_spread: As of `State`, shape (T, 3), or None.
+        latent_spread: Shape (T, r, 3), or None.
     """
 
     def __repr__(self) -> str:
@@ -103,6 +110,8 @@ class Rollout:
     body_points: np.ndarray
     wall_time_s: float
     _excess: Callable[[], Excess | None] = field(repr=False)
+    force_spread: np.ndarray | None = None
+    latent_spread: np.ndarray | None = None
 
     @cached_property
     def excess(self) -> Excess | None:
@@ -127,6 +136,16 @@ class Rollouts:
     torque: np.ndarray
     poses: np.ndarray
     wall_time_s: float
+    force_spread: np.ndarray | None = None
+    latent_spread: np.ndarray | None = None
+
+
+class _Place(NamedTuple):
+    """Where one member is."""
+
+    poses: list[np.ndarray]  # the last d of the tool, (7,) each; none before the first step
+    latent: Tensor  # the last d positions [m], (1, d, r, 3)
+    load: tuple[np.ndarray, np.ndarray]  # force [N] and torque [N m], (3,) each
 
 
 class Simulator:
@@ -143,10 +162,12 @@ class Simulator:
         num_modes: Of the soil, the first of those it was trained with; None: all.
         rate_independent: Whether the soil follows a prescribed tool, not the clock, where the tool is slower than in
             all training runs (see `sgns.model.features`).
+        spread: Of an ensemble, whether all members are stepped, each on its own soil: everything is their mean then,
+            and states and rollouts have a spread. Otherwise the first member alone answers.
 
     Attributes:
         basis: Modes of the soil.
-        dynamics: What steps the modes: network or polynomials.
+        dynamics: What steps the modes: network or polynomials; of several members the first.
         start_positions: Of all particles at rest [m], shape (n, 3).
         body_points: Those of the training runs, in the body frame [m], shape (M, 3).
         mean_force: Of the training runs [N], shape (3,): the simplest prediction of a force.
@@ -159,7 +180,7 @@ class Simulator:
         card: Where it comes from: settings, runs, versions.
 
     Raises:
-        UserError: The device cannot be used, or the modes are more than there are.
+        UserError: The device cannot be used, the modes are more than there are, or a spread is asked of one network.
     """
 
     def __init__(
@@ -168,9 +189,11 @@ class Simulator:
         device: str = "cpu",
         num_modes: int | None = None,
         rate_independent: bool = True,
+        spread: bool = False,
     ) -> None:
-        if not isinstance(rate_independent, (bool, np.bool_)):
-            raise UserError(f"rate_independent is {rate_independent!r}; it must be True or False")
+        for name, value in (("rate_independent", rate_independent), ("spread", spread)):
+            if not isinstance(value, (bool, np.bool_)):
+                raise UserError(f"{name} is {value!r}; it must be True or False")
         try:
             self.device = torch.device(device)
             # On others, such as "meta", tensors hold no values or no float64.
@@ -184,7 +207,14 @@ class Simulator:
         dynamics, self.basis = surrogate.dynamics, surrogate.basis
         if num_modes is not None:
             dynamics, self.basis = dynamics.with_modes(num_modes), self.basis.sliced(num_modes)
-        self.dynamics = dynamics
+        if spread and dynamics.members == 1:
+            raise UserError(
+                f"spread is true, and this {dynamics.settings.kind} has one member; train with training.members=4, or "
+                "leave spread out"
+            )
+        self._members = [dynamics.member(index) for index in range(dynamics.members if spread else 1)]
+        self._band = dynamics.band.cpu().numpy().copy() if spread else np.ones(4)
+        self.dynamics = dynamics = self._members[0]
         self.history, self.num_modes = dynamics.history, dynamics.num_modes
         self.context_keys, self.predicts_body = dynamics.context_keys, dynamics.predicts_body
         self.frame_rate, self.card = surrogate.frame_rate, surrogate.card
@@ -210,7 +240,7 @@ class Simulator:
         copied = object.__new__(type(self))
         copied.__dict__.update(self.__dict__)
         # All else is replaced, not written to, from step to step.
-        copied._stepper = copy.copy(self._stepper)
+        copied._steppers = [copy.copy(stepper) for stepper in self._steppers]
         return copied
 
     @classmethod
@@ -220,9 +250,10 @@ class Simulator:
         device: str = "cpu",
         num_modes: int | None = None,
         rate_independent: bool = True,
+        spread: bool = False,
     ) -> Simulator:
         """From a checkpoint written by `sgns train`, or UserError; the other arguments as of the class."""
-        return cls(load_surrogate(path), device, num_modes, rate_independent)
+        return cls(load_surrogate(path), device, num_modes, rate_independent, spread)
 
     @property
     def scene(self) -> dict[str, Any]:
@@ -267,11 +298,13 @@ class Simulator:
             poses = [] if pose is None else [pose] * self.history
         else:
             latent, poses = self._checked_beginning(history)
-        stepper = self.dynamics.stepper(len(points), self._told(context))
+        told = self._told(context)
+        steppers = [member.stepper(len(points), told) for member in self._members]
         # All is in order: nothing is changed before.
-        self._frame, self._points, self._context, self._stepper = 0, points, context, stepper
-        self._poses, self._latent = poses, latent.clone()[None].to(self.device)
-        self._load = np.zeros(3), np.zeros(3)
+        self._frame, self._points, self._context, self._steppers = 0, points, context, steppers
+        place = _Place(poses, latent.clone()[None].to(self.device), (np.zeros(3), np.zeros(3)))
+        self._places = [place] * len(steppers)
+        self._answer = self._together(self._places)
         self._motion: ToolMotion | None = None
         # The last two frames; what the network sees may be further apart.
         last = poses[-2:] or [np.full(7, np.nan)]
@@ -289,19 +322,19 @@ class Simulator:
                 not finite; then the simulator stays where it was.
         """
         pose = check_pose(tool_pose, f"tool pose of frame {self._frame + 1}")
-        poses, shown = self._poses, self._shown[-1]
-        if not poses:
-            poses, shown = [pose] * self.history, (pose, shown[1])
+        places, shown = self._places, self._shown[-1]
+        if not places[0].poses:
+            places = [place._replace(poses=[pose] * self.history) for place in places]
+            shown = pose, shown[1]
         motion = None
         if self._pace is not None:
-            before = self._motion or ToolMotion.along(self._markers(poses), *self._pace)
+            before = self._motion or ToolMotion.along(self._markers(places[0].poses), *self._pace)
             motion = before.moved(self._markers([pose])[0])
-        latent, load = self._latent, self._load
         if motion is None or motion.steps:
-            pose, latent, load = self._step_soil(poses, pose)
-            poses = [*poses[1:], pose]
-        self._poses, self._motion, self._latent, self._load = poses, motion, latent, load
-        self._shown = [shown, (pose, latent[0, -1].cpu().numpy().copy())]
+            places = self._step_soil(places, pose)
+            pose = mean_pose([place.poses[-1] for place in places])
+        self._places, self._motion, self._answer = places, motion, self._together(places)
+        self._shown = [shown, (pose, self._answer[0])]
         self._frame += 1
         state = self._state()
         known = self._surrogate.training_range
@@ -329,27 +362,31 @@ class Simulator:
             stacklevel=3,
         )
 
-    def _step_soil(
-        self, poses: Sequence[np.ndarray], pose: np.ndarray
-    ) -> tuple[np.ndarray, Tensor, tuple[np.ndarray, np.ndarray]]:
-        """Let the network take a step after d poses; returns where the tool is then (7,), the last d latent positions
-        (1, d, r, 3), and force and torque. What fails changes nothing."""
-        # One frame more than the network sees, because the first motion needs a frame before it.
-        window = np.stack([*poses, pose])
-        body = self.dynamics.track(window, in_world_frame(window, self._points)).frames(slice(1, None))
-        memory = self._stepper.memory
+    def _step_soil(self, places: Sequence[_Place], pose: np.ndarray) -> list[_Place]:
+        """Let every member take a step to where the tool is put; returns where they are then. What fails changes
+        nothing."""
+        memories = [stepper.memory for stepper in self._steppers]
         try:
-            with torch.inference_mode():
-                step = self._stepper.advance(self._latent, body)
-                self._require_finite(step)
-                latent = torch.cat([self._latent[:, 1:], step.latent[:, None]], dim=1)
-            if self.predicts_body:
-                there = body.position[0, -2] + step.displacement[0]
-                pose = self.dynamics.predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
+            return [self._stepped(*pair, pose) for pair in zip(self._steppers, places, strict=True)]
         except BaseException:  # an interruption as well
-            self._stepper.memory = memory
+            for stepper, memory in zip(self._steppers, memories, strict=True):
+                stepper.memory = memory
             raise
-        return pose, latent, (step.force[0].cpu().numpy().copy(), step.torque[0].cpu().numpy().copy())
+
+    def _stepped(self, stepper: Stepper, place: _Place, pose: np.ndarray) -> _Place:
+        """Where one member is after a step."""
+        # One frame more than the network sees, because the first motion needs a frame before it.
+        window = np.stack([*place.poses, pose])
+        body = self.dynamics.track(window, in_world_frame(window, self._points)).frames(slice(1, None))
+        with torch.inference_mode():
+            step = stepper.advance(place.latent, body)
+            self._require_finite(step)
+            latent = torch.cat([place.latent[:, 1:], step.latent[:, None]], dim=1)
+        if self.predicts_body:
+            there = body.position[0, -2] + step.displacement[0]
+            pose = self.dynamics.predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
+        load = step.force[0].cpu().numpy().copy(), step.torque[0].cpu().numpy().copy()
+        return _Place([*place.poses[1:], pose], latent, load)
 
     def rollout(
         self,
@@ -394,12 +431,24 @@ class Simulator:
         context = self._context_of(values)
         told = self._told(context)
         began = time.perf_counter()
-        found = self.dynamics.follow(poses[None], points, told, latent, self._pace, given, loads)
+        found = self._followed(poses[None], points, told, latent, given, loads)
         wall_time = elapsed(began, time.perf_counter())
-        states, force, torque, poses, world = (part[0] for part in found)
+        states, force, torque, poses, world, *spread = (None if part is None else part[0] for part in found)
         self._look(0, poses, points, context)
         excess = partial(self._surrogate.training_range.excess, poses, points, states, context)
-        return Rollout(states, force, torque, poses, world, wall_time, excess)
+        return Rollout(states, force, torque, poses, world, wall_time, excess, *spread)
+
+    def _followed(self, poses: np.ndarray, *arguments: Any) -> tuple[Any, ...]:
+        """What `Dynamics.follow` finds, the mean of all members, then the spread of force and modes."""
+        points, told, latent, *given = arguments
+        each = [member.follow(poses, points, told, latent, self._pace, *given) for member in self._members]
+        if len(each) == 1:
+            return *each[0], None, None
+        states, force, torque, poses, worlds = (np.stack(parts) for parts in zip(*each, strict=True))
+        states, latent_spread = together(states, self._band[3])
+        force, force_spread = together(force, self._band[:3])
+        torque, worlds = (together(part, 1.0)[0] for part in (torque, worlds))
+        return states, force, torque, mean_pose(list(poses)), worlds, force_spread, latent_spread
 
     def rollouts(
         self,
@@ -431,12 +480,14 @@ class Simulator:
         poses = np.stack([check_poses(path, f"path {i}") for i, path in enumerate(poses)])
         start = self._start_latent.expand(self.history, -1, -1)
         began = time.perf_counter()
-        parts = [
-            self.dynamics.follow(poses[first : first + paths_at_once], points, told, start, self._pace)[:4]
-            for first in range(0, len(poses), paths_at_once)
-        ]
-        latent, force, torque, poses = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return Rollouts(latent, force, torque, poses, elapsed(began, time.perf_counter()))
+        parts = []
+        for first in range(0, len(poses), paths_at_once):
+            found = self._followed(poses[first : first + paths_at_once], points, told, start)
+            parts.append((*found[:4], *found[5:]))
+        latent, force, torque, poses, *spread = (
+            None if part[0] is None else np.concatenate(part) for part in zip(*parts, strict=True)
+        )
+        return Rollouts(latent, force, torque, poses, elapsed(began, time.perf_counter()), *spread)
 
     def _require_finite(self, step: Step) -> None:
         """Refuses a step that says nothing; the simulator stays where it was."""
@@ -455,11 +506,19 @@ class Simulator:
         poses, latent = (np.stack(part) for part in zip(*self._shown, strict=True))
         # It holds nothing of the simulator that goes on changing.
         excess = partial(self._surrogate.training_range.excess, poses, self._points, latent, self._context)
-        force, torque = (part.copy() for part in self._load)
-        scene = self._surrogate.card["scene"]
-        return State(
-            self._frame, latent[-1].copy(), force, torque, poses[-1].copy(), self.basis, scene, excess
-        )
+        _, force, torque, *spread = (None if part is None else part.copy() for part in self._answer)
+        scene, newest = self._surrogate.card["scene"], (latent[-1].copy(), force, torque, poses[-1].copy())
+        return State(self._frame, *newest, self.basis, scene, excess, *spread)
+
+    def _together(self, places: Sequence[_Place]) -> tuple[np.ndarray | None, ...]:
+        """Newest latent positions, force and torque, the mean of all members, then the spread of force and modes."""
+        latents = [place.latent[0, -1].cpu().numpy() for place in places]
+        if len(places) == 1:
+            return latents[0].copy(), *places[0].load, None, None
+        latent, latent_spread = together(np.stack(latents), self._band[3])
+        forces, torques = (np.stack(loads) for loads in zip(*(place.load for place in places), strict=True))
+        force, force_spread = together(forces, self._band[:3])
+        return latent, force, together(torques, 1.0)[0], force_spread, latent_spread
 
     def _context_of(self, values: Mapping[str, Any] | None) -> dict[str, float]:
         """The numbers of a scene that the network is told, by their keys."""
@@ -506,3 +565,12 @@ class Simulator:
     def _markers(self, poses: Sequence[np.ndarray]) -> np.ndarray:
         path = np.stack(poses)
         return markers(path, in_world_frame(path, self._points))
+
+
+def mean_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
+    """Of the poses (..., 7) that members predict, or that all were given."""
+    if all(np.array_equal(pose, poses[0]) for pose in poses[1:]):
+        return poses[0]
+    mean = np.mean(poses, axis=0)
+    mean[..., 3:] /= np.linalg.norm(mean[..., 3:], axis=-1, keepdims=True)
+    return mean

@@ -1,6 +1,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import h5py
 import numpy as np
 import pytest
 
@@ -67,6 +68,23 @@ def test_file_is_a_complete_run_with_decoded_soil(simulator, tmp_path):
         assert run.extra["history"] == 1
     assert timing.simulated == pytest.approx((len(scene.poses) - 1) / 60.0)
     assert timing.complete_rate > timing.inference_rate > 0.0
+
+
+def test_the_spread_of_an_ensemble_is_in_the_file(simulator, tmp_path):
+    scene, known = FakeScene(simulator), simulator.rollout
+    with_spread = tmp_path / "with.h5"
+    spread = np.linspace(0.0, 3.0, len(scene.poses))[:, None] * [1.0, 2.0, 3.0]
+    simulator.rollout = lambda *args, **kw: replace(known(*args, **kw), force_spread=spread)
+    rollout_scene(simulator, scene, with_spread)
+    simulator.rollout = known
+    rollout_scene(simulator, scene, tmp_path / "without.h5")
+    assert check_run(with_spread) == check_run(tmp_path / "without.h5") == []
+    with Run(with_spread) as run, Run(tmp_path / "without.h5") as without:
+        np.testing.assert_array_equal(run.force_spread, spread)
+        assert without.force_spread is None and run.content_hash != without.content_hash
+    with h5py.File(with_spread, "a") as file:
+        file["observables/body/force_spread/value"][3, 1] = np.nan
+    assert any("force_spread is not finite at frame 3" in problem for problem in check_run(with_spread))
 
 
 def test_velocities_are_differences_of_positions(simulator, tmp_path, monkeypatch):

@@ -15,9 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from sgns.config import UserError
 from sgns.data.surface import soil_surface
+from sgns.model.checkpoint import load_surrogate
 from sgns.simulator import Simulator
+from sgns.train.command import train
 from sgns_testing.commands import python
-from sgns_testing.tiny import MODEL, POLYNOMIAL
+from sgns_testing.tiny import BRIEF, MODEL, POLYNOMIAL
 from sgns_testing.trained import TrainedKinds
 
 MODELS = {"pose": MODEL, "points": MODEL | {"body_nodes": "points"}, "polynomial": POLYNOMIAL}
@@ -456,7 +458,7 @@ def test_a_refusal_changes_nothing(trained, kind) -> None:
 def test_an_interrupted_step_is_as_if_not_tried(trained, monkeypatch) -> None:
     simulator, path = trained.simulator("points"), along_x(trained, [1.5, 1.7, 1.9, 2.1])
     stepped(simulator, path[:2])
-    plain, memory = copy.copy(simulator), simulator._stepper.memory
+    plain, memory = copy.copy(simulator), simulator._steppers[0].memory
     turned = path[2].copy()
     turned[3:] = [0.0, 1.0, 0.0, 0.0]
 
@@ -468,7 +470,7 @@ def test_an_interrupted_step_is_as_if_not_tried(trained, monkeypatch) -> None:
         simulator.step(turned)
     monkeypatch.undo()
     # What is kept of the edges within the body is that of the step before, too: it differs by rounding only.
-    assert all(now is then for now, then in zip(simulator._stepper.memory, memory, strict=True))
+    assert all(now is then for now, then in zip(simulator._steppers[0].memory, memory, strict=True))
     for pose in path[2:]:
         assert_same(simulator.step(pose), plain.step(pose))
 
@@ -547,3 +549,76 @@ with multiprocessing.get_context("fork").Pool(2, initializer=torch.set_num_threa
     print(pool.map(work, [1500, 1500]))
 """
     assert python(code).stdout == "[1500.0, 1500.0]\n"
+
+
+# --- several members ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ensemble(trained, tmp_path_factory):
+    """Checkpoint of two members."""
+    folder = tmp_path_factory.mktemp("ensemble")
+    train(trained.data, num_modes=4, model=MODEL, training=BRIEF | {"members": 2}, output=folder)
+    return folder / "best.ckpt"
+
+
+def test_without_a_spread_the_first_member_answers(trained, ensemble) -> None:
+    surrogate, path = load_surrogate(ensemble), trained.run.pose
+    each = []
+    for index in range(2):
+        alone = load_surrogate(ensemble)
+        alone.dynamics = alone.dynamics.member(index)
+        each.append(Simulator(alone).rollout(path))
+    first, both = Simulator(surrogate).rollout(path), Simulator(surrogate, spread=True).rollout(path)
+    assert_same(first, each[0])
+    assert first.force_spread is None and first.latent_spread is None
+    forces = np.stack([one.force for one in each])
+    np.testing.assert_array_equal(both.force, forces.mean(axis=0))
+    factor = surrogate.dynamics.band[:3].numpy()
+    assert both.force_spread == pytest.approx(factor * forces.std(axis=0, ddof=1))
+    assert both.latent_spread.shape == both.latent.shape and both.latent_spread[1:].all()
+    assert not both.force_spread[0].any() and not both.latent_spread[0].any()  # the bed at rest is known
+
+
+def test_steps_of_several_members_are_their_rollout(trained, ensemble) -> None:
+    simulator, path = Simulator.load(ensemble, spread=True), along_x(trained, CHANGING)
+    states, found = stepped(simulator, path), simulator.rollout(path)
+    many = simulator.rollouts(np.stack([path, path]), paths_at_once=1)
+    copied = copy.deepcopy(simulator)
+    for frame, state in enumerate(states):
+        assert_same(state, found, frame)
+        np.testing.assert_array_equal(state.force_spread, found.force_spread[frame])
+        np.testing.assert_array_equal(state.latent_spread, found.latent_spread[frame])
+    np.testing.assert_array_equal(many.force_spread[1], found.force_spread)
+    assert_same(copied.step(path[-1]), simulator.step(path[-1]), ...)
+    assert np.isfinite(states[-1].outside)
+
+
+def test_equal_members_have_no_spread(trained, ensemble) -> None:
+    surrogate = load_surrogate(ensemble)
+    (other,) = surrogate.dynamics.others
+    for name, part in other.items():
+        part.load_state_dict(getattr(surrogate.dynamics, name).state_dict())
+    found = Simulator(surrogate, spread=True).rollout(trained.run.pose)
+    assert found.force.any() and not found.force_spread.any() and not found.latent_spread.any()
+
+
+def test_a_step_that_one_member_cannot_take_changes_nothing(trained, ensemble) -> None:
+    surrogate, path = load_surrogate(ensemble), trained.run.pose
+    simulator, network = Simulator(surrogate, spread=True), surrogate.dynamics.others[0]["network"]
+    good = copy.deepcopy(network.state_dict())
+    network.decode.linears[-1].bias.fill_(torch.nan)
+    simulator.reset(path)  # which copies the weights
+    with pytest.raises(UserError, match="not finite at frame 1"):
+        simulator.step(path[1])
+    assert "at frame 0" in repr(simulator)
+    network.load_state_dict(good)
+    assert_same(copy.copy(simulator).step(path[1]), stepped(Simulator(surrogate, spread=True), path[:2])[1])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_network_has_no_spread(trained, kind) -> None:
+    with pytest.raises(UserError, match=r"spread is true, and this \w+ has one member; train with training"):
+        trained.simulator(kind, spread=True)
+    with pytest.raises(UserError, match="spread is 'yes'; it must be True or False"):
+        trained.simulator(kind, spread="yes")

@@ -24,6 +24,7 @@ from sgns.data.run import Run
 from sgns.data.run_file import (
     OTHERS,
     PRODUCERS,
+    SPREAD,
     STOPPED,
     open_run,
     read_attributes,
@@ -238,9 +239,9 @@ def _check_body(file: h5py.File) -> Iterator[str]:
 
 
 def _check_others(file: h5py.File) -> Iterator[str]:
-    for name in set(recorded_in(file)) & set(OTHERS):
+    for name in set(recorded_in(file)) & set(OTHERS | SPREAD):
         values = series(file, name)[...].astype(float)
-        if (frame := _first(~np.isfinite(values).all(axis=(1, 2)))) is not None:
+        if (frame := _first(~np.isfinite(values).reshape(len(values), -1).all(axis=1))) is not None:
             yield f"{name} is not finite at frame {frame}"
         elif name == "other_pose":
             off = np.abs(np.linalg.norm(values[:, :, 3:], axis=2) - 1.0).max(axis=1, initial=0.0)

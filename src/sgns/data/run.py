@@ -144,6 +144,13 @@ class Run:
         return self._whole("force")
 
     @property
+    def force_spread(self) -> np.ndarray | None:
+        """Half the width of the band around the force that is to hold 90 % [N], shape (T, 3), float64; None where the
+        run has none: only rollouts with spread=true do."""
+        there = self._file and "force_spread" in recorded_in(self._file)
+        return self._whole("force_spread") if there or not self._file else None
+
+    @property
     def torque(self) -> np.ndarray:
         """By the soil on the body about its centre of mass [N m], world frame, shape (T, 3), float64."""
         return self._whole("torque")

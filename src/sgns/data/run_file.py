@@ -102,6 +102,16 @@ OTHERS = {
     "other_torque": Recorded("observables/others/torque", ("k", 3), "<f8", "N m", "as of the body"),
 }
 """What a run has besides whose scene has further bodies."""
+SPREAD = {
+    "force_spread": Recorded(
+        "observables/body/force_spread",
+        (3,),
+        "<f8",
+        "N",
+        "half the width of a band that is to hold 90 %",
+    )
+}
+"""What a rollout has besides whose checkpoint holds several networks, where it was asked for."""
 MESH = {
     "vertices": Recorded(
         "parameters/tool/vertices", ("V", 3), "<f8", "m", "of the tool, about its centre of mass, body frame"
@@ -114,13 +124,16 @@ MESH = {
 
 
 def series(file: h5py.File, name: str, part: str = "value") -> h5py.Dataset:
-    """A dataset of one of `SERIES` or `OTHERS`: its `value`, `step` or `time`."""
-    return file[f"{(SERIES | OTHERS)[name].path}/{part}"]
+    """A dataset of one of `SERIES`, `OTHERS` or `SPREAD`: its `value`, `step` or `time`."""
+    return file[f"{(SERIES | OTHERS | SPREAD)[name].path}/{part}"]
 
 
 def recorded_in(file: h5py.File) -> dict[str, Recorded]:
-    """`SERIES`, and `OTHERS` where there are further bodies."""
-    return SERIES | (OTHERS if own_object(file, "observables/others") is not None else {})
+    """`SERIES`, and what there is of `OTHERS` and `SPREAD`."""
+    found = dict(SERIES)
+    for path, more in (("observables/others", OTHERS), (SPREAD["force_spread"].path, SPREAD)):
+        found |= more if own_object(file, path) is not None else {}
+    return found
 
 
 # --- Opening a file that may be anything ----------------------------------------------------------------

@@ -28,6 +28,7 @@ from sgns.data.run_file import (
     MESH,
     OTHERS,
     SERIES,
+    SPREAD,
     STATE,
     STOPPED,
     WHOLE,
@@ -146,8 +147,8 @@ class ContentHash:
         self._hash = hashlib.blake2b(digest_size=16)
 
     def update(self, frame: Mapping[str, np.ndarray]) -> None:
-        """Add one frame: an array for every name in `ORDER`, in the file's types, and those of further bodies."""
-        for name in (*self.ORDER, *(name for name in OTHERS if name in frame)):
+        """Add one frame: an array for every name in `ORDER`, in the file's types, and what else there is."""
+        for name in (*self.ORDER, *(name for name in OTHERS | SPREAD if name in frame)):
             self._hash.update(np.ascontiguousarray(frame[name]).data)
 
     def hexdigest(self) -> str:
@@ -174,6 +175,7 @@ class RunWriter:
         extra: more provenance as plain nested data; "author" also becomes H5MD's author name.
         mesh: of a tool that is one: vertices (V, 3) about its centre of mass [m] and triangles (F, 3).
         others: k, the number of further bodies.
+        spread: whether every frame has a spread of the force.
 
     Raises:
         UserError: the folder cannot be written, the disk is full, something else than a run of before would be
@@ -196,16 +198,17 @@ class RunWriter:
         extra: Mapping[str, Any] | None = None,
         mesh: tuple[np.ndarray, np.ndarray] | None = None,
         others: int = 0,
+        spread: bool = False,
     ) -> None:
         self.path = Path(path)
         counts = {"n": int(particle_count), "M": int(body_points), "k": others}
-        self._recorded = SERIES | (OTHERS if others else {})
+        self._recorded = SERIES | (OTHERS if others else {}) | (SPREAD if spread else {})
         self._shapes = {  # of one frame
             name: tuple(counts[size] if isinstance(size, str) else size for size in recorded.tail)
             for name, recorded in self._recorded.items()
         }
         self._small: dict[str, list[np.ndarray]] = {
-            name: [] for name in (*ContentHash.ORDER, *(OTHERS if others else ())) if name not in VIEWS
+            name: [] for name in ("time", *self._recorded) if name not in VIEWS
         }
         self._hash = ContentHash()
         extra = extra or {}
@@ -255,7 +258,7 @@ class RunWriter:
         body_pose: np.ndarray,
         force: np.ndarray,
         torque: np.ndarray,
-        others: tuple[np.ndarray, ...] = (),
+        more: tuple[np.ndarray, ...] = (),
     ) -> None:
         """Write one frame.
 
@@ -267,7 +270,8 @@ class RunWriter:
             body_pose: centre of mass [m] and quaternion x y z w, shape (7,).
             force: by the soil on the body [N], world frame, mean since the frame before, shape (3,).
             torque: likewise about the centre of mass [N m], shape (3,).
-            others: pose (k, 7), force and torque (k, 3) of the further bodies, if there are any.
+            more: pose (k, 7), force and torque (k, 3) of the further bodies, if there are any; then the spread of the
+                force [N], shape (3,), if it has one.
         """
         file = self._open_file()
         index = self.frame_count
@@ -281,8 +285,8 @@ class RunWriter:
             force,
             torque,
             body_pose,
-            *others,
-        )  # as in SERIES and OTHERS
+            *more,
+        )  # as in SERIES, OTHERS and SPREAD
         for (name, recorded), values in zip(self._recorded.items(), given, strict=True):
             # A float64 beyond float32's range becomes inf here and is reported below, so numpy need not warn.
             with np.errstate(over="ignore"):

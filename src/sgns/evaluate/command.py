@@ -300,6 +300,10 @@ def log_summary(evaluation: Evaluation, report: Path) -> None:
         f"computing time of one simulated second, on one thread: network along a path {timing.rollout:.3g} s (all "
         f"particles decoded {timing.decoded:.3g} s), pose by pose {timing.stepped:.3g} s; solver {timing.solver:.3g} s",
     ]
+    if not math.isnan(total.coverage):
+        lines.append(
+            f"band around the force: {100 * total.coverage:.0f} % of the true values are in it, 90 % are to be"
+        )
     if full := evaluation.full_space:
         lines.append(
             f"the same network on every particle: {full.rollout:.3g} s per simulated second, {full.training_step:.3g} "
@@ -415,7 +419,7 @@ def main(cfg: DictConfig) -> float:
     new_rollouts = [cfg.new_rollouts] if isinstance(cfg.new_rollouts, str) else cfg.new_rollouts or []
     checkpoint, output = Path(cfg.checkpoint), Path(cfg.output)
     published = cfg.dataset.get("format") == "published"
-    simulator = Simulator.load(checkpoint, device=cfg.device, num_modes=cfg.num_modes)
+    simulator = Simulator.load(checkpoint, cfg.device, cfg.num_modes, spread=cfg.spread)
     if not published:
         dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
     with only_here(output / "metrics.json"):

@@ -211,6 +211,7 @@ class Curve:
     colour: str  # of the line
     style: str = "-"  # matplotlib's name of the dashes
     scaled: bool = True  # whether the panel must be large enough for it
+    band: np.ndarray | None = None  # half its width around the line, shape (t,)
 
 
 @dataclass(frozen=True)
@@ -230,15 +231,18 @@ def compared(
     prediction: Any,
     history: int,
     baseline: np.ndarray | None = None,
+    spread: np.ndarray | None = None,
 ) -> list[Panel]:
     """A panel for each of k values that `read` takes from a `Run`, shape (T, k): the truth (None for a path that was
-    never simulated), the prediction after its history, and perhaps a baseline, the training runs' mean (k,).
+    never simulated), the prediction after its history, perhaps with the spread (T, k) around it, and perhaps a
+    baseline, the training runs' mean (k,).
     """
     time, predicted = prediction.time, read(prediction)
     simulated = None if truth is None else read(truth)
     panels = []
     for column, label in enumerate(labels):
-        curves = [Curve("network", time[history:], predicted[history:, column], NETWORK)]
+        band = None if spread is None else spread[history:, column]
+        curves = [Curve("network", time[history:], predicted[history:, column], NETWORK, band=band)]
         if simulated is not None:
             curves.insert(0, Curve("simulated (MPM)", time, simulated[:, column], TRUTH))
         if baseline is not None:
@@ -263,7 +267,12 @@ def force_panels(truth: Any, prediction: Any, history: int, mean_force: np.ndarr
     def read(run: Any) -> np.ndarray:
         return named_forces(run.scene, run.force)[1]
 
-    panels = compared([f"{name} [N]" for name in names], read, *runs, mean)
+    spread = prediction.force_spread
+    if (
+        spread is not None
+    ):  # of a turned wheel's directions, as if the axes' errors had nothing to do with each other
+        spread = np.sqrt(spread**2 @ named_forces(prediction.scene, np.eye(3))[1] ** 2)
+    panels = compared([f"{name} [N]" for name in names], read, *runs, mean, spread)
     # A small component is drawn as small as it is beside the largest.
     ranges = [float(np.ptp(curve.values)) for panel in panels for curve in panel.curves if len(curve.values)]
     panels = [replace(panel, least_height=SMALLEST_PANEL * max(ranges, default=0.0)) for panel in panels]
@@ -325,6 +334,9 @@ def history_figure(panels: Sequence[Panel]) -> Figure:
         for curve in panel.curves:
             (line,) = axis.plot(curve.time, curve.values, curve.style, color=curve.colour, label=curve.label)
             lines.setdefault(curve.label, line)
+            if curve.band is not None:
+                low, high = curve.values - curve.band, curve.values + curve.band
+                axis.fill_between(curve.time, low, high, color=curve.colour, alpha=0.25, linewidth=0.0)
         axis.set_ylim(*limits(panel))
         axis.set_ylabel(panel.label, fontsize=9)
     axes[-1].set_xlabel("time [s]")
@@ -337,7 +349,11 @@ def history_figure(panels: Sequence[Panel]) -> Figure:
 
 def limits(panel: Panel) -> tuple[float, float]:
     """Range of the vertical axis."""
-    scaled = [curve.values[np.isfinite(curve.values)] for curve in panel.curves if curve.scaled]
+    drawn = [curve for curve in panel.curves if curve.scaled]
+    lines = [curve.values for curve in drawn]
+    for curve in drawn:
+        lines += [] if curve.band is None else [curve.values - curve.band, curve.values + curve.band]
+    scaled = [values[np.isfinite(values)] for values in lines]
     values = np.concatenate([*scaled, [0.0]] if panel.from_zero else scaled)
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     missing = max(panel.least_height - (high - low), 0.0)

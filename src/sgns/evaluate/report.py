@@ -296,8 +296,13 @@ def histories(evaluation: Evaluation) -> list[FigureGroup]:
     for run in evaluation.runs[:MOST_RUNS]:
         scores = run.scores
         nrmse, rmse = fixed(scores.force.overall_nrmse), number(scores.rmse_mm("total"))
+        band = (
+            ""
+            if math.isnan(scores.coverage)
+            else f"; {100 * scores.coverage:.0f} % of the true values in the band"
+        )
         captions = {
-            "force": f"NRMSE {nrmse}. {run.words}",
+            "force": f"NRMSE {nrmse}{band}. {run.words}",
             "torque": f"NRMSE {fixed(scores.torque.overall_nrmse)}.",
             "error": f"Position RMSE {rmse} mm, force NRMSE {nrmse}.",
         }

@@ -56,6 +56,8 @@ class Scores:
     # mean-square distance of the body from its true place [m²]; 0 where its path was given
     body_mse: float = 0.0
     sinkage_mae: float = math.nan  # mean absolute error of a wheel's sinkage [m]; NaN for other bodies
+    # share of the force's components within the prediction's spread, all frames [1]; NaN where it has none
+    coverage: float = math.nan
 
     def rmse_mm(self, name: str) -> float:
         """Root of a mean-square error [mm]."""
@@ -81,6 +83,7 @@ class Scores:
         row["contact_force_nrmse"] = self.contact.overall_nrmse
         row["contact_mean_force_nrmse"] = self.contact_mean.overall_nrmse
         row |= {"body_rmse_mm": 1e3 * math.sqrt(self.body_mse), "sinkage_mae_mm": 1e3 * self.sinkage_mae}
+        row["force_coverage"] = self.coverage
         row["solver_wall_s_per_s"] = self.solver_rate
         return row
 
@@ -129,14 +132,22 @@ def run_scores(
         solver_rate=float(wall) / simulated if wall else math.nan,
         body_mse=body.mse,
         sinkage_mae=body.sinkage_mae,
+        coverage=covered(force, prediction, history),
     )
+
+
+def covered(force: np.ndarray, prediction: Any, history: int) -> float:
+    """Share of the components of the true force (t, 3) within the prediction's spread; NaN where it has none."""
+    if prediction.force_spread is None:
+        return math.nan
+    return float(np.mean(np.abs(prediction.force[history:] - force) <= prediction.force_spread[history:]))
 
 
 def aggregate(runs: Sequence[Scores], name: str = "all runs") -> Scores:
     """Scores of several runs together.
 
     Position errors are means over runs, so that skill is 1 − Σ MSE / Σ MSE of the baseline; forces are pooled
-    over all frames; |MPE|, sinkage and the solver's time are means over the runs that have them.
+    over all frames; |MPE|, sinkage, coverage and the solver's time are means over the runs that have them.
     """
     first = runs[0]
 
@@ -151,6 +162,7 @@ def aggregate(runs: Sequence[Scores], name: str = "all runs") -> Scores:
         solver_rate=mean_of_known([run.solver_rate for run in runs]),
         body_mse=float(np.mean([run.body_mse for run in runs])),
         sinkage_mae=mean_of_known([run.sinkage_mae for run in runs]),
+        coverage=mean_of_known([run.coverage for run in runs]),
     )
 
 

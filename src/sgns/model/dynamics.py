@@ -89,6 +89,27 @@ class Standardiser(nn.Module):
         return value.double() * self.scale + self.mean
 
 
+COVERED = 0.9
+"""Share of the truth that a band is to hold."""
+
+
+def together(members: np.ndarray, band: np.ndarray | float) -> tuple[np.ndarray, np.ndarray | None]:
+    """Mean of what some members say (m, ...) and half the width of their band; of one alone what it says, and None."""
+    if len(members) == 1:
+        return members[0], None
+    return members.mean(axis=0), band * members.std(axis=0, ddof=1)
+
+
+def fitted_band(members: np.ndarray, truth: np.ndarray) -> float:
+    """How many deviations of the members (m, ...) to both sides of their mean hold the share `COVERED` of the truth
+    (...); what they agree on to the bit, or what is not finite, does not count."""
+    mean, deviation = together(members, 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.abs(mean - truth) / deviation
+    ratio = ratio[np.isfinite(ratio)]
+    return float(np.quantile(ratio, COVERED)) if ratio.size else 1.0
+
+
 class Step(NamedTuple):
     """One step in physical units, float64. The displacement is the prescribed one, with what is predicted in its place
     along the free axes."""
@@ -121,11 +142,14 @@ class Dynamics(nn.Module):
         lowest: Latent positions that no step goes below [m], shape (r, 3) or those of more modes; without bound until
             the surrogate that it is a part of tells it.
         highest: Likewise.
+        band: Of several members, how many of their deviations to both sides of their mean hold 90 % of the validation
+            runs, shape (4,): force x, y, z, and all the modes' coordinates.
     """
 
     force: Standardiser
     lowest: Tensor
     highest: Tensor
+    band: Tensor
 
     def __init__(
         self,
@@ -147,6 +171,15 @@ class Dynamics(nn.Module):
     def history(self) -> int:
         """d, positions of history."""
         return self.settings.history
+
+    @property
+    def members(self) -> int:
+        """Of an ensemble, how many dynamics it is."""
+        return 1
+
+    def member(self, index: int) -> Dynamics:
+        """One of them, from 0, alone; the weights are shared."""
+        return self
 
     def card(self) -> dict[str, Any]:
         """Plain values from which the same dynamics can be built, to be filled from a state dict."""

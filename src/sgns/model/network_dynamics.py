@@ -36,11 +36,13 @@ class Prediction(NamedTuple):
 class LatentDynamics(Dynamics):
     """Graph network on modes and body nodes, with the statistics that make its inputs and outputs of order one.
 
-    Arguments as of `Dynamics`; every node is told the context.
+    Arguments as of `Dynamics`; every node is told the context. Of several members each has a network of its own: a
+    batch is theirs in turn, in equal shares.
     """
 
     settings: ModelSettings
     free: Tensor
+    others: nn.ModuleList  # what the members after the first have of their own
 
     def __init__(
         self,
@@ -48,6 +50,7 @@ class LatentDynamics(Dynamics):
         num_modes: int,
         context: tuple[str, ...] = (),
         predicts_body: bool = False,
+        members: int = 1,
     ) -> None:
         super().__init__(settings, num_modes, context, predicts_body)
         pose = settings.body_nodes == "pose"
@@ -58,18 +61,29 @@ class LatentDynamics(Dynamics):
         body_width = place + (6 if pose else 0) + motion * motions
         # A learned vector for each mode, or one for all of them, and one for the body's nodes.
         vectors = num_modes if settings.identity == "mode" else 1
-        self.identity = nn.Embedding(vectors + 1, settings.identity_width)
-        self.network = EncodeProcessDecode(
-            max(mode_width, body_width) + settings.identity_width + len(context),
-            4 if settings.edge_length else 3,
-            9 if settings.torque else 6,
-            settings.hidden_width,
-            settings.hidden_layers,
-            settings.message_passing_steps,
-            settings.layer_norm,
-            settings.residual,
-            settings.activation,
-        )
+
+        def learned() -> dict[str, nn.Module]:
+            identity = nn.Embedding(vectors + 1, settings.identity_width)
+            network = EncodeProcessDecode(
+                max(mode_width, body_width) + settings.identity_width + len(context),
+                4 if settings.edge_length else 3,
+                9 if settings.torque else 6,
+                settings.hidden_width,
+                settings.hidden_layers,
+                settings.message_passing_steps,
+                settings.layer_norm,
+                settings.residual,
+                settings.activation,
+            )
+            return {"identity": identity, "network": network}
+
+        self.identity: nn.Embedding
+        self.network: EncodeProcessDecode
+        for name, part in learned().items():
+            self.add_module(name, part)
+        self.others = nn.ModuleList(nn.ModuleDict(learned()) for _ in range(members - 1))
+        if members > 1:
+            self.register_buffer("band", torch.ones(4, dtype=torch.float64))
         self.position = Standardiser.empty(num_modes, 3)
         self.velocity = Standardiser.empty(num_modes, 3)
         self.change = Standardiser.empty(num_modes, 3)
@@ -90,7 +104,9 @@ class LatentDynamics(Dynamics):
             if model[key] > len(state):
                 raise ValueError(f"model.{key} is {model[key]}, but there are {len(state)} tensors of it")
         told = tuple(map(str, card["context"])), bool(card["predicts_body"])
-        arguments = ModelSettings(**model), int(card["num_modes"]), *told
+        if not 1 <= (members := int(card.get("members", 1))) <= len(state):
+            raise ValueError(f"members is {members}, but there are {len(state)} tensors of them")
+        arguments = ModelSettings(**model), int(card["num_modes"]), *told, members
         with torch.device("meta"):  # shapes without memory
             described = cls(*arguments).state_dict()
         for name, value in described.items():
@@ -106,13 +122,40 @@ class LatentDynamics(Dynamics):
         fewer.num_modes, fewer._edges = num_modes, {}
         for name in ("position", "velocity", "change"):
             setattr(fewer, name, getattr(self, name)[:num_modes])
+
+        def first(identity: nn.Embedding) -> nn.Embedding:
+            weight = torch.cat([identity.weight[:num_modes], identity.weight[-1:]])
+            return nn.Embedding.from_pretrained(weight, freeze=False)
+
         if self.settings.identity == "mode":
-            weight = torch.cat([self.identity.weight[:num_modes], self.identity.weight[-1:]])
-            fewer.identity = nn.Embedding.from_pretrained(weight, freeze=False)
+            fewer.identity = first(self.identity)
+            fewer.others = nn.ModuleList(
+                nn.ModuleDict(dict(other.items()) | {"identity": first(other["identity"])})
+                for other in self.others
+            )
         return fewer
 
+    @property
+    def members(self) -> int:
+        return 1 + len(self.others)
+
+    def card(self) -> dict[str, Any]:
+        return super().card() | ({"members": self.members} if self.members > 1 else {})
+
+    def member(self, index: int) -> LatentDynamics:
+        if self.members == 1:
+            return self
+        alone = copy.copy(self)
+        alone._modules = dict(self._modules)
+        if index > 0:
+            for name, part in self.others[index - 1].items():
+                alone.add_module(name, part)
+        alone.others = nn.ModuleList()
+        return alone
+
     def forward(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Prediction:
-        """Predict one step of every window in a batch; arguments as for `advance`."""
+        """Predict one step of every window in a batch; arguments as for `advance`. The first windows are the first
+        member's, the next ones the second's."""
         modes, nodes = latent.shape[-2], body.position.shape[-2]
         edge_index = self.edge_index(modes, nodes, latent.device)
         features, edges = build_graph(
@@ -122,8 +165,17 @@ class LatentDynamics(Dynamics):
             edge_index,
             self.settings.edge_length,
         )
-        told = self.told(modes, nodes, latent.shape[0], context)
-        return self.read(self.network(torch.cat([features, told], dim=-1), edges, edge_index))
+        members, share = map(self.member, range(self.members)), len(latent) // self.members
+        contexts = [None] * self.members if context is None else context.split(share)
+        decoded = [
+            member.network(
+                torch.cat([own, member.told(modes, nodes, share, numbers)], dim=-1), own_edges, edge_index
+            )
+            for member, own, own_edges, numbers in zip(
+                members, features.split(share), edges.split(share), contexts, strict=True
+            )
+        ]
+        return self.read(torch.cat(decoded))
 
     def read(self, decoded: Tensor) -> Prediction:
         """The prediction in what the network decodes, shape (B, V, 6 or 9)."""

@@ -84,6 +84,8 @@ def main(cfg: DictConfig) -> float:
 def next_commands(checkpoint: Path, reduced: ReducedDataset, given: Sequence[str]) -> list[str]:
     """What to type after a training with these overrides."""
     file = f"checkpoint={shlex.quote(str(checkpoint))}"
+    members = read_checkpoint(checkpoint)["hyper_parameters"].get("members", 1)
+    file += " spread=true" * (members > 1)
     lines = [f"next: sgns evaluate {' '.join([*of_dataset(given), file])}"]
     scene = reduced.runs("train")[0].scene
     if "bed" in scene:  # published runs have no particles

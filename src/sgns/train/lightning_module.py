@@ -202,7 +202,7 @@ def prepared(
     windows = TrainingWindows(
         runs, num_modes, model.history, model.body_nodes, seed, settings.horizon, context
     )
-    dynamics = LatentDynamics(model, num_modes, context, moves_freely(runs))
+    dynamics = LatentDynamics(model, num_modes, context, moves_freely(runs), settings.members)
     noise = fit_normalisation(
         dynamics, windows, settings.noise, settings.noise_unit, settings.scales, settings.normalisation_floor
     )
@@ -216,6 +216,11 @@ def prepared(
                 f"{start_from} has another model or another bed; use the same model.* and "
                 "dataset, or checkpoint=null"
             )
+        if other.members != settings.members:
+            raise UserError(
+                f"training.members is {settings.members} and {start_from} has {other.members}; use as many, or "
+                "checkpoint=null"
+            )
         if not torch.equal(given.basis.modes, reduced.basis.modes[:, :num_modes]):
             raise UserError(
                 f"{start_from} belongs to another basis; use the dataset it was trained on, or "
@@ -223,7 +228,7 @@ def prepared(
             )
         dynamics = other.requires_grad_(True).train()
     surrogate = Surrogate.of(dynamics, reduced, card)
-    return surrogate, WindowLoader(windows, settings.batch_size, noise)
+    return surrogate, WindowLoader(windows, settings.windows, noise)
 
 
 def require_resumable(last: Path, trainer: L.Trainer, module: SurrogateTraining) -> None:
@@ -292,7 +297,7 @@ class WholeCheckpoints(TorchCheckpointIO):
 
 def make_trainer(task: Task, callbacks: list[L.Callback]) -> L.Trainer:
     """Lightning's trainer: by steps, one device, no validation loop of its own (see `RolloutValidation`)."""
-    settings, device = task.settings, task.device
+    settings, device, clip = task.settings, task.device, task.settings.gradient_clip
     if device not in ("cpu", "cuda"):
         raise UserError(f"device is {device!r}; allowed: cpu, cuda")
     if device == "cuda" and not torch.cuda.is_available():
@@ -309,7 +314,8 @@ def make_trainer(task: Task, callbacks: list[L.Callback]) -> L.Trainer:
         logger=task.logger,
         callbacks=callbacks,
         log_every_n_steps=settings.log_every,
-        gradient_clip_val=settings.gradient_clip,
+        # The loss is a mean over members: its gradient's norm is that of one member's over √members.
+        gradient_clip_val=clip and clip / math.sqrt(settings.members),
         num_sanity_val_steps=0,
         enable_checkpointing=False,
         enable_progress_bar=False,

@@ -18,7 +18,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from sgns.model.dynamics import Dynamics
+from sgns.model.dynamics import Dynamics, fitted_band
 from sgns.model.features import BodyTrack, body_track, context_of
 from sgns.reduction.basis import left_out
 from sgns.train.windows import filled, require_finite
@@ -63,6 +63,7 @@ class RolloutScore(NamedTuple):
     force_nrmse_at_rest: float
     body_rmse: float  # RMS distance between predicted and true body nodes [m]; 0 for a prescribed body
     force: Tensor  # predicted from d true frames [N], shape (B, T, 3), zero in the history
+    band: list[float] | None  # of several members, see `Dynamics`; the rest is of their mean
 
     @property
     def errors(self) -> tuple[float, float, float, float]:
@@ -136,8 +137,12 @@ class ValidationRollouts:
         """Roll every run out twice, from d true frames and from rest."""
         given, start = self.latent[:, : self.history], self.latent[:, :1].expand(-1, self.history, -1, -1)
         with torch.inference_mode():
-            latent, force, body = self.rolled(dynamics, given, self.body)
-            at_rest, force_at_rest, _ = self.rolled(dynamics, start, self.body_at_rest)
+            each = self.rolled(dynamics, given, self.body)
+            band = self.fitted_band(*each[:2]) if dynamics.members > 1 else None
+            latent, force, body = (part.mean(0) for part in each)
+            at_rest, force_at_rest, _ = (
+                part.mean(0) for part in self.rolled(dynamics, start, self.body_at_rest)
+            )
             at_rest, force_at_rest = at_rest[:, self.padding :], force_at_rest[:, self.padding :]
             frozen, error, error_at_rest = (
                 self.squares(part - self.latent) for part in (given[:, -1:], latent, at_rest)
@@ -156,7 +161,14 @@ class ValidationRollouts:
                 self.force_error(force_at_rest),
                 self.body_error(body) if dynamics.predicts_body else 0.0,
                 force,
+                band,
             )
+
+    def fitted_band(self, latent: Tensor, force: Tensor) -> list[float]:
+        """The band of members' rollouts (m, B, T, ...), see `Dynamics`."""
+        pairs = [(force[..., axis], self.force[..., axis]) for axis in range(3)] + [(latent, self.latent)]
+        counted = self.counted.numpy()
+        return [fitted_band(each.numpy()[:, counted], truth.numpy()[counted]) for each, truth in pairs]
 
     def squares(self, error: Tensor) -> float:
         """Sum over runs of the mean square over a run's counted frames; infinite where a rollout is not finite."""
@@ -173,25 +185,30 @@ class ValidationRollouts:
         )
         return (error / max(truth, 1e-30)) ** 0.5 if np.isfinite(error) else float("inf")
 
-    def body_error(self, body: BodyTrack) -> float:
+    def body_error(self, position: Tensor) -> float:
         """RMS distance of body nodes from where they are in truth, over all counted frames [m]."""
-        squares = (body.position - self.body.position).square().sum(-1).nanmean(-1)
+        squares = (position - self.body.position).square().sum(-1).nanmean(-1)
         error = float(torch.where(self.counted, squares, 0.0).sum() / self.counted.sum())
         return error**0.5 if np.isfinite(error) else float("inf")
 
-    def rolled(self, dynamics: Dynamics, latent: Tensor, body: BodyTrack) -> tuple[Tensor, Tensor, BodyTrack]:
-        """Latent positions [m], force [N] and body of an unrolling, computed where the dynamics are, on the CPU."""
-        device = next(dynamics.parameters()).device
-        found = BodyTrack(*(part.clone() for part in body))
-        states = torch.empty(*body.position.shape[:2], *latent.shape[2:], dtype=latent.dtype)
-        force = torch.empty(*body.position.shape[:2], 3, dtype=latent.dtype)
+    def rolled(self, dynamics: Dynamics, latent: Tensor, body: BodyTrack) -> tuple[Tensor, Tensor, Tensor]:
+        """Latent positions [m], force [N] and body's positions [m] of an unrolling by each member, (m, B, T, ...),
+        computed where the dynamics are, on the CPU."""
+        device, members = next(dynamics.parameters()).device, dynamics.members
+        size = members, *body.position.shape[:2]
+        position = body.position.expand(members, -1, -1, -1, -1).clone()
+        states = torch.empty(*size, *latent.shape[2:], dtype=latent.dtype)
+        force = torch.empty(*size, 3, dtype=latent.dtype)
         for count in self.nodes.unique():
             of = torch.nonzero(self.nodes == count)[:, 0]
-            track = BodyTrack(*(part[of][:, :, :count].to(device) for part in body))
-            path = dynamics.unroll(latent[of].to(device), track, self.context[of].to(device))
-            states[of], force[of] = path.latent.cpu(), path.force.cpu()
-            found.position[of, :, :count] = path.body.position.cpu()
-        return states, force, found
+            of_all = of.repeat(members)
+            track = BodyTrack(*(part[of_all][:, :, :count].to(device) for part in body))
+            path = dynamics.unroll(latent[of_all].to(device), track, self.context[of_all].to(device))
+            states[:, of], force[:, of], position[:, of, :, :count] = (
+                part.cpu().unflatten(0, (members, -1))
+                for part in (path.latent, path.force, path.body.position)
+            )
+        return states, force, position
 
 
 def force_figure(rollouts: ValidationRollouts, score: RolloutScore, most: int = 4) -> Figure:
@@ -260,7 +277,7 @@ class RolloutValidation(L.Callback):
         elif step % self.settings.log_every == 0:
             before, then = self._mark
             now = time.perf_counter()
-            rate = (step - before) * self.settings.batch_size / elapsed(then, now)
+            rate = (step - before) * self.settings.windows / elapsed(then, now)
             self._mark = (step, now)
             current = trainer.optimizers[0].param_groups[0]["lr"]
             logger_of(trainer).log_metrics({"samples_per_s": rate, "learning_rate": current}, step)
@@ -274,6 +291,8 @@ class RolloutValidation(L.Callback):
         self.require_finite_weights(step)
         trainer.lightning_module.eval()
         score = self.rollouts.measure(self.surrogate.dynamics)
+        if score.band is not None:
+            self.surrogate.dynamics.band.copy_(torch.tensor(score.band, dtype=torch.float64))
         trainer.lightning_module.train()
         logger = logger_of(trainer)
         logger.log_metrics(

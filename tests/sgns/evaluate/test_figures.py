@@ -176,7 +176,7 @@ def test_a_force_along_an_axis_without_any_is_left_out(truth, prediction):
         force = prediction.force * [forward, 0.0, forward]
         force[:, 1] = lateral * np.abs(prediction.force).max()
         pushed = SimpleNamespace(
-            time=prediction.time, force=force, scene=prediction.scene, pose=prediction.pose
+            time=prediction.time, force=force, scene=prediction.scene, pose=prediction.pose, force_spread=None
         )
         panels = force_panels(None, pushed, HISTORY, MEAN)
         # A small component is not blown up.
@@ -193,12 +193,16 @@ def test_a_turned_wheel_is_compared_along_its_heading_and_its_axle(tmp_path):
     scene = WHEEL | {"slip_angle": 90.0}
     run = Run(make_run(tmp_path / "run.h5", frames=20, n=60, scene=scene))
     force = np.array([3.0, 2.0, 1.0]) * np.linspace(0.0, 1.0, 20)[:, None]
-    wheel = SimpleNamespace(time=run.time, force=force, torque=force, scene=run.scene, pose=run.pose)
+    spread = 0.1 * force
+    wheel = SimpleNamespace(
+        time=run.time, force=force, torque=force, scene=run.scene, pose=run.pose, force_spread=spread
+    )
     panels = force_panels(wheel, wheel, HISTORY, np.array([3.0, 2.0, 1.0]))
     labels = ["drawbar pull\n(along heading) [N]", "lateral force\n(along axle) [N]", "vertical Fz [N]"]
     assert [panel.label for panel in panels[:3]] == labels
     for panel, last in zip(panels, (2.0, -3.0, 1.0), strict=False):
         assert [curve.values[-1] for curve in panel.curves] == pytest.approx([last] * 3)
+        assert panel.curves[-1].band[-1] == pytest.approx(0.1 * abs(last))
     drive = torque_panels(wheel, wheel, HISTORY, np.zeros(3))[1]
     assert drive.label == "drive torque\n(about axle) [N m]"
     assert curves(drive)["network"].values[-1] == pytest.approx(-3.0)
@@ -219,6 +223,24 @@ def test_wheel_has_drawbar_pull_and_its_own_sinkage(tmp_path):
     ):
         assert depths[label].values == pytest.approx(1e3 * (0.15 - run.pose[frames, 2]))
     pixels(history_figure(panels))
+
+
+def test_the_spread_is_a_band_around_the_predicted_force(truth, prediction):
+    spread = np.linspace(0.0, 60.0, 20)[:, None] * [1.0, 0.1, 0.5]
+    told = SimpleNamespace(
+        **{name: getattr(prediction, name) for name in ("time", "force", "scene", "pose")},
+        force_spread=spread,
+    )
+    panels = force_panels(truth, told, HISTORY, MEAN)
+    assert curves(panels[1])["network"].band == pytest.approx(spread[HISTORY:, 2])
+    low, high = limits(panels[0])
+    assert low < (-told.force[:, 0] - spread[:, 0]).min() and high > (-told.force[:, 0] + spread[:, 0]).max()
+    figure, plain = history_figure(panels), history_figure(force_panels(truth, prediction, HISTORY, MEAN))
+    assert [len(axis.collections) for axis in figure.axes] == [1, 1]
+    assert [len(axis.collections) for axis in plain.axes] == [0, 0]
+    (edge,) = figure.axes[0].collections[0].get_paths()
+    assert np.ptp(edge.vertices[:, 1]) > 60.0
+    pixels(figure)
 
 
 def test_path_without_truth(prediction):

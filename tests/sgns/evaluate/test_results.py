@@ -43,7 +43,7 @@ def test_typical_and_worst_by_position_and_force():
 def test_force_in_contact_leaves_rest_out():
     force = np.zeros((8, 3))
     force[4:, 0] = [-90.0, -110.0, -90.0, -110.0]
-    guess = SimpleNamespace(force=np.full((8, 3), [-80.0, 0.0, 0.0]))
+    guess = SimpleNamespace(force=np.full((8, 3), [-80.0, 0.0, 0.0]), force_spread=None)
     time = np.arange(8) / 60.0
     truth = SimpleNamespace(time=time, force=force, torque=force, wall_time_s=None)
     guess.torque = guess.force
@@ -53,6 +53,10 @@ def test_force_in_contact_leaves_rest_out():
     assert row["contact_force_nrmse"] == pytest.approx(math.sqrt(10.0**2 + 30.0**2) / rms)
     assert row["contact_mean_force_nrmse"] == pytest.approx(math.sqrt(2.0) * 10.0 / rms)
     assert row["force_nrmse"] == pytest.approx(0.605, abs=1e-3)  # at rest there was no force
+    assert math.isnan(row["force_coverage"])
+    guess.force_spread = np.full((8, 3), 15.0)  # of x two of six frames, of y and z all
+    row = run_scores("a", errors, truth, guess, 2, guess.force[0], np.zeros(3)).row()
+    assert row["force_coverage"] == pytest.approx(14 / 18)
     still = SimpleNamespace(time=time, force=0.0 * force, torque=force, wall_time_s=None)
     assert math.isnan(
         run_scores("a", errors, still, guess, 2, guess.force[0], np.zeros(3)).row()["contact_force_nrmse"]

@@ -1,8 +1,10 @@
 """Means and scales: round trip, nothing blown up, float64 before float32."""
 
+import numpy as np
+import pytest
 import torch
 
-from sgns.model.dynamics import Standardiser
+from sgns.model.dynamics import Standardiser, fitted_band, together
 
 
 def test_round_trip() -> None:
@@ -45,3 +47,22 @@ def test_small_movements_of_large_positions_survive() -> None:
 def test_an_empty_quantity() -> None:
     standard = Standardiser.fit(torch.zeros(5, 0))
     assert standard.normalise(torch.zeros(2, 0)).shape == (2, 0)
+
+
+def test_a_band_holds_nine_of_ten_truths() -> None:
+    """Two members one apart, so that their deviation is √½, and truths 0, 1, ... 100 from their mean."""
+    members = np.stack([np.full(101, 4.5), np.full(101, 5.5)])
+    truth = 5.0 + np.arange(101.0) * (-1) ** np.arange(101)
+    factor = fitted_band(members, truth)
+    assert factor == pytest.approx(90.0 / np.sqrt(0.5))
+    mean, half = together(members, factor)
+    assert np.mean(np.abs(truth - mean) <= half + 1e-9) == pytest.approx(91 / 101)
+
+
+def test_what_members_agree_on_has_no_spread_and_no_say_in_the_band() -> None:
+    alike = np.stack([np.ones((5, 3))] * 2)
+    assert not together(alike, 7.0)[1].any() and fitted_band(alike, np.zeros((5, 3))) == 1.0
+    members = np.stack([[0.0, 1.0, np.nan], [2.0, 1.0, np.nan]])  # of three truths one can be told
+    assert fitted_band(members, np.array([3.0, 9.0, 9.0])) == pytest.approx(np.sqrt(2.0))
+    said, half = together(alike[:1], 7.0)
+    assert half is None and said is not None

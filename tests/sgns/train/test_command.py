@@ -19,19 +19,22 @@ import torch
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from mpm_warp.poses import in_body_frame
 from sgns.config import Interrupted, UserError
 from sgns.data.dataset import Dataset
 from sgns.data.run import Run
 from sgns.evaluate.command import evaluate
 from sgns.model.checkpoint import load_surrogate
 from sgns.model.dynamics import Path, Standardiser
+from sgns.model.features import BodyTrack
 from sgns.reduction.reduce import reduce_dataset
-from sgns.settings import TrainingSettings
+from sgns.settings import TrainingSettings, model_settings
 from sgns.simulator import Simulator
 from sgns.train import lightning_module as module
 from sgns.train import validation
 from sgns.train.command import main, train
 from sgns.train.validation import ValidationRollouts
+from sgns.train.windows import Batch
 from sgns_testing.commands import TRAIN, environment
 from sgns_testing.tiny import BRIEF, MODEL, REDUCTION, TRAINING, make_dataset
 
@@ -143,7 +146,7 @@ def test_what_tensorboard_shows(trained) -> None:
 class Known(torch.nn.Linear):
     """Gives the answers instead of learning them."""
 
-    predicts_body = False
+    predicts_body, members = False, 1
 
     def __init__(self, *answers) -> None:
         super().__init__(1, 1)
@@ -422,3 +425,81 @@ def test_before_the_first_checkpoint_an_interruption_says_that_nothing_is_kept(
     with pytest.raises(Interrupted) as caught:
         run(data, tmp_path, validate_every=70)
     assert caught.value.said == ""
+
+
+# --- several members ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ensemble(data, tmp_path_factory):
+    """Folder of a training of two members, only to be read."""
+    folder = tmp_path_factory.mktemp("ensemble")
+    run(data, folder, members=2)
+    return folder
+
+
+def test_members_differ_and_share_their_scales(ensemble) -> None:
+    dynamics = load_surrogate(ensemble / "best.ckpt").dynamics
+    assert dynamics.members == 2 and (dynamics.band > 0.0).all() and not (dynamics.band == 1.0).all()
+    first, second = (dynamics.member(index) for index in range(2))
+    assert first.members == 1 and torch.equal(first.force.scale, second.force.scale)
+    pairs = zip(first.parameters(), second.parameters(), strict=True)
+    assert not any(torch.equal(a, b) for a, b in pairs)
+
+
+def test_each_member_learns_from_its_own_windows_alone(data) -> None:
+    how = TrainingSettings.from_dict(TRAINING | {"members": 2, "batch_size": 6})
+    card = {"settings": {}, "frame_rate": 60.0, "scene": data.runs("train")[0].scene}
+    surrogate, loader = module.prepared(data, 4, model_settings(MODEL), how, 0, card, None)
+    batch = next(iter(loader))
+    assert len(batch.latent) == 6  # three each
+    trained = module.SurrogateTraining(surrogate, how)
+    halves = [
+        Batch(
+            *(
+                BodyTrack(*(p[rows] for p in part)) if isinstance(part, BodyTrack) else part[rows]
+                for part in batch
+            )
+        )
+        for rows in (slice(3), slice(3, None))
+    ]
+    whole, dynamics = trained.losses(batch), surrogate.dynamics
+    each = []
+    for index, half in enumerate(halves):
+        surrogate.dynamics = dynamics.member(index)
+        each.append(trained.losses(half))
+    for name, value in whole.items():
+        mean = sum(float(one[name].detach()) for one in each) / 2
+        assert float(value.detach()) == pytest.approx(mean, rel=1e-5)
+
+
+def test_the_band_holds_nine_tenths_of_the_validation_runs(data, ensemble) -> None:
+    simulator = Simulator.load(ensemble / "best.ckpt", spread=True)
+    force, soil = [], []
+    for one in data.runs("validation"):
+        points = in_body_frame(one.pose[0], one.body_points[0])
+        found = simulator.rollout(one.pose, points, one.latent[:3, :4])
+        force.append((np.abs(found.force - one.force) <= found.force_spread * (1 + 1e-5))[3:])
+        soil.append((np.abs(found.latent - one.latent[:, :4]) <= found.latent_spread * (1 + 1e-5))[3:])
+    assert np.concatenate(force).mean(axis=0) == pytest.approx(0.9, abs=0.06)  # a value more or less
+    assert np.concatenate(soil).mean() == pytest.approx(0.9, abs=0.01)
+
+
+def test_a_training_of_members_goes_on_and_begins_from_as_many(data, ensemble, tmp_path) -> None:
+    run(data, tmp_path, ensemble / "last.ckpt", members=2, max_steps=1, validate_every=1)
+    with pytest.raises(
+        UserError, match=r"training\.members is 1 and .* has 2; use as many, or checkpoint=null"
+    ):
+        run(data, tmp_path / "one", ensemble / "last.ckpt")
+    with pytest.raises(UserError, match=r"training\.members is 2 there and 3 here"):
+        run(data, ensemble, members=3)
+
+
+def test_fewer_modes_of_several_members(data, tmp_path) -> None:
+    run(data, tmp_path, members=2, fewer_modes=1.0, max_steps=3, validate_every=3)
+    path = data.runs("test")[0].pose
+    for spread in (False, True):
+        assert (
+            Simulator.load(tmp_path / "best.ckpt", num_modes=2, spread=spread).rollout(path).latent.shape[1]
+            == 2
+        )
