@@ -433,7 +433,8 @@ class Simulator:
         began = time.perf_counter()
         found = self._followed(poses[None], points, told, latent, given, loads)
         wall_time = elapsed(began, time.perf_counter())
-        states, force, torque, poses, world, *spread = (None if part is None else part[0] for part in found)
+        parts: list[Any] = [None if part is None else part[0] for part in found]
+        states, force, torque, poses, world, *spread = parts
         self._look(0, poses, points, context)
         excess = partial(self._surrogate.training_range.excess, poses, points, states, context)
         return Rollout(states, force, torque, poses, world, wall_time, excess, *spread)
@@ -484,9 +485,10 @@ class Simulator:
         for first in range(0, len(poses), paths_at_once):
             found = self._followed(poses[first : first + paths_at_once], points, told, start)
             parts.append((*found[:4], *found[5:]))
-        latent, force, torque, poses, *spread = (
+        whole: list[Any] = [
             None if part[0] is None else np.concatenate(part) for part in zip(*parts, strict=True)
-        )
+        ]
+        latent, force, torque, poses, *spread = whole
         return Rollouts(latent, force, torque, poses, elapsed(began, time.perf_counter()), *spread)
 
     def _require_finite(self, step: Step) -> None:
@@ -506,11 +508,11 @@ class Simulator:
         poses, latent = (np.stack(part) for part in zip(*self._shown, strict=True))
         # It holds nothing of the simulator that goes on changing.
         excess = partial(self._surrogate.training_range.excess, poses, self._points, latent, self._context)
-        _, force, torque, *spread = (None if part is None else part.copy() for part in self._answer)
+        _, force, torque, *spread = (part if part is None else part.copy() for part in self._answer)
         scene, newest = self._surrogate.card["scene"], (latent[-1].copy(), force, torque, poses[-1].copy())
         return State(self._frame, *newest, self.basis, scene, excess, *spread)
 
-    def _together(self, places: Sequence[_Place]) -> tuple[np.ndarray | None, ...]:
+    def _together(self, places: Sequence[_Place]) -> tuple[Any, ...]:
         """Newest latent positions, force and torque, the mean of all members, then the spread of force and modes."""
         latents = [place.latent[0, -1].cpu().numpy() for place in places]
         if len(places) == 1:

@@ -103,9 +103,8 @@ def together(members: np.ndarray, band: np.ndarray | float) -> tuple[np.ndarray,
 def fitted_band(members: np.ndarray, truth: np.ndarray) -> float:
     """How many deviations of the members (m, ...) to both sides of their mean hold the share `COVERED` of the truth
     (...); what they agree on to the bit, or what is not finite, does not count."""
-    mean, deviation = together(members, 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.abs(mean - truth) / deviation
+        ratio = np.abs(members.mean(axis=0) - truth) / members.std(axis=0, ddof=1)
     ratio = ratio[np.isfinite(ratio)]
     return float(np.quantile(ratio, COVERED)) if ratio.size else 1.0
 

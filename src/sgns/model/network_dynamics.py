@@ -8,7 +8,7 @@ W = T - d + 1 windows.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -42,7 +42,7 @@ class LatentDynamics(Dynamics):
 
     settings: ModelSettings
     free: Tensor
-    others: nn.ModuleList  # what the members after the first have of their own
+    others: Any  # what the members after the first have of their own
 
     def __init__(
         self,
@@ -166,7 +166,9 @@ class LatentDynamics(Dynamics):
             self.settings.edge_length,
         )
         members, share = map(self.member, range(self.members)), len(latent) // self.members
-        contexts = [None] * self.members if context is None else context.split(share)
+        contexts: Sequence[Tensor | None] = [None] * self.members
+        if context is not None:
+            contexts = context.split(share)
         decoded = [
             member.network(
                 torch.cat([own, member.told(modes, nodes, share, numbers)], dim=-1), own_edges, edge_index

@@ -56,12 +56,14 @@ def test_a_band_holds_nine_of_ten_truths() -> None:
     factor = fitted_band(members, truth)
     assert factor == pytest.approx(90.0 / np.sqrt(0.5))
     mean, half = together(members, factor)
+    assert half is not None
     assert np.mean(np.abs(truth - mean) <= half + 1e-9) == pytest.approx(91 / 101)
 
 
 def test_what_members_agree_on_has_no_spread_and_no_say_in_the_band() -> None:
     alike = np.stack([np.ones((5, 3))] * 2)
-    assert not together(alike, 7.0)[1].any() and fitted_band(alike, np.zeros((5, 3))) == 1.0
+    _, none = together(alike, 7.0)
+    assert none is not None and not none.any() and fitted_band(alike, np.zeros((5, 3))) == 1.0
     members = np.stack([[0.0, 1.0, np.nan], [2.0, 1.0, np.nan]])  # of three truths one can be told
     assert fitted_band(members, np.array([3.0, 9.0, 9.0])) == pytest.approx(np.sqrt(2.0))
     said, half = together(alike[:1], 7.0)
