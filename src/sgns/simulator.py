@@ -508,7 +508,8 @@ class Simulator:
         poses, latent = (np.stack(part) for part in zip(*self._shown, strict=True))
         # It holds nothing of the simulator that goes on changing.
         excess = partial(self._surrogate.training_range.excess, poses, self._points, latent, self._context)
-        _, force, torque, *spread = (part if part is None else part.copy() for part in self._answer)
+        copies: list[Any] = [part if part is None else part.copy() for part in self._answer]
+        _, force, torque, *spread = copies
         scene, newest = self._surrogate.card["scene"], (latent[-1].copy(), force, torque, poses[-1].copy())
         return State(self._frame, *newest, self.basis, scene, excess, *spread)
 
