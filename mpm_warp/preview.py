@@ -79,7 +79,7 @@ class Preview:
             )
         if touch is not None:
             warnings += near_floor(scene, float(low[deepest]))
-        warnings += near_wall(scene, times, poses)
+        warnings += near_wall(scene, times, poses) + beside_wall(scene, poses)
         lines = (
             _bin(scene) + scene.remarks() + ([] if scene.axle is not None else _way(scene, low, times, touch))
         )
@@ -201,6 +201,40 @@ def near_wall(scene: Scene, times: np.ndarray, poses: np.ndarray) -> list[str]:
                     f"scene.duration={max(0.0, times[pose - 1]):.3g} ends before that, or use a longer scene.bed.size"
                 ]
     return []
+
+
+def beside_wall(scene: Scene, poses: np.ndarray) -> list[str]:
+    """A line if a tool moves along a wall with less than a grid spacing of soil between them, at some of its poses
+    (T, 7). A wheel counts as in `near_wall`, and walls on which soil slips stand for more of the same soil."""
+    body, bed = scene.body, scene.bed
+    assert body is not None
+    outline, moved = body.outline(), np.diff(poses, axis=0, prepend=poses[:1])
+    places = poses[:, :3].copy()
+    if scene.axle is not None:
+        places[:, 2] = 0.75 * body.half_size[2]
+    around = np.abs(rotation_matrices(poses[:, 3:])) @ body.half_size
+    nearest, wall = bed.spacing - 1e-9, ""
+    for axis in (axis for axis in (0, 1) if bed.walls.conditions[axis] in ("no_slip", "friction")):
+        beside = np.abs(moved[:, axis]) <= 0.5 * np.linalg.norm(moved[:, :2], axis=1)
+        room = np.minimum(places[:, axis], bed.size[axis] - places[:, axis]) - around[:, axis]
+        maybe = np.flatnonzero(
+            moved.any(axis=1) & beside & (room < bed.spacing) & (places[:, 2] < around[:, 2])
+        )
+        for pose in maybe[:: 1 + len(maybe) // _MOST_LOOKED_AT]:
+            points = outline @ rotation_matrices(poses[pose, 3:]).T + places[pose]
+            across = points[points[:, 2] < 0.0, axis]
+            for at, gaps in ((0.0, across), (bed.size[axis], bed.size[axis] - across)):
+                if gaps.min(initial=nearest) < nearest:
+                    nearest, wall = float(gaps.min()), f"{'xy'[axis]} = {at:g} m"
+    if not wall:
+        return []
+    remedy = "use a wider scene.bed.size"
+    if getattr(scene, "path", None) is not None:
+        remedy = "lay scene.path further from it, in a wider scene.bed.size if need be"
+    return [
+        f"the tool comes to {_words(max(0.0, nearest))} from the wall at {wall}, less than one grid spacing: soil jams "
+        f"there and forces get too large; {remedy}"
+    ]
 
 
 def _sides(reach: np.ndarray) -> str:

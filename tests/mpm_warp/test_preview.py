@@ -235,6 +235,28 @@ def test_soil_that_will_be_pushed_against_a_wall_is_told():
     assert Preview.of(body(back, bed=channel)).warnings == ()
 
 
+def test_a_tool_that_moves_along_a_wall_is_told():
+    """Not of walls on which soil slips, nor of the wall behind a tool, nor above the soil."""
+
+    def told(rows, **kw):
+        return [one for one in Preview.of(body(rows, **kw)).warnings if "from the wall" in one]
+
+    [near] = told(np.subtract(ROWS, [0, 0, 0.19, 0]))  # the box is 0.2 m wide
+    assert "comes to 10 mm from the wall at y = 0 m, less than one grid spacing" in near
+    assert near.endswith("lay scene.path further from it, in a wider scene.bed.size if need be")
+    assert "from the wall at y = 0.6 m" in told(np.add(ROWS, [0, 0, 0.19, 0]))[0]
+    for rows in (
+        np.subtract(ROWS, [0, 0, 0.18, 0]),
+        np.subtract(ROWS, [0, 0, 0.19, -0.03]),
+        ROWS[1:] - [0.5, 0.15, 0, 0],
+    ):
+        assert told(rows) == []
+    slippery = Bed(size=(0.8, 0.6, 0.15), spacing=0.02, walls=Walls(y="slip"))
+    assert told(np.subtract(ROWS, [0, 0, 0.19, 0]), bed=slippery) == []
+    [wheel] = [one for one in Preview.of(Wheel(width=0.18)).warnings if "from the wall" in one]
+    assert wheel.endswith("too large; use a wider scene.bed.size")
+
+
 def test_how_a_tool_is_turned_at_the_start_is_told():
     """A quaternion written w, x, y, z stands the tool on its head; here its origin is its tip."""
     upright = Preview.of(body()).lines[0]
