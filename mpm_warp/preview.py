@@ -10,6 +10,7 @@ import numpy as np
 from .bed import PADDING
 from .poses import rotation_matrices, rotation_vectors
 from .scene import Scene
+from .scenes import Wheel
 from .settings import likely_radians
 from .tool_geometry import Odd, odd_size, odd_times, place_unit
 
@@ -64,7 +65,7 @@ class Preview:
         reach = np.stack([outline.min(axis=0), outline.max(axis=0)]) - body.path_point
         found = [odd_size(body, scene.bed.size, scene.open_sides), *_of_path(scene, low, touch)]
         odd = [one for one in found if one]
-        warnings += [one.words for one in odd]
+        warnings += [one.words for one in odd] or _throws(scene, times, touching)
         above = _to_begin_above(scene, -float(low[0]))
         if len(scene.own_displaced):
             deep = f", {_words(-low[0])} deep" if low[0] < 0.0 else ""
@@ -79,7 +80,7 @@ class Preview:
             )
         if touch is not None:
             warnings += near_floor(scene, float(low[deepest]))
-        warnings += near_wall(scene, times, poses)
+        warnings += near_wall(scene, times, poses) + beside_wall(scene, poses)
         lines = (
             _bin(scene) + scene.remarks() + ([] if scene.axle is not None else _way(scene, low, times, touch))
         )
@@ -137,14 +138,45 @@ def _buried(scene: Scene) -> list[str]:
 
 
 def near_floor(scene: Scene, lowest: float) -> list[str]:
-    """A line if a tool whose lowest point gets to this z [m] is too near to the floor. Of a wheel it is known
-    afterwards."""
+    """A line if a tool whose lowest point gets to this z [m] is too near to the floor."""
     above = scene.bed.size[2] + lowest
     if above >= scene.bed.spacing:
         return []
     return [
         f"the tool's lowest point comes to {_words(above)} above the floor, less than one grid spacing: soil jams "
         "there and forces get too large; use a deeper scene.bed.size"
+    ]
+
+
+def afterwards(scene: Scene, poses: np.ndarray) -> list[str]:
+    """What a user should know of a run of a wheel with these poses (T, 7), whose height was not known before."""
+    found, h = near_floor(scene, float(scene.lowest_points(poses).min())), scene.bed.spacing
+    if isinstance(scene, Wheel) and (sinkage := scene.mean_sinkage(poses)) < h / 3.0:
+        found.append(
+            f"the wheel's mean sinkage is {_words(sinkage)}, less than a third of a grid spacing ({_words(h)}): the "
+            "grid does not resolve it, and sinkage and forces may be wrong; use a finer scene.bed.spacing"
+        )
+    return found
+
+
+def _throws(scene: Scene, times: np.ndarray, touching: np.ndarray) -> list[str]:
+    """A line if a tool is so fast at one of the times (T,) [s], those with numbers `touching` in the soil, that soil
+    as fast as it flies higher than the grid."""
+    inside = touching[touching > 0]
+    if scene.axle is not None or scene.gravity == 0.0 or not len(inside):
+        return []
+    speeds = scene.largest_displacement(times) / np.maximum(np.diff(times), 1e-12)
+    fastest = inside[np.argmax(speeds[inside - 1])]
+    speed, room = float(speeds[fastest - 1]), scene.bed.headroom
+    height = 0.5 * speed**2 / scene.gravity
+    if height <= room:
+        return []
+    given = getattr(scene, "path", None) is not None
+    likely = "are the times of the path in seconds?" if given else "scene.speed is in m/s."
+    return [
+        f"the tool moves at up to {speed:.3g} m/s in the soil (at {times[fastest]:.3g} s): soil as fast as that flies "
+        f"{_words(height)} high, out of the grid (scene.bed.headroom={room:g} m); {likely} "
+        "If it is meant, raise scene.bed.headroom"
     ]
 
 
@@ -201,6 +233,40 @@ def near_wall(scene: Scene, times: np.ndarray, poses: np.ndarray) -> list[str]:
                     f"scene.duration={max(0.0, times[pose - 1]):.3g} ends before that, or use a longer scene.bed.size"
                 ]
     return []
+
+
+def beside_wall(scene: Scene, poses: np.ndarray) -> list[str]:
+    """A line if a tool moves along a wall with less than a grid spacing of soil between them, at some of its poses
+    (T, 7). A wheel counts as in `near_wall`, and walls on which soil slips stand for more of the same soil."""
+    body, bed = scene.body, scene.bed
+    assert body is not None
+    outline, moved = body.outline(), np.diff(poses, axis=0, prepend=poses[:1])
+    places = poses[:, :3].copy()
+    if scene.axle is not None:
+        places[:, 2] = 0.75 * body.half_size[2]
+    around = np.abs(rotation_matrices(poses[:, 3:])) @ body.half_size
+    nearest, wall = bed.spacing - 1e-9, ""
+    for axis in (axis for axis in (0, 1) if bed.walls.conditions[axis] in ("no_slip", "friction")):
+        beside = np.abs(moved[:, axis]) <= 0.5 * np.linalg.norm(moved[:, :2], axis=1)
+        room = np.minimum(places[:, axis], bed.size[axis] - places[:, axis]) - around[:, axis]
+        maybe = np.flatnonzero(
+            moved.any(axis=1) & beside & (room < bed.spacing) & (places[:, 2] < around[:, 2])
+        )
+        for pose in maybe[:: 1 + len(maybe) // _MOST_LOOKED_AT]:
+            points = outline @ rotation_matrices(poses[pose, 3:]).T + places[pose]
+            across = points[points[:, 2] < 0.0, axis]
+            for at, gaps in ((0.0, across), (bed.size[axis], bed.size[axis] - across)):
+                if gaps.min(initial=nearest) < nearest:
+                    nearest, wall = float(gaps.min()), f"{'xy'[axis]} = {at:g} m"
+    if not wall:
+        return []
+    remedy = "use a wider scene.bed.size"
+    if getattr(scene, "path", None) is not None:
+        remedy = "lay scene.path further from it, in a wider scene.bed.size if need be"
+    return [
+        f"the tool comes to {_words(max(0.0, nearest))} from the wall at {wall}, less than one grid spacing: soil jams "
+        f"there and forces get too large; {remedy}"
+    ]
 
 
 def _sides(reach: np.ndarray) -> str:

@@ -317,7 +317,14 @@ class Scene(Settings, Moved):
 
     def remarks(self) -> list[str]:
         """What holds for this scene by choice, and needs no warning."""
-        return []
+        count = self.bed.particles_per_cell
+        if self.body is None or count >= 2.0:
+            return []
+        particles = "one particle" if count == 1.0 else f"{count:g} particles"
+        return [
+            f"{particles} per cell: forces may be wrong by tens of per cent; scene.bed.particles_per_cell=4 takes "
+            f"{4.0 / count:.2g} times as long"
+        ]
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         """What came out, in a few words, of the soil's force on the body [N] and its torque about the centre of mass

@@ -113,9 +113,8 @@ class Excavation(Scene):
         return found
 
     def remarks(self) -> list[str]:
-        if _COARSE <= self.blade.thickness / self.bed.spacing < 2.0:
-            return [f"a coarse grid: {self._thickness()}"]
-        return []
+        coarse = _COARSE <= self.blade.thickness / self.bed.spacing < 2.0
+        return ([f"a coarse grid: {self._thickness()}"] if coarse else []) + super().remarks()
 
     def _thickness(self) -> str:
         return (
@@ -374,6 +373,13 @@ class Wheel(Scene):
         """See `sinkage`."""
         return sinkage(vars(self), poses)
 
+    def mean_sinkage(self, poses: np.ndarray) -> float:
+        """While driving [m], of poses (T, 7)."""
+        return float(self.sinkage(poses)[self._driving(len(poses))].mean())
+
+    def _driving(self, count: int) -> np.ndarray:
+        return self.times()[:count] > self.settle + 0.5 / self.frame_rate
+
     def warnings(self) -> list[str]:
         found = [*super().warnings(), *self._notes]
         if self.friction_angle is not None:
@@ -389,12 +395,12 @@ class Wheel(Scene):
         return found
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
-        driving = self.times()[: len(force)] > self.settle + 0.5 / self.frame_rate
+        driving = self._driving(len(force))
         pull, lateral, vertical = along_and_across(vars(self), force[driving].mean(axis=0))
         sideways = f"lateral force {lateral:.2f} N, " if self.slip_angle else ""
         return (
             f"while driving: mean drawbar pull {pull:.2f} N, {sideways}vertical force {vertical:.2f} N, "
-            f"sinkage {1000.0 * self.sinkage(poses)[driving].mean():.1f} mm, "
+            f"sinkage {1000.0 * self.mean_sinkage(poses):.1f} mm, "
             f"torque {along_and_across(vars(self), torque[driving].mean(axis=0))[1]:.3f} N m"
         )
 

@@ -21,6 +21,7 @@ from mpm_warp import (
     Wheel,
 )
 from mpm_warp.kernels.signed_distance import wall_kernel
+from mpm_warp.preview import afterwards
 from sgns_testing.meshes import box_corners, box_triangles
 from sgns_testing.scenes import cut
 
@@ -47,7 +48,11 @@ def test_where_a_tool_is_and_gets_to():
     assert found.first_touch == pytest.approx(0.07 / 0.18, abs=0.02)
     np.testing.assert_allclose(found.reach, [[-0.04, -0.1, -0.05], [0.04, 0.1, 0.05]])
     assert found.displaced == 0 and found.warnings == ()
-    origin, way = found.lines
+    origin, particles, way = found.lines
+    assert particles.startswith("one particle per cell: forces may be wrong by tens of per cent; ")
+    assert particles.endswith("scene.bed.particles_per_cell=4 takes 4 times as long")
+    finer = Bed(size=(0.8, 0.6, 0.15), spacing=0.02, particles_per_cell=2.0)
+    assert Preview.of(body(bed=finer)).lines == (origin, way)
     assert "from -40 to 40 mm along x, -100 to 100 mm along y, -50 to 50 mm along z" in origin
     assert way == "its lowest point gets 20 mm deep (at 0.50 s); it first touches soil at 0.40 s"
 
@@ -94,7 +99,7 @@ def test_a_tool_that_starts_in_the_soil_is_told():
     scene = body(ROWS[1:] - [0.5, 0, 0, 0.05])
     (found,) = Preview.of(scene).warnings
     assert f"in the soil at the start, 70 mm deep: {len(scene.displaced)} particles" in found
-    assert Preview.of(scene).lines[1].endswith("it is in the soil from the start")
+    assert Preview.of(scene).lines[2].endswith("it is in the soil from the start")
 
 
 @pytest.mark.parametrize(
@@ -233,6 +238,51 @@ def test_soil_that_will_be_pushed_against_a_wall_is_told():
     assert "against the wall at y = 0 m" in " ".join(Preview.of(body(back)).warnings)
     channel = Bed(size=(0.8, 0.6, 0.15), spacing=0.02, walls=Walls(y="periodic"))
     assert Preview.of(body(back, bed=channel)).warnings == ()
+
+
+def test_a_tool_that_moves_along_a_wall_is_told():
+    """Not of walls on which soil slips, nor of the wall behind a tool, nor above the soil."""
+
+    def told(rows, **kw):
+        return [one for one in Preview.of(body(rows, **kw)).warnings if "from the wall" in one]
+
+    [near] = told(np.subtract(ROWS, [0, 0, 0.19, 0]))  # the box is 0.2 m wide
+    assert "comes to 10 mm from the wall at y = 0 m, less than one grid spacing" in near
+    assert near.endswith("lay scene.path further from it, in a wider scene.bed.size if need be")
+    assert "from the wall at y = 0.6 m" in told(np.add(ROWS, [0, 0, 0.19, 0]))[0]
+    for rows in (
+        np.subtract(ROWS, [0, 0, 0.18, 0]),
+        np.subtract(ROWS, [0, 0, 0.19, -0.03]),
+        ROWS[1:] - [0.5, 0.15, 0, 0],
+    ):
+        assert told(rows) == []
+    slippery = Bed(size=(0.8, 0.6, 0.15), spacing=0.02, walls=Walls(y="slip"))
+    assert told(np.subtract(ROWS, [0, 0, 0.19, 0]), bed=slippery) == []
+    [wheel] = [one for one in Preview.of(Wheel(width=0.18)).warnings if "from the wall" in one]
+    assert wheel.endswith("too large; use a wider scene.bed.size")
+
+
+def test_a_tool_so_fast_that_soil_leaves_the_grid_is_told():
+    """Soil at 2.2 m/s flies 25 cm high, the default headroom."""
+    fast = ROWS * [0.05, 1, 1, 1]  # the whole path in 0.1 s
+    [told] = Preview.of(body(fast, duration=0.1)).warnings
+    assert "moves at up to 4 m/s in the soil (at 0.0" in told and "flies 815 mm high, out of the grid" in told
+    assert told.endswith("are the times of the path in seconds? If it is meant, raise scene.bed.headroom")
+    assert Preview.of(body(ROWS * [0.1, 1, 1, 1], duration=0.2)).warnings == ()
+    blade = cut(speed=2.0, duration=0.05)
+    [told] = [one for one in Preview.of(blade).warnings if "moves at" in one]
+    assert "scene.speed is in m/s. If it is meant" in told
+
+
+def test_a_wheel_that_sinks_too_little_for_the_grid_is_told_afterwards():
+    wheel = Wheel()
+    poses = wheel.poses_at(wheel.times())
+    for sunk, told in ((0.0030, True), (0.0035, False)):  # on a grid of 10 mm
+        words = afterwards(wheel, poses - [0, 0, sunk, 0, 0, 0, 0])
+        assert len(words) == told
+    [words] = afterwards(wheel, poses - [0, 0, 0.0013, 0, 0, 0, 0])
+    assert "mean sinkage is 1.3 mm, less than a third of a grid spacing (10 mm)" in words
+    assert words.endswith("use a finer scene.bed.spacing")
 
 
 def test_how_a_tool_is_turned_at_the_start_is_told():

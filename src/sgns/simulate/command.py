@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from mpm_warp import Preview, Scene
-from mpm_warp.preview import near_floor
+from mpm_warp.preview import afterwards
 from sgns.config import Interrupted, UserError, of_dataset
 from sgns.data.files import only_here
 from sgns.data.run import Run
@@ -197,7 +197,7 @@ def simulate_one(scene: Scene, cfg: DictConfig, restart: Restart | None = None, 
         if words := scene.summary(run.force, run.torque, run.pose):
             log.info("%s", words)
         if scene.axle is not None:  # others were told before
-            for words in near_floor(scene, float(scene.lowest_points(run.pose).min())):
+            for words in afterwards(scene, run.pose):
                 log.warning("%s", words)
     log.info(
         "%.1f s for %.2f simulated s: %.2f s per simulated second, %.2f M particle-steps/s on %s",
