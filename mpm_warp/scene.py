@@ -326,9 +326,13 @@ class Scene(Settings, Moved):
             f"{4.0 / count:.2g} times as long"
         ]
 
+    def results(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> dict[str, float]:
+        """What came out, names with their units, of the soil's force on the body [N] and its torque about the centre of
+        mass [N m], shape (T, 3), and the body's poses (T, 7); empty without a body."""
+        return {}
+
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
-        """What came out, in a few words, of the soil's force on the body [N] and its torque about the centre of mass
-        [N m], shape (T, 3), and the body's poses (T, 7); empty without a body."""
+        """The results in a few words."""
         return ""
 
     def to_dict(self) -> dict[str, Any]:

@@ -122,9 +122,15 @@ class Excavation(Scene):
             "it feels the soil in front of it"
         )
 
+    def results(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> dict[str, float]:
+        return {
+            "mean_draft_N": -float(np.mean(force[1:, 0])),
+            "mean_vertical_force_N": float(np.mean(force[1:, 2])),
+        }
+
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
-        words = f"mean draft {-np.mean(force[1:, 0]):.1f} N, vertical force {np.mean(force[1:, 2]):.1f} N"
-        return words + _each_pass(self, force)
+        draft, vertical = self.results(force, torque, poses).values()
+        return f"mean draft {draft:.1f} N, vertical force {vertical:.1f} N" + _each_pass(self, force)
 
 
 def _each_pass(scene: Excavation | Body, force: np.ndarray) -> str:
@@ -208,8 +214,12 @@ class Body(Scene):
             )
         return found
 
+    def results(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> dict[str, float]:
+        names = (f"mean_force_{axis}_N" for axis in "xyz")
+        return dict(zip(names, force[1:].mean(axis=0).tolist(), strict=True))
+
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
-        x, y, z = force[1:].mean(axis=0)
+        x, y, z = self.results(force, torque, poses).values()
         return f"mean force ({x:.1f}, {y:.1f}, {z:.1f}) N" + _each_pass(self, force)
 
 
@@ -394,14 +404,23 @@ class Wheel(Scene):
             )
         return found
 
-    def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
+    def results(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> dict[str, float]:
         driving = self._driving(len(force))
         pull, lateral, vertical = along_and_across(vars(self), force[driving].mean(axis=0))
+        return {
+            "mean_pull_N": float(pull),
+            "mean_lateral_force_N": float(lateral),
+            "mean_vertical_force_N": float(vertical),
+            "mean_sinkage_mm": 1000.0 * self.mean_sinkage(poses),
+            "mean_torque_Nm": float(along_and_across(vars(self), torque[driving].mean(axis=0))[1]),
+        }
+
+    def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
+        pull, lateral, vertical, sinkage, axle_torque = self.results(force, torque, poses).values()
         sideways = f"lateral force {lateral:.2f} N, " if self.slip_angle else ""
         return (
             f"while driving: mean drawbar pull {pull:.2f} N, {sideways}vertical force {vertical:.2f} N, "
-            f"sinkage {1000.0 * self.mean_sinkage(poses):.1f} mm, "
-            f"torque {along_and_across(vars(self), torque[driving].mean(axis=0))[1]:.3f} N m"
+            f"sinkage {sinkage:.1f} mm, torque {axle_torque:.3f} N m"
         )
 
     def _check_fits(self) -> None:

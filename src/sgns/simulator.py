@@ -29,7 +29,16 @@ from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step, Stepper, together
 from sgns.model.features import ToolMotion, context_of, markers
 from sgns.model.training_range import FAR, Excess
-from sgns.numbers import check_pose, check_poses, elapsed, finite_array, first_pose, is_whole, real_array
+from sgns.numbers import (
+    check_pose,
+    check_poses,
+    counted,
+    elapsed,
+    finite_array,
+    first_pose,
+    is_whole,
+    real_array,
+)
 from sgns.reduction.basis import Basis
 
 # Every step it is looked at whether the tool's pose and its change are far outside the training range; the rest, such
@@ -136,8 +145,31 @@ class Rollouts:
     torque: np.ndarray
     poses: np.ndarray
     wall_time_s: float
+    _basis: Basis = field(repr=False)
+    _scene: Mapping[str, Any] = field(repr=False)
+    _excess: Callable[..., Excess | None] = field(repr=False)
     force_spread: np.ndarray | None = None
     latent_spread: np.ndarray | None = None
+
+    @cached_property
+    def outside(self) -> np.ndarray:
+        """Of every path the largest of all frames, as `Rollout.outside`, shape (B,); computed when asked for."""
+        each = [
+            self._excess(path, latent=latent) for path, latent in zip(self.poses, self.latent, strict=True)
+        ]
+        return np.array([np.nan if found is None else found.largest for found in each])
+
+    def soil(self, path: int, frame: int = -1) -> np.ndarray:
+        """Positions of all particles on a path at a frame, the last one by default [m], shape (n, 3); decoded when
+        asked for."""
+        for name, index, count in zip(("path", "frame"), (path, frame), self.latent.shape, strict=False):
+            if not is_whole(index) or not -count <= index < count:
+                raise UserError(f"{name} is {index!r}; there are {counted(count, name)}: 0 to {count - 1}")
+        return self._basis.inverse(self.latent[path, frame]).numpy()
+
+    def surface(self, path: int, frame: int = -1) -> Surface:
+        """The soil's surface there, as `State.surface`."""
+        return soil_surface(self.soil(path, frame), self._scene)
 
 
 class _Place(NamedTuple):
@@ -339,26 +371,43 @@ class Simulator:
         state = self._state()
         known = self._surrogate.training_range
         if not self._warned and (self._frame % _LOOK_EVERY == 1 or known.far(shown[0], pose)):
-            self._look(self._frame - 1, np.stack([shown[0], pose]), self._points, self._context)
+            self._look(self._frame - 1, np.stack([shown[0], pose])[None], self._points, self._context)
         return state
 
-    def _look(self, begin: int, poses: np.ndarray, points: np.ndarray, context: Mapping[str, float]) -> None:
-        """Warns, once, of a tool that is far outside the training range at poses (T, 7) from frame `begin` on."""
-        if self._warned:
+    def _look(
+        self,
+        begin: int,
+        paths: np.ndarray,
+        points: np.ndarray,
+        context: Mapping[str, float],
+        at_once: int = 1,
+    ) -> None:
+        """Warns, once, of a tool that is far outside the training range on paths (B, T, 7) from frame `begin` on."""
+        known, whole = self._surrogate.training_range, np.flatnonzero(np.isfinite(paths).all(axis=(1, 2)))
+        if self._warned or not len(whole):
             return
-        latent = np.zeros((len(poses), self.num_modes, 3))
-        known = self._surrogate.training_range
-        found = known.excess(poses, points, latent, context, of="the tool's")
-        if found is None or not found.largest > FAR:
+
+        def excess(some: np.ndarray) -> Excess:
+            latent = np.zeros((some[..., 0].size, self.num_modes, 3))
+            found = known.excess(some.reshape(-1, 7), points, latent, context, "the tool's", len(some))
+            assert found is not None
+            return found
+
+        parts = [paths[whole[first : first + at_once]] for first in range(0, len(whole), at_once)]
+        largest = np.concatenate([excess(part).amount.reshape(len(part), -1).max(axis=1) for part in parts])
+        if not largest.max() > FAR:
             return
-        self._warned, worst = True, int(found.amount.argmax())
-        unit = (
-            "; positions look like millimetres and are taken as metres" if known.in_millimetres(poses) else ""
-        )
+        self._warned, path = True, whole[largest.argmax()]
+        found = excess(paths[path][None])
+        worst, many = int(found.amount.argmax()), ""
+        if len(paths) > 1:
+            far = f"{(largest > FAR).sum()} of {len(paths)} paths"
+            many = f"far outside the training range: {far}, worst of all path {path}; there, "
+        unit = "; positions look like millimetres and are taken as metres"
         warnings.warn(
-            f"at frame {begin + worst} {found.quantity[worst]} is {found.amount[worst]:.2g} times its training range "
-            f"outside of it{unit}: force and soil are a guess there (`outside` of every state and rollout says how "
-            "far; this line comes once)",
+            f"{many}at frame {begin + worst} {found.quantity[worst]} is {found.amount[worst]:.2g} times its training "
+            f"range outside of it{unit * known.in_millimetres(paths[path])}: force and soil are a guess there "
+            "(`outside` of every state and rollout says how far; this line comes once)",
             stacklevel=3,
         )
 
@@ -435,7 +484,7 @@ class Simulator:
         wall_time = elapsed(began, time.perf_counter())
         parts: list[Any] = [None if part is None else part[0] for part in found]
         states, force, torque, poses, world, *spread = parts
-        self._look(0, poses, points, context)
+        self._look(0, poses[None], points, context)
         excess = partial(self._surrogate.training_range.excess, poses, points, states, context)
         return Rollout(states, force, torque, poses, world, wall_time, excess, *spread)
 
@@ -477,7 +526,8 @@ class Simulator:
             raise UserError(f"the array of paths has shape {poses.shape}; it needs shape (paths, frames, 7)")
         if not is_whole(paths_at_once) or paths_at_once < 1:
             raise UserError(f"paths_at_once is {paths_at_once!r}; it must be a whole number, at least 1")
-        points, told = self._checked_points(body_points), self._told(self._context_of(values))
+        points, context = self._checked_points(body_points), self._context_of(values)
+        told = self._told(context)
         poses = np.stack([check_poses(path, f"path {i}") for i, path in enumerate(poses)])
         start = self._start_latent.expand(self.history, -1, -1)
         began = time.perf_counter()
@@ -489,7 +539,11 @@ class Simulator:
             None if part[0] is None else np.concatenate(part) for part in zip(*parts, strict=True)
         ]
         latent, force, torque, poses, *spread = whole
-        return Rollouts(latent, force, torque, poses, elapsed(began, time.perf_counter()), *spread)
+        wall_time = elapsed(began, time.perf_counter())
+        self._look(0, poses, points, context, paths_at_once)
+        excess = partial(self._surrogate.training_range.excess, points=points, context=context)
+        scene = self._surrogate.card["scene"]
+        return Rollouts(latent, force, torque, poses, wall_time, self.basis, scene, excess, *spread)
 
     def _require_finite(self, step: Step) -> None:
         """Refuses a step that says nothing; the simulator stays where it was."""

@@ -448,6 +448,15 @@ def test_a_wheels_summary_leaves_the_settling_out():
     words = scene.summary(force, torque, poses)
     assert "drawbar pull 2.00 N, vertical force 60.00 N" in words
     assert "torque -0.500 N m" in words
+    assert scene.results(force, torque, poses) == pytest.approx(
+        {
+            "mean_pull_N": 2.0,
+            "mean_lateral_force_N": 0.0,
+            "mean_vertical_force_N": 60.0,
+            "mean_sinkage_mm": 1e3 * scene.sinkage(poses)[7:].mean(),
+            "mean_torque_Nm": -0.5,
+        }
+    )
 
 
 def test_the_summary_of_a_turned_wheel_is_in_its_own_axes():

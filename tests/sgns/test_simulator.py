@@ -212,6 +212,43 @@ def test_it_says_how_far_a_path_is_outside(trained, kind) -> None:
     np.testing.assert_allclose(told, excess.amount, rtol=1e-12)
 
 
+@pytest.mark.parametrize("kind", ["pose", "polynomial"])
+def test_many_paths_say_how_far_each_is_outside(trained, kind) -> None:
+    """With one warning, also where their first frames are far from the last of the path before."""
+    path = trained.data.runs("train")[0].pose
+    aside, far = path.copy(), path.copy()
+    aside[:, 1] += 1.0
+    far[:, :3] *= 1e3
+    paths = np.stack([path, aside, path, far, path])
+    trained.simulator(kind).rollouts(paths[[0, 2, 4]], paths_at_once=2)  # without a warning
+    for at_once in (2, 256):
+        simulator = trained.simulator(kind)
+        words = r"far outside .*: 2 of 5 paths, worst of all path 3; there, at frame \d+ the tool's .*; positions look"
+        with pytest.warns(UserWarning, match=words) as caught:
+            many = simulator.rollouts(paths, paths_at_once=at_once)
+        simulator.rollouts(paths)
+        assert len(caught) == 1
+        each = [simulator.rollout(one) for one in paths]
+        assert many.outside.shape == (5,)
+        np.testing.assert_allclose(many.outside, [one.outside for one in each], rtol=1e-3, atol=1e-6)
+        np.testing.assert_array_equal(many.outside > 0.5, [False, True, False, True, False])
+
+
+def test_soil_and_surface_of_many_paths(trained) -> None:
+    simulator, path = trained.simulator("pose"), trained.run.pose
+    many = simulator.rollouts(np.stack([path[:6], path[4:10]]))
+    first, *_, last = stepped(simulator, path[4:10])
+    soil = many.soil(1)
+    np.testing.assert_allclose(soil, last.soil(), rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(soil, many.soil(-1, frame=5))
+    np.testing.assert_array_equal(many.surface(1).z, soil_surface(soil, simulator.scene).z)
+    np.testing.assert_array_equal(many.soil(0, 0), first.soil())
+    with pytest.raises(UserError, match=r"path is 2; there are 2 paths: 0 to 1"):
+        many.soil(2)
+    with pytest.raises(UserError, match=r"frame is 0.5; there are 6 frames: 0 to 5"):
+        many.surface(0, frame=0.5)
+
+
 def test_a_step_far_outside_is_told_once(trained) -> None:
     simulator, pose = trained.simulator("pose"), trained.run.pose[0].copy()
     simulator.reset(pose)

@@ -178,10 +178,11 @@ def end_sweep(jobs: Sequence[Any], value: str | None) -> None:
     for job, settings in zip(jobs, given, strict=True):
         row = {key: settings.get(key, "") for key in varied} | _found(job.cfg.get("output"))
         rows.append(row if value is None else {**row, value: job.return_value})
-    table = [list(rows[0]), *([_short(cell) for cell in row.values()] for row in rows)]
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    table = [names, *([_short(row.get(name)) for name in names] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     text = io.StringIO()
-    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer = csv.DictWriter(text, names, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     own = jobs[0].hydra_cfg.hydra  # `sweep.dir` itself may hold a time
@@ -193,7 +194,10 @@ def end_sweep(jobs: Sequence[Any], value: str | None) -> None:
 
 
 def _found(output: str | None) -> dict[str, Any]:
-    """Errors, time and place of a job's result, as far as its files say them."""
+    """Errors, or forces of a run, time and place of a job's result, as far as its files say them."""
+    from mpm_warp import Scene  # loads Warp
+    from sgns.data.run import Run
+
     if output is None:
         return {}
     folder = Path(output)
@@ -203,6 +207,10 @@ def _found(output: str | None) -> dict[str, Any]:
     elif (file := folder / "metrics.json").is_file():
         of = json.loads(file.read_text(encoding="utf-8"))["aggregate"]
         soil, result = of["rmse_total_mm"], folder
+    elif folder.suffix == ".h5" and folder.is_file():
+        with Run(folder) as run:
+            scene = Scene.from_dict(run.scene, run.mesh)
+            return scene.results(run.force, run.torque, run.pose) | {"output": output}
     else:
         return {"output": output}
     errors = {"soil_error_mm": soil, "force_nrmse": of["force_nrmse"]}

@@ -149,14 +149,16 @@ class TrainingRange:
         latent: np.ndarray,
         context: Mapping[str, float],
         of: str = "",
+        paths: int = 1,
     ) -> Excess | None:
         """How far a path of poses (T, 7), body points in the body frame (M, 3) [m] and modes (T, r, 3) [m] is outside;
         None where the tool is nowhere. Fewer modes than those of the training are compared with the first of them.
-        Quantities count whose names begin with `of`."""
+        Quantities count whose names begin with `of`. The frames may be those of several paths, all of one length, one
+        after another."""
         if not np.isfinite(poses).all():
             return None
         amounts, names = [], []
-        found = quantities(poses, in_world_frame(poses, points), latent, context)
+        found = quantities(poses, in_world_frame(poses, points), latent, context, paths)
         for name in (name for name in self.low if name.startswith(of)):
             values = found[name]
             low, high = (side[name][: values.shape[1]] for side in (self.low, self.high))
@@ -168,15 +170,17 @@ class TrainingRange:
 
 
 def quantities(
-    poses: np.ndarray, points: np.ndarray, latent: np.ndarray, context: Mapping[str, float]
+    poses: np.ndarray, points: np.ndarray, latent: np.ndarray, context: Mapping[str, float], paths: int = 1
 ) -> dict[str, np.ndarray]:
-    """What is compared, by name; each of shape (T, components). Motions of frame 0 are zero."""
+    """What is compared, by name; each of shape (T, components). Motions of the first frame of every path are zero."""
     track = body_track(poses, None, "pose")
     moved, place = track.motion[:, 0].numpy(), np.asarray(poses)[:, :3]
     heights = points[:, :, 2].min(axis=1) if points.shape[1] else place[:, 2]
     latent = np.asarray(latent, dtype=np.float64).reshape(len(place), -1)
     with np.errstate(invalid="ignore"):  # of a soil that is not finite
         velocity = np.diff(latent, axis=0, prepend=latent[:1])
+    first = slice(None, None, len(place) // paths)
+    moved[first] = velocity[first] = 0.0
     return {
         _POSITION: place,
         "the tool's lowest point": heights[:, None],

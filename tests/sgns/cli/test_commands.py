@@ -16,12 +16,13 @@ import pytest
 
 import sgns.settings as typed
 from mpm_warp.settings import described
-from sgns import __version__
+from sgns import Run, __version__
 from sgns.cli.commands import COMMANDS
 from sgns.cli.help import groups_of, options_of
 from sgns.cli.settings import sweep_jobs
 from sgns.config import UserError
 from sgns_testing.commands import call, composed, python
+from sgns_testing.runs import make_run
 
 
 def call_process(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -305,6 +306,25 @@ def test_a_sweep_ends_with_a_table(empty_folder: Path) -> None:
     *_, head, one, two, last = (line.split() for line in result.stdout.splitlines())
     assert head == names and last[-1] == "sweep/sweep.csv"
     assert [one, two] == [[c.removesuffix(".0") for c in row] for row in rows]
+
+
+def test_the_table_of_a_sweep_of_runs_has_their_forces(empty_folder: Path, monkeypatch) -> None:
+    def main(cfg) -> float:
+        if cfg.seed < 3:
+            make_run(cfg.output, seed=cfg.seed)
+        return 4.0
+
+    monkeypatch.setattr(importlib.import_module(COMMANDS["simulate"].module), "main", main)
+    done = call("simulate", "-m", "seed=1,2,3", "scene.duration=0.2", "hydra.sweep.dir=swept")
+    assert done.returncode == 0, done.stderr
+    names, *rows = (row.split(",") for row in Path("swept/sweep.csv").read_text().splitlines())
+    assert names == ["seed", "mean_draft_N", "mean_vertical_force_N", "output", "wall_s_per_simulated_s"]
+    for row in rows[:2]:
+        with Run(row[3]) as run:
+            x, _, z = run.force[1:].mean(axis=0)
+        assert [float(cell) for cell in row[1:3]] == pytest.approx([-x, z], rel=1e-6)
+    assert rows[2][:3] == ["3", "", ""]
+    assert done.stdout.splitlines()[-5].split() == names
 
 
 def test_wrong_key_in_a_sweep(empty_folder: Path) -> None:

@@ -147,7 +147,8 @@ def test_a_sweep_over_checkpoints_plays_the_scene_of_each(folder: Path) -> None:
         with Run(folder / f"swept/{number}/swept.h5") as run:
             assert run.scene == scene_from_config(composed(*SMALL, "scene.depth=0.03")).to_dict()
     rows = [line.split(",") for line in (folder / "swept/sweep.csv").read_text().splitlines()]
-    assert rows[0] == ["checkpoint", "output", "wall_s_per_simulated_s"]
+    forces = ["mean_draft_N", "mean_vertical_force_N"]
+    assert rows[0] == ["checkpoint", *forces, "output", "wall_s_per_simulated_s"]
     assert [row[0] for row in rows[1:]] == checkpoints
 
 
