@@ -79,14 +79,17 @@ class Scene(Settings, Moved):
     volume_averaging: float = setting(1.0, "share of volume changes that a local mean replaces", ge=0, le=1)
     remap_time: float | None = setting(
         None,
-        "longest time between two remaps of the velocities (solver.py); None: 0.72 sqrt(d / g)",
+        "longest time between two remaps of the velocities (solver.py); None: 0.72 sqrt(d / g), at least 0.04 sqrt(h / g)",
         "s",
         ge=0,
         words=" s; it must be 0 (every step) or more, or null",
     )
     remap_distance: float = setting(0.1, "soil's way between two remaps", "grid spacings", gt=0, le=0.5)
     velocity_memory: float | None = setting(
-        None, "time in which velocities below the grid fade to 37 %; None: 18 sqrt(d / g)", "s", gt=0
+        None,
+        "time in which velocities below the grid fade to 37 %; None: 18 sqrt(d / g), at least 0.5 sqrt(h / g)",
+        "s",
+        gt=0,
     )
     others: tuple[Other, ...] = setting((), "further bodies: a list of groups of keys")
 
@@ -120,17 +123,21 @@ class Scene(Settings, Moved):
     @property
     def remap_limit(self) -> float:
         """Longest time between two remaps [s]."""
-        return self._like_grains(REMAP_TIME) if self.remap_time is None else self.remap_time
+        return self._like_grains(REMAP_TIME, 0.04) if self.remap_time is None else self.remap_time
 
     @property
     def memory_time(self) -> float:
         """In which velocities below the grid fade to 37 % [s]."""
-        return self._like_grains(VELOCITY_MEMORY) if self.velocity_memory is None else self.velocity_memory
+        return (
+            self._like_grains(VELOCITY_MEMORY, 0.5) if self.velocity_memory is None else self.velocity_memory
+        )
 
-    def _like_grains(self, time: float) -> float:
-        """A time of the default sand on Earth, scaled as sqrt(d / g); without gravity with that of the Earth [s]."""
-        size = self.material.grain_diameter / Material.grain_diameter
-        return time * math.sqrt(size * (Scene.gravity / (self.gravity or Scene.gravity)))
+    def _like_grains(self, time: float, least: float) -> float:
+        """A time of the default sand on Earth, scaled as sqrt(d / g), and not below a share of sqrt(h / g), since remaps
+        of dust in every step would be a viscosity; without gravity with that of the Earth [s]."""
+        size, gravity = self.material.grain_diameter / Material.grain_diameter, self.gravity or Scene.gravity
+        scaled = time * math.sqrt(size * (Scene.gravity / gravity))
+        return max(scaled, least * math.sqrt(self.bed.spacing / gravity))
 
     @property
     def contact_distance(self) -> float:

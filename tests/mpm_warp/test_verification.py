@@ -112,6 +112,9 @@ def test_times_of_the_numerics_follow_grains_and_gravity():
     assert (scene.remap_limit, scene.memory_time) == (4.0e-3, 0.1)
     finer = replace(scene, material=Material(grain_diameter=0.25 * Material.grain_diameter), gravity=4 * 9.81)
     assert (finer.remap_limit, finer.memory_time) == pytest.approx((1.0e-3, 0.025))
+    dust = replace(scene, material=Material(grain_diameter=1e-9))  # not in every step
+    least = 0.04 * math.sqrt(scene.bed.spacing / 9.81)
+    assert (dust.remap_limit, dust.memory_time) == pytest.approx((least, 12.5 * least))
     in_seconds = replace(finer, remap_time=0.0, velocity_memory=0.3)
     assert (in_seconds.remap_limit, in_seconds.memory_time) == (0.0, 0.3)
     assert replace(scene, gravity=0.0).remap_limit == 4.0e-3  # as on Earth

@@ -107,14 +107,15 @@ def near(friction: str, laws: tuple[str, ...]) -> tuple[float, str]:
 def tiny_grains(effects: Effects) -> float:
     """Change of a cut's force between grains of 1 nm and constant friction mu_s [%].
 
-    The fluidity's own dynamics, which have nothing to do with d, are as good as at once.
+    The fluidity's own dynamics, which have nothing to do with d, are as good as at once. The times between remaps, which
+    have, are those of the sand.
     """
-    force = []
+    force, numerics = [], {"remap_time": cut().remap_limit, "velocity_memory": cut().memory_time}
     for chosen, material in (
         (effects, replace(SAND, grain_diameter=1e-9, fluidity_time=1e-8)),
         (Effects(rate_dependence=False), SAND),
     ):
-        frames = frames_of(cut(material=material), effects=chosen)
+        frames = frames_of(cut(material=material, **numerics), effects=chosen)
         force.append(np.mean([f.force for f in frames[6:]], axis=0))
     return 100.0 * float(np.linalg.norm(force[0] - force[1]) / np.linalg.norm(force[1]))
 
