@@ -79,7 +79,7 @@ class Scene(Settings, Moved):
     volume_averaging: float = setting(1.0, "share of volume changes that a local mean replaces", ge=0, le=1)
     remap_time: float | None = setting(
         None,
-        "longest time between two remaps of the velocities (solver.py); None: 0.72 sqrt(d / g), at least 0.04 sqrt(h / g)",
+        "longest time between two remaps of the velocities; None: 0.72 sqrt(d / g), at least 0.04 sqrt(h / g)",
         "s",
         ge=0,
         words=" s; it must be 0 (every step) or more, or null",
@@ -133,8 +133,8 @@ class Scene(Settings, Moved):
         )
 
     def _like_grains(self, time: float, least: float) -> float:
-        """A time of the default sand on Earth, scaled as sqrt(d / g), and not below a share of sqrt(h / g), since remaps
-        of dust in every step would be a viscosity; without gravity with that of the Earth [s]."""
+        """A time of the default sand on Earth, scaled as sqrt(d / g), and not below a share of sqrt(h / g): remaps in
+        every step would be a viscosity. Without gravity with that of the Earth [s]."""
         size, gravity = self.material.grain_diameter / Material.grain_diameter, self.gravity or Scene.gravity
         scaled = time * math.sqrt(size * (Scene.gravity / gravity))
         return max(scaled, least * math.sqrt(self.bed.spacing / gravity))

@@ -107,8 +107,8 @@ def near(friction: str, laws: tuple[str, ...]) -> tuple[float, str]:
 def tiny_grains(effects: Effects) -> float:
     """Change of a cut's force between grains of 1 nm and constant friction mu_s [%].
 
-    The fluidity's own dynamics, which have nothing to do with d, are as good as at once. The times between remaps, which
-    have, are those of the sand.
+    The fluidity's own dynamics, which have nothing to do with d, are as good as at once. The times of the numerics,
+    which have, are those of the sand.
     """
     force, numerics = [], {"remap_time": cut().remap_limit, "velocity_memory": cut().memory_time}
     for chosen, material in (
