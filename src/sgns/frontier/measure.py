@@ -339,6 +339,7 @@ def own_errors(simulator: Simulator, dataset: Dataset) -> Scores:
                 pose=rollout.poses,
                 force=rollout.force,
                 torque=rollout.torque,
+                force_spread=None,
                 positions=lambda frames, latent=latent: basis.inverse(latent[frames]).numpy(),
             )
             errors = position_errors(truth, prediction, basis, d, grid)
