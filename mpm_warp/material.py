@@ -139,13 +139,16 @@ class Material(Settings):
 
     def warnings(self) -> list[str]:
         """What a user should know about this soil before it is used."""
-        found = list(self._notes)
-        if self.rest_stress_yields:
-            found.append(
-                f"material.static_friction {self.static_friction:.3f} is so low that the bed at rest "
-                "already yields under its own weight (K0 condition)"
-            )
-        return found
+        return list(self._notes)
+
+    def warnings_at_rest(self) -> list[str]:
+        """Likewise of a bed of it that is to rest."""
+        if not self.rest_stress_yields:
+            return []
+        return [
+            f"material.static_friction {self.static_friction:.3f} is so low that the bed at rest already yields under "
+            "its own weight (K0 condition)"
+        ]
 
     @property
     def cohesive_pressure(self) -> float:

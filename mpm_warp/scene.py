@@ -309,9 +309,15 @@ class Scene(Settings, Moved):
             found = digest([found, "from", self.soil.digest])
         return digest([found, "without", self.displaced.tolist()]) if len(self.displaced) else found
 
+    @property
+    def rests(self) -> bool:
+        """Whether the soil is meant to be at rest where no body moves it."""
+        return True
+
     def warnings(self) -> list[str]:
         """What a user should know about this scene before it runs."""
-        found = self.material.warnings() + (self.body.warnings() if self.body is not None else [])
+        found = self.material.warnings() + (self.material.warnings_at_rest() if self.rests else [])
+        found += self.body.warnings() if self.body is not None else []
         if self.bed.surface is not None and self.soil is None:
             steepest = np.linalg.norm(self.bed.slope_at(*self.filled[0][:, :2].T), axis=0).max()
             slope, stands = (math.degrees(math.atan(x)) for x in (steepest, self.material.static_friction))

@@ -541,9 +541,9 @@ class Incline(Scene):
                 "degrees: choose such a tilt or start at rest with scene.flowing=false"
             )
 
-    def warnings(self) -> list[str]:
-        # A layer that is to flow may yield at once.
-        return [words for words in super().warnings() if not self.tilt or "bed at rest" not in words]
+    @property
+    def rests(self) -> bool:
+        return not self.tilt
 
     @property
     def _flowing_angles(self) -> tuple[float, float]:

@@ -122,6 +122,7 @@ def nrmse(ours: np.ndarray, theirs: np.ndarray) -> float:
 def campaign_of(options: argparse.Namespace) -> tuple[list[PublishedRun], Campaign]:
     """The published runs in the order of their cases, and the campaign that makes them."""
     published = sorted(read_published(options.published), key=lambda run: run.case)
+    published = [run for run in published if options.only is None or run.case in options.only]
     name = options.kind if options.reference else f"published_{options.kind}"
     theirs = THEIR_WHEEL if name == "wheel" else ()
     config = composed("simulate", f"scene={name}", *theirs, *options.overrides)
@@ -195,11 +196,17 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, help="folder for the run files (default: data/<scene>)")
     parser.add_argument("--other-draw", type=Path, help="such a folder, of another seed, to compare with")
     parser.add_argument("--workers", type=int, help="runs at once (default: one per core)")
+    parser.add_argument("--only", type=int, nargs="+", help="numbers of the cases to make (default: all)")
+    parser.add_argument(
+        "--table", help="name of the table to write, without a figure (default: both, by kind)"
+    )
     parser.add_argument("overrides", nargs="*", help="changes of the scene, for example scene.friction=0.5")
     options = parser.parse_intermixed_args()
+    if options.only and not options.table:
+        parser.error("--only would leave the others out of the table; give --table another name")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     published, campaign = campaign_of(options)
-    if options.kind == "excavation" and not options.reference:
+    if options.kind == "excavation" and not options.reference and options.table is None:
         ripples = [ripple(run, campaign.scenes[f"case_{run.case:03d}"]) for run in published]
         write_rows(HERE / "ripple.csv", ripples)
     simulate_campaign(campaign, device="cpu", workers=options.workers)
@@ -230,7 +237,9 @@ def main() -> None:
     axes[0, 1].legend(fontsize=8)
     figure.supxlabel("time [s]")
     table, picture = RESULT[options.kind, options.reference]
-    figure.savefig(HERE / f"{picture}.png", dpi=80)
+    if options.table is None:
+        figure.savefig(HERE / f"{picture}.png", dpi=80)
+    table = options.table or table
     write_rows(HERE / f"{table}.csv", rows, digits=6)
     for key in [key for key in rows[0] if "nrmse" in key]:
         errors = [row[key] for row in rows if key in row]

@@ -324,8 +324,8 @@ def loose_soil(real: type) -> SimpleNamespace:
 
     @wp.func
     def mirrored(at: int, low: int, high: int):
-        # Soil goes on beyond a wall as its mirror image.
-        return wp.min(wp.max(at, 2 * low - at), high - (at - high))
+        # Soil goes on beyond a wall as its mirror image. `high` may be so large that twice of it is no whole number.
+        return high - wp.abs(high - (low + wp.abs(at - low)))
 
     @wp.func
     def volume(ln_j: real, base: wp.vec3i, f: vec3, nodes: wp.array(dtype=vec4), grid: Grid):

@@ -86,17 +86,8 @@ class FullSpaceDynamics(nn.Module):
         self.radius = radius
         self.register_buffer("bin_size", bin_size.double())
         self.identity = nn.Embedding(2, settings.identity_width)
-        self.network = EncodeProcessDecode(
-            3 * settings.history + 5 + settings.identity_width,
-            4,
-            6,
-            settings.hidden_width,
-            settings.hidden_layers,
-            settings.message_passing_steps,
-            settings.layer_norm,
-            settings.residual,
-            settings.activation,
-        )
+        inputs = 3 * settings.history + 5 + settings.identity_width
+        self.network = EncodeProcessDecode.of(settings, inputs, edge_inputs=4, outputs=6)
         self.velocity = Standardiser.empty(3)
         self.acceleration = Standardiser.empty(3)
         self.body_motion = Standardiser.empty(3)

@@ -24,6 +24,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch_geometric.nn import MessagePassing
 
+from sgns.settings import ModelSettings
+
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "silu": nn.SiLU, "gelu": nn.GELU, "tanh": nn.Tanh}
 # Edges that go through the network at once on a CPU when nothing is kept for gradients.
 EDGES_AT_ONCE = 4096
@@ -393,6 +395,23 @@ class EncodeProcessDecode(nn.Module):
         self.decode = MLP(hidden, hidden, hidden_layers, outputs, activation=activation)
         # The edges of the last call: a training or a rollout keeps them.
         self._known_adjacency: tuple[Tensor, Adjacency] | None = None
+
+    @classmethod
+    def of(
+        cls, settings: ModelSettings, node_inputs: int, edge_inputs: int, outputs: int
+    ) -> EncodeProcessDecode:
+        """The network that the settings describe."""
+        return cls(
+            node_inputs,
+            edge_inputs,
+            outputs,
+            settings.hidden_width,
+            settings.hidden_layers,
+            settings.message_passing_steps,
+            settings.layer_norm,
+            settings.residual,
+            settings.activation,
+        )
 
     def plain(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> Tensor:
         """Node quantities (..., V, outputs) from a batch of graphs as defined: nodes (..., V, node_inputs), edges

@@ -64,16 +64,11 @@ class LatentDynamics(Dynamics):
 
         def learned() -> dict[str, nn.Module]:
             identity = nn.Embedding(vectors + 1, settings.identity_width)
-            network = EncodeProcessDecode(
+            network = EncodeProcessDecode.of(
+                settings,
                 max(mode_width, body_width) + settings.identity_width + len(context),
-                4 if settings.edge_length else 3,
-                9 if settings.torque else 6,
-                settings.hidden_width,
-                settings.hidden_layers,
-                settings.message_passing_steps,
-                settings.layer_norm,
-                settings.residual,
-                settings.activation,
+                edge_inputs=4 if settings.edge_length else 3,
+                outputs=9 if settings.torque else 6,
             )
             return {"identity": identity, "network": network}
 
