@@ -196,7 +196,7 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, help="folder for the run files (default: data/<scene>)")
     parser.add_argument("--other-draw", type=Path, help="such a folder, of another seed, to compare with")
     parser.add_argument("--workers", type=int, help="runs at once (default: one per core)")
-    parser.add_argument("--only", type=int, nargs="+", help="numbers of the cases to make (default: all)")
+    parser.add_argument("--only", type=int, action="append", help="number of a case to make (default: all)")
     parser.add_argument(
         "--table", help="name of the table to write, without a figure (default: both, by kind)"
     )
