@@ -268,9 +268,8 @@ def force_panels(truth: Any, prediction: Any, history: int, mean_force: np.ndarr
         return named_forces(run.scene, run.force)[1]
 
     spread = prediction.force_spread
-    if (
-        spread is not None
-    ):  # of a turned wheel's directions, as if the axes' errors had nothing to do with each other
+    # Of a turned wheel's directions, as if the axes' errors had nothing to do with each other.
+    if spread is not None:
         spread = np.sqrt(spread**2 @ named_forces(prediction.scene, np.eye(3))[1] ** 2)
     panels = compared([f"{name} [N]" for name in names], read, *runs, mean, spread)
     # A small component is drawn as small as it is beside the largest.
