@@ -202,6 +202,7 @@ def test_a_run_that_another_process_makes_is_left_to_it(tmp_path, caplog, batch)
     assert all(c.file(name).exists() for name in others)
 
 
+@pytest.mark.long
 def test_two_processes_may_compile_into_an_empty_cache_at_once(tmp_path):
     variables = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": variables}
@@ -244,7 +245,8 @@ def workers_of(pid: int) -> list[int]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
 @pytest.mark.parametrize(
-    "number", [signal.SIGTERM, signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.long)]
+    "number",
+    [signal.SIGKILL, *(pytest.param(one, marks=pytest.mark.long) for one in (signal.SIGTERM, signal.SIGINT))],
 )
 def test_the_workers_of_an_ended_campaign_keep_what_they_have_and_end(tmp_path, number):
     script = tmp_path / "make.py"
