@@ -74,6 +74,18 @@ class PublishedSettings(Group):
     fold: int = setting(0, "which one", ge=0)
 
 
+@settings
+class PackedSettings(Group):
+    """A dataset whose reduced runs are all there is."""
+
+    group: ClassVar[str] = "dataset"
+    name: str = setting("", "what it is called")
+    format: Literal["reduced"] = setting(
+        "reduced", "a few small files, written by sgns reduce ... pack=<folder>"
+    )
+    path: str = setting("", "folder of these files")
+
+
 # --- conf/reduction -------------------------------------------------------------------------------------
 
 
@@ -391,6 +403,7 @@ class Reduce(_Command):
 
     output: str = setting("", "folder for energy.csv; the basis is kept in the dataset's own folder")
     overwrite: bool = setting(False, "true: replace a table that is there at `output`")
+    pack: str | None = setting(None, "new folder: also write the reduced runs there, small")
     device: str = _device()
 
 
@@ -572,6 +585,9 @@ def training_settings(model: Mapping[str, Any], training: Mapping[str, Any]) -> 
     return MODELS[model_settings(model).kind][1].from_dict(training)
 
 
-def dataset_settings(dataset: Mapping[str, Any]) -> DatasetSettings | PublishedSettings:
+_FORMATS: dict[Any, type[Group]] = {"reduced": PackedSettings, None: DatasetSettings}
+
+
+def dataset_settings(dataset: Mapping[str, Any]) -> Group:
     """The settings in the values of `conf/dataset`, checked; errors as `model_settings`."""
-    return (PublishedSettings if "format" in dataset else DatasetSettings).from_dict(dataset)
+    return _FORMATS.get(dataset.get("format"), PublishedSettings).from_dict(dataset)

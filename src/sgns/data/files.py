@@ -11,7 +11,7 @@ import os
 import socket
 import stat
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -338,6 +338,13 @@ def read_arrays(path: Path, wrong: str, advice: str) -> dict[str, np.ndarray]:
         packed.seek(0)
         with np.load(packed, allow_pickle=False) as content:
             return dict(content)
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write an NPZ file; it appears complete or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)
 
 
 @contextmanager

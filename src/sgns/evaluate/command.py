@@ -13,10 +13,8 @@ import math
 import os
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import torch
@@ -30,7 +28,6 @@ from sgns.config import UserError
 from sgns.data.check import scene_problems
 from sgns.data.dataset import Dataset
 from sgns.data.files import only_here, require_replaceable
-from sgns.data.published import PARTICLES, fingerprint, published_runs
 from sgns.data.run import Run
 from sgns.data.surface import surface_grid
 from sgns.evaluate.costs import (
@@ -41,24 +38,21 @@ from sgns.evaluate.costs import (
     solver_rates,
 )
 from sgns.evaluate.figures import VALIDATION
-from sgns.evaluate.metrics import PositionErrors, body_errors, mean_prediction, position_errors
+from sgns.evaluate.metrics import body_errors, mean_prediction, position_errors
+from sgns.evaluate.modes import evaluate_modes
 from sgns.evaluate.report import describe, forward_name, seen_warning, short_names, write_report
 from sgns.evaluate.results import (
     EvaluatedRun,
     Evaluation,
     NetworkTiming,
-    Scores,
     aggregate,
     run_scores,
     seen_before,
-    write_csv,
-    write_json,
     write_tables,
 )
 from sgns.model.features import is_wheel
 from sgns.numbers import counted, elapsed, error_hint, error_words
 from sgns.reduction.basis import Basis, reduction_curves
-from sgns.reduction.reduce import ReducedRun
 from sgns.rollout import single_thread, write_rollout
 from sgns.settings import ModelSettings, model_settings
 from sgns.simulator import Rollout, Simulator
@@ -249,7 +243,7 @@ def evaluate(
             )
             with Run(target) as prediction:
                 errors = position_errors(truth, prediction, simulator.basis, history, grid)
-                body = body_errors(truth, prediction, history)
+                body = body_errors(truth, prediction.pose, history)
                 scores = run_scores(path.stem, errors, truth, prediction, history, *means, body)
             words, wheel = describe(truth.scene), is_wheel(truth.scene)
         runs.append(EvaluatedRun(path.stem, label, words, path, target, errors, scores, wheel))
@@ -314,103 +308,6 @@ def log_summary(evaluation: Evaluation, report: Path) -> None:
         log.info("%s", line)
 
 
-# --- dataset=published: only the modes of these runs are known. With an orthonormal basis the mean square over all
-# particles is ‖ΔS′‖² / 3n all the same; what the reduction leaves out is not in it.
-
-
-def evaluate_published(
-    simulator: Simulator, settings: Mapping[str, Any], split: str, output: Path, checkpoint: Path
-) -> float:
-    """Roll out, print the table, write metrics.csv and metrics.json; returns the skill against frozen.
-
-    The split "train" are the published runs that the simulator was trained on; any other all others of the folder.
-    """
-    trained = {name.rsplit(" ", 1)[-1] for name in simulator.basis.fitted_on or []}
-    everything = [run for found in published_runs(settings["path"]).values() for run in found]
-    kind = everything[0].scene["kind"]
-    if simulator.arrangement_hash != f"published-{kind}":
-        raise UserError(
-            f"{checkpoint} was not trained on published {kind} runs; train one: sgns train dataset=published "
-            f"dataset.path={settings['path']}"
-        )
-    runs = [run for run in everything if (fingerprint(run) in trained) == (split == "train")]
-    if not runs:
-        if split == "train":
-            raise UserError(
-                f"{checkpoint} was trained on none of the runs in {settings['path']}; use split=test"
-            )
-        log.warning("%s was trained on all of these runs: errors on new runs will be larger", checkpoint)
-        runs = everything
-    require_replaceable(output / "metrics.csv", output / "metrics.json")
-    mean_force = simulator.mean_force
-    with single_thread():
-        scores = [scored(simulator, run, mean_force) for run in runs]
-    total = aggregate(scores)
-    log.info("%s", "\n".join(score_lines([*scores, total])))
-    output.mkdir(parents=True, exist_ok=True)
-    write_csv(output / "metrics.csv", [score.row() for score in (*scores, total)])
-    write_json(
-        output / "metrics.json",
-        {
-            "aggregate": total.row(),
-            "runs": [score.row() for score in scores],
-            "mean_training_force_N": mean_force,
-            "particles": PARTICLES[kind],
-            "trained_on_these": runs is everything and split != "train",
-            "made": provenance(simulator, checkpoint),
-        },
-    )
-    log.info("tables: %s", output)
-    return total.skill()
-
-
-def scored(simulator: Simulator, run: ReducedRun, mean_force: np.ndarray) -> Scores:
-    """Scores of one run, rolled out from its first d true frames."""
-    d = simulator.history
-    truth = run.latent[:, : simulator.num_modes]
-    rollout = simulator.rollout(
-        run.pose, in_body_frame(run.pose[0], run.body_points[0]), latent_history=truth[:d], values=run.scene
-    )
-    size = 3 * PARTICLES[run.scene["kind"]]
-
-    def mean_square(latent: np.ndarray) -> np.ndarray:
-        return ((latent - truth)[d:] ** 2).sum(axis=(1, 2)) / size
-
-    elapsed = np.arange(len(truth))[:, None, None] - (d - 1)
-    network = mean_square(rollout.latent)
-    unknown = np.full(len(network), np.nan)
-    errors = PositionErrors(
-        time=run.time[d:],
-        reduction=unknown,
-        network=network,
-        total=network,
-        frozen=mean_square(truth[d - 1][None]),
-        constant_velocity=mean_square(truth[d - 1] + elapsed * (truth[d - 1] - truth[d - 2])),
-        surface=unknown,
-        surface_frozen=unknown,
-    )
-    simulated = SimpleNamespace(time=run.time, force=run.force, torque=run.torque, wall_time_s=0.0)
-    return run_scores(run.name, errors, simulated, rollout, d, mean_force, np.zeros(3))
-
-
-def score_lines(scores: Sequence[Scores]) -> list[str]:
-    """The table as text: position errors in 1e-4 m², force errors in per cent; x is forward, z up."""
-    lines = [
-        "                      position MSE [1e-4 m2]      skill against      force MPE [%]   force NRMSE",
-        "run               network   frozen  const vel  frozen const vel      x       z     network  mean force",
-    ]
-    for score in scores:
-        mse = [1e4 * score.mse[name] for name in ("network", "frozen", "constant_velocity")]
-        lines.append(
-            f"{score.name:<16} {mse[0]:8.4f} {mse[1]:8.4f} {mse[2]:10.4f} {score.skill():7.3f} "
-            f"{score.skill('constant_velocity'):9.3f} {score.force.mpe[0]:7.1f} {score.force.mpe[2]:7.1f} "
-            f"{score.force.overall_nrmse:9.3f} {score.mean_force.overall_nrmse:11.3f}"
-        )
-    absolute = scores[-1].force.absolute_mpe
-    lines.append(f"mean |MPE|: x {absolute[0]:.1f} %, z {absolute[2]:.1f} %")
-    return lines
-
-
 # --- The command ---------------------------------------------------------------------------------------
 
 
@@ -418,13 +315,13 @@ def main(cfg: DictConfig) -> float:
     """The `sgns evaluate` command; returns the position skill against frozen over all runs of the split."""
     new_rollouts = [cfg.new_rollouts] if isinstance(cfg.new_rollouts, str) else cfg.new_rollouts or []
     checkpoint, output = Path(cfg.checkpoint), Path(cfg.output)
-    published = cfg.dataset.get("format") == "published"
+    form = cfg.dataset.get("format")
     simulator = Simulator.load(checkpoint, cfg.device, cfg.num_modes, spread=cfg.spread)
-    if not published:
+    if form is None:
         dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
     with only_here(output / "metrics.json"):
-        if published:
-            return evaluate_published(simulator, cfg.dataset, cfg.split, output, checkpoint)
+        if form is not None:
+            return evaluate_modes(simulator, cfg.dataset, cfg.split, output, checkpoint)
         evaluation = evaluate(
             simulator,
             dataset,

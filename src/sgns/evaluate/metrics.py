@@ -237,9 +237,9 @@ def position_errors(
     return PositionErrors(time=np.asarray(truth.time)[history:], **values, particles=particles)
 
 
-def body_errors(truth: Any, prediction: Any, history: int) -> BodyErrors:
-    """Errors of the body's place in a predicted `Run`, over the frames after the history."""
-    misplaced = prediction.pose[history:, :3] - truth.pose[history:, :3]
+def body_errors(truth: Any, predicted: np.ndarray, history: int) -> BodyErrors:
+    """Errors of predicted poses (T, 7) of a run's body, over the frames after the history."""
+    misplaced = predicted[history:, :3] - truth.pose[history:, :3]
     return BodyErrors(
         mse=float(np.mean((misplaced**2).sum(axis=1))),
         sinkage_mae=float(np.mean(np.abs(misplaced[:, 2]))) if is_wheel(truth.scene) else math.nan,

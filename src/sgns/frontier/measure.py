@@ -343,7 +343,7 @@ def own_errors(simulator: Simulator, dataset: Dataset) -> Scores:
                 positions=lambda frames, latent=latent: basis.inverse(latent[frames]).numpy(),
             )
             errors = position_errors(truth, prediction, basis, d, grid)
-            body = body_errors(truth, prediction, d)
+            body = body_errors(truth, prediction.pose, d)
             found.append(run_scores(path.stem, errors, truth, prediction, d, *means, body))
     return aggregate(found)
 

@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 
 from mpm_warp import Scene
 from sgns.config import UserError
-from sgns.data.files import read_arrays, whole_file
+from sgns.data.files import read_arrays, write_arrays
 from sgns.data.surface import SurfaceGrid, height_map
 from sgns.evaluate.metrics import VectorErrors, height_error, rms_mm
 from sgns.numbers import require_shapes
@@ -62,9 +62,7 @@ class Observation:
 
     def save(self, file: Path) -> None:
         """Write it, complete or not at all."""
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(file) as temporary, temporary.open("wb") as stream:
-            np.savez_compressed(stream, **{f.name: getattr(self, f.name) for f in fields(self)})
+        write_arrays(file, {f.name: getattr(self, f.name) for f in fields(self)})
 
     @property
     def finite(self) -> bool:

@@ -297,6 +297,13 @@ def left_out(path: Path, basis: Basis, since: int) -> tuple[np.ndarray, np.ndarr
     return here, way
 
 
+def outside(latent: np.ndarray, unseen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `left_out` since frame 0, of fewer modes: from the coordinates along those left out (T, c, 3) [m] and what all
+    modes do not see (T, 2) [m²]."""
+    here, way = (np.square(part).sum((1, 2)) for part in (latent, latent - latent[:1]))
+    return here + unseen[:, 0], way + unseen[:, 1]
+
+
 def reconstruction_curve(paths: Sequence[Path], basis: Basis) -> np.ndarray:
     """Reduction MSE of runs in one pass: mean over frames, particles and axes [m²] for r = 0 … R, shape (R + 1,); NaN
     without runs.

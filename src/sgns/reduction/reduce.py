@@ -151,6 +151,9 @@ class ReducedRun:
     torque: np.ndarray  # about the centre of mass [N m], shape (T, 3)
     scene: dict[str, Any]  # the complete scene as plain data
     path: Path | None = None  # the run file; None where there is none with particles
+    unseen: np.ndarray | None = (
+        None  # without one: squares that all modes do not see, of `left_out` since frame 0, (T, 2)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,6 +346,8 @@ def main(cfg: DictConfig) -> float:
     """The `sgns reduce` command; returns the mean squared reconstruction error on the training runs [m²]."""
     from sgns.data.dataset import Dataset
 
+    if "format" in cfg.dataset:
+        raise UserError(f"dataset={cfg.dataset.name} is reduced already; train with it")
     dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
     table = Path(cfg.output) / "energy.csv"
     with only_here(table):
@@ -354,6 +359,10 @@ def main(cfg: DictConfig) -> float:
     log.info("%s", "\n".join(energy_lines(curves, used)))
     log.info("errors on %d training and %d validation runs", len(basis.fitted_on), len(validation))
     log.info("every number of modes: %s; basis and reduced runs: %s", table, reduced.folder)
+    if cfg.get("pack") is not None:
+        from sgns.reduction.packed import pack
+
+        log.info("%s", pack(reduced, Path(cfg.pack)))
     return float(basis.residual_mse(used))
 
 

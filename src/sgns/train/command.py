@@ -29,6 +29,7 @@ from sgns.config import Interrupted, UserError, differences, flattened, of_datas
 from sgns.data.files import only_here, require_replaceable, write_whole
 from sgns.model.checkpoint import SUMMARY, read_checkpoint, read_summary
 from sgns.numbers import counted, error_hint, error_words
+from sgns.reduction.packed import packed_dataset
 from sgns.reduction.reduce import ReducedDataset, reduce_dataset
 from sgns.settings import model_settings, training_settings
 from sgns.train import Fit, Task
@@ -61,6 +62,8 @@ def main(cfg: DictConfig) -> float:
     title = plain["dataset"]["name"]
     if cfg.dataset.get("format") == "published":
         reduced = published_dataset(plain["dataset"], cfg.reduction.num_modes)
+    elif cfg.dataset.get("format") == "reduced":
+        reduced = packed_dataset(plain["dataset"], cfg.reduction.num_modes, cfg.reduction.centring)
     else:
         dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
         reduced, title = reduce_dataset(dataset, cfg.reduction, device=cfg.device), dataset.title

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from sgns.model.dynamics import Dynamics, fitted_band
 from sgns.model.features import BodyTrack, body_track, context_of
-from sgns.reduction.basis import left_out
+from sgns.reduction.basis import left_out, outside
 from sgns.train.windows import filled, require_finite
 
 if TYPE_CHECKING:
@@ -118,11 +118,14 @@ class ValidationRollouts:
         self.unseen, self.unseen_way = 0.0, 0.0
         self.coordinates = math.nan  # 3 n
         paths = [run.path for run in runs if run.path is not None]
-        if basis is not None and len(paths) == len(runs):
+        packed = [(run.latent[:, num_modes:], run.unseen) for run in runs if run.unseen is not None]
+        if basis is not None and len(runs) in (len(paths), len(packed)):
             kept, last = basis.sliced(num_modes), [min(history, length) - 1 for length in self.lengths]
-            parts = zip(
-                *(left_out(*one) for one in zip(paths, [kept] * len(paths), last, strict=True)), strict=True
-            )
+            if packed:
+                each = [outside(*one) for one in packed]
+            else:
+                each = [left_out(*one) for one in zip(paths, [kept] * len(paths), last, strict=True)]
+            parts = zip(*each, strict=True)
             self.unseen, self.unseen_way = (
                 self.squares(stacked(part)[..., None, None].sqrt()) for part in parts
             )

@@ -192,10 +192,10 @@ def test_body_errors_by_hand():
     moved[2:, 2] = [-0.003, 0.003, -0.003]
     moved[2:, 1] = 0.004
     wheel = {"kind": "wheel"}
-    errors = body_errors(SimpleNamespace(pose=poses, scene=wheel), SimpleNamespace(pose=moved), 2)
+    errors = body_errors(SimpleNamespace(pose=poses, scene=wheel), moved, 2)
     assert errors.mse == pytest.approx(0.005**2)
     assert errors.sinkage_mae == pytest.approx(0.003)
-    blade = body_errors(SimpleNamespace(pose=poses, scene={}), SimpleNamespace(pose=poses), 2)
+    blade = body_errors(SimpleNamespace(pose=poses, scene={}), poses, 2)
     assert blade.mse == 0.0 and math.isnan(blade.sinkage_mae)
 
 
