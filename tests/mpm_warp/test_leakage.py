@@ -55,9 +55,20 @@ def test_a_plate_with_an_edge_does_not_leak():
     assert leakage(frames, scene.body) == 0.0
 
 
-def test_what_passes_behind_a_ground_edge_is_no_leak():
-    """The plane half-way through the plate lies behind its ground face there."""
+def test_half_way_through_a_ground_edge_is_the_middle_of_its_wedge():
     plate = Plate(thickness=0.02, width=0.2, length=0.1, edge="bevel")
-    middle = plate.section[0, 1] + 0.5 * 0.02 * 3.0**0.5
-    start, end = ([[x, 0, middle - 0.001], [x, 0, middle + 0.001]] for x in (0.01, -0.01))
-    np.testing.assert_array_equal(leaked([frame(start), frame(end)], plate), [0, -1])
+    ground = -0.05 + (0.01 - np.array([0.005, -0.005])) * 3.0**0.5  # its face at these x
+    ways = [
+        (
+            (0.005, ground[0] + 0.001),
+            (-0.005, ground[1] + 0.001),
+        ),  # along the ground face, pressed in by 0.5 mm
+        ((0.011, -0.04), (-0.011, -0.04)),  # through the wedge, below the middle of the ground face
+        ((-0.011, -0.04), (0.011, -0.04)),
+        ((0.011, -0.051), (-0.011, -0.051)),  # below the tip
+        ((0.011, -0.047), (-0.011, -0.047)),  # 3 mm above it
+        ((0.011, 0.0), (-0.011, 0.0)),
+    ]
+    frames = [frame([[x, 0.0, z] for x, z in places]) for places in zip(*ways, strict=True)]
+    np.testing.assert_array_equal(leaked(frames, plate), [0, -1, 1, 0, -1, -1])
+    np.testing.assert_array_equal(leaked(frames, plate, edge=0.005), [0, -1, 1, 0, 0, -1])
