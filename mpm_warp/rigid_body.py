@@ -121,10 +121,10 @@ class RigidBody:
         """The struct that kernels take."""
         data.margin = scene.contact_distance
         data.layer = HOLDING_LAYER * h if scene.bilateral else 0.0
-        outermost = max(0.0, scene.contact_distance + float(data.layer))
         thicker = thickening(shape, scene.contact_distance, h)
-        data.shape, self._mesh = shape_data(shape, real, outermost, device, thicker)
-        outermost += 0.0 if thicker is None else float(thicker.max())
+        begins = scene.contact_distance + float(data.layer)
+        data.shape, self._mesh = shape_data(shape, real, begins, device, thicker)
+        outermost = max(0.0, begins) + (0.0 if thicker is None else float(thicker.max()))
         data.reach = shape.reach + math.sqrt(3.0) * outermost + h
         data.friction = shape.friction
         data.stiffness, data.damping = contact_spring(scene, scene.filled[1])

@@ -7,6 +7,7 @@ import pytest
 
 from mpm_warp import (
     Bed,
+    Body,
     Box,
     Cylinder,
     Effects,
@@ -248,3 +249,13 @@ def test_the_second_of_two_wheels_rolls_in_the_rut_of_the_first() -> None:
     assert more < 0.5 * sinkage  # it sinks less below the rut than the first below the bed
     up = np.array([[f.force[2], f.other_forces[0, 2]] for f in frames])[rut]
     np.testing.assert_allclose(up.mean(axis=0), 20.0, rtol=0.1)
+
+
+def test_thin_bars_of_a_wheel_begin_inside_where_its_contact_does() -> None:
+    tool = Cylinder(diameter=0.08, width=0.05, grousers=4, grouser_height=0.01, grouser_thickness=0.004)
+    still = ((0.0, 0.08, 0.08, 0.08, 0.0, 0.0, 0.0, 1.0),)
+    for margin in (-0.5, 0.1):
+        made = Body(bed=BED, duration=0.02, tool=tool, path=still, contact_margin=margin)
+        expected = made.contact_distance + 0.25 * 0.004 if margin < 0 else 0.0
+        assert (expected < 0.0) == (margin < 0)
+        assert float(Solver(made).body.data.shape.grouser_offset) == pytest.approx(expected)

@@ -22,27 +22,38 @@ def frames_of(scene: Scene, every: int = 1, **settings) -> list[Frame]:
 
 
 def volume_gain(scene: Scene, position: np.ndarray) -> float:
-    """Volume gain of settled soil [-]: how much less soil than at the start is in the middle of the bed's inner blocks.
+    """Volume gain of settled soil [-]: how much less soil than in a full bed is around the inner points.
 
-    The bin is cut into blocks of 2 x 2 x 2 grid cells. A block is inner where it and all its neighbours hold soil;
-    what lies beyond walls and floor counts as full. Negative gains, soil that has become denser, count as they are.
+    The points are the middles of the grid's cells, and the density there is the sum of quadratic splines one grid
+    spacing wide: that of a lattice of any spacing is 1 to a percent, where counts of particles in blocks of the bin
+    would tell how the lattice and the blocks happen to lie. Soil goes on beyond walls and floor as its mirror image. A
+    point is inner where there is soil two cells from it on every side. Negative gains, soil that has become denser,
+    count as they are.
     """
-    bed, edge = scene.bed, 2.0 * scene.bed.spacing
-    count = [round(s / edge) for s in bed.size[:2]] + [int((bed.size[2] + bed.headroom) / edge)]
-    place = np.floor((position - [0.0, 0.0, -bed.size[2]]) / edge).astype(int)
-    place = place[np.all((place >= 0) & (place < count), axis=1)]
-    blocks = np.zeros(count)
-    np.add.at(blocks, tuple(place.T), 1.0)
-    nominal = 8.0 * bed.particles_per_cell
-    filled = np.pad(blocks > 0.25 * nominal, 1, constant_values=True)
-    filled[:, :, -1] = False
-    inner = filled[1:-1, 1:-1, 1:-1].copy()
+    bed = scene.bed
+    count = [round(s / bed.spacing) for s in (*bed.size[:2], bed.size[2] + bed.headroom)]
+    place = (position - [0.0, 0.0, -bed.size[2]]) / bed.spacing - 0.5
+    lowest = np.floor(place - 0.5).astype(int)
+    off = place - lowest
+    weights = [0.5 * (1.5 - off) ** 2, 0.75 - (off - 1.0) ** 2, 0.5 * (off - 0.5) ** 2]
+    density = np.zeros(count)
+    for shift in np.ndindex(3, 3, 3):
+        node = lowest + shift
+        node = np.where(node < 0, -1 - node, node)
+        node = np.where(node >= count, 2 * np.array(count) - 1 - node, node)
+        inside = np.all((node >= 0) & (node < count), axis=1)
+        weight = np.prod([weights[n][:, axis] for axis, n in enumerate(shift)], axis=0)
+        np.add.at(density, tuple(node[inside].T), weight[inside])
+    density *= scene.filled[1] / bed.spacing**3
+    filled = np.pad(density > 0.25, 2, constant_values=True)
+    filled[:, :, -2:] = False
+    inner = density > 0.25
     for axis in range(3):
-        for shift in (-1, 1):
-            inner &= np.roll(filled, shift, axis)[1:-1, 1:-1, 1:-1]
+        for shift in (-2, -1, 1, 2):
+            inner &= np.roll(filled, shift, axis)[2:-2, 2:-2, 2:-2]
     if not inner.any():
-        raise ValueError("no block of the bed is surrounded by soil")
-    return nominal / float(blocks[inner].mean()) - 1.0
+        raise ValueError("no point of the bed is surrounded by soil")
+    return 1.0 / float(density[inner].mean()) - 1.0
 
 
 def blade_force(scene: Scene, frames: list[Frame]) -> float:

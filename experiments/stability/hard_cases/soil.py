@@ -154,7 +154,10 @@ def thrown_and_settled(per_cell: float) -> tuple[float, str]:
 
 
 def grains_and_settled(per_cell: float) -> tuple[float, str]:
-    bed = Rain(size=(0.16, 0.16, 0.08), particles_per_cell=per_cell, headroom=3.0, **LOOSE)
+    side = 0.32 / math.sqrt(
+        per_cell
+    )  # as many grains for any number per cell: so few that chance counts for 1.4 %
+    bed = Rain(size=(side, side, 0.08), particles_per_cell=per_cell, headroom=3.0, **LOOSE)
     scene = Thrown(bed=bed, spread=0.3, duration=2.0)
     last = frames_of(scene, every=10**6)[-1]
     layer = np.sort(last.position[:, 2] + bed.size[2])
