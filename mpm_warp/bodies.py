@@ -15,7 +15,7 @@ import numpy as np
 
 from .mesh_files import mesh_content, read_mesh
 from .settings import Settings, lengths, same, setting, settings
-from .solids import Solid, checked_mesh, closed_mesh
+from .solids import Solid, checked_mesh, closed_mesh, solid_and_surface
 from .state import SceneError
 
 
@@ -219,9 +219,9 @@ class Box(Settings, Tool):
 
     @property
     def moments(self) -> tuple[float, np.ndarray]:
-        """Volume [m^3], and moments of inertia about the body's axes per density [m^5], shape (3,)."""
+        """Volume [m^3], and inertia about the body's axes per density [m^5], shape (3, 3)."""
         volume, squares = math.prod(self.size), np.square(self.size)
-        return volume, volume / 12.0 * (squares.sum() - squares)
+        return volume, np.diag(volume / 12.0 * (squares.sum() - squares))
 
     def points(self) -> np.ndarray:
         return _upright_edges(self.half_size, 2)
@@ -282,7 +282,7 @@ class Cylinder(Settings, Tool):
         radius = 0.5 * self.diameter
         volume = math.pi * radius**2 * self.width
         across = volume * (3.0 * radius**2 + self.width**2) / 12.0
-        return volume, np.array([across, 0.5 * volume * radius**2, across])
+        return volume, np.diag([across, 0.5 * volume * radius**2, across])
 
     def points(self, count: int = 8) -> np.ndarray:
         """Body nodes: `count` on each of the two rims, shape (2 count, 3)."""
@@ -320,7 +320,7 @@ class Sphere(Settings, Tool):
     def moments(self) -> tuple[float, np.ndarray]:
         """As of a box."""
         volume = math.pi / 6.0 * self.diameter**3
-        return volume, np.full(3, 0.1 * volume * self.diameter**2)
+        return volume, np.diag(np.full(3, 0.1 * volume * self.diameter**2))
 
     def points(self) -> np.ndarray:
         """Body nodes: where the body's axes go through the surface, shape (6, 3)."""
@@ -414,6 +414,20 @@ class MeshBody(Settings, Tool):
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices about the centre of mass [m] (k, 3), triangles (t, 3)."""
         return self._solid.vertices, self._solid.triangles
+
+    @cached_property
+    def _moments(self) -> list[tuple[float, np.ndarray]]:
+        return solid_and_surface(*self.mesh)
+
+    @property
+    def moments(self) -> tuple[float, np.ndarray]:
+        """As of a box."""
+        return self._moments[0]
+
+    @property
+    def surface_moments(self) -> tuple[float, np.ndarray]:
+        """Area [m^2], and inertia of a thin skin per mass and area [m^4], shape (3, 3)."""
+        return self._moments[1]
 
     @property
     def tip(self) -> np.ndarray:

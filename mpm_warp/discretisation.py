@@ -125,7 +125,7 @@ def asymmetry(scene: Scene) -> str | None:
         if one.free:
             return f"{one.place} is free to leave the plane"
         if reason := _body_asymmetry(one):
-            return reason.replace("the body", one.place)
+            return reason.replace("the body", one.place).replace("the tool", one.place)
     if reason := _body_asymmetry(scene):
         return reason
     if scene.soil is not None and scene.soil.state.whole is None:

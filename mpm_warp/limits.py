@@ -32,7 +32,7 @@ def substeps_per_frame(scene: Scene) -> int:
     Raises:
         SceneError: more than limits.py allows in a frame or in all.
     """
-    limit = min(_wave_step(scene), *map(longest_step, (scene, *scene.companions)))
+    limit = min(wave_step(scene), *map(longest_step, (scene, *scene.companions)))
     count = 1.0 / scene.frame_rate / limit - 1e-9 if limit > 0.0 else math.inf
     total = count * (scene.frame_count - 1)
     if not count <= MOST_SUBSTEPS:
@@ -48,7 +48,7 @@ def substeps_per_frame(scene: Scene) -> int:
     return max(1, math.ceil(count))
 
 
-def _wave_step(scene: Scene) -> float:
+def wave_step(scene: Scene) -> float:
     """Longest step [s] that elastic waves and the body's motion allow."""
     step = scene.courant * scene.bed.spacing / (scene.material.wave_speed + top_body_speed(scene))
     return step * damped_share(scene)
@@ -57,10 +57,10 @@ def _wave_step(scene: Scene) -> float:
 def _way_out(scene: Scene) -> str:
     """What to change for fewer substeps: the key that asks for most of them beyond what the defaults would."""
     for one in scene.companions:
-        if longest_step(one) < _wave_step(scene):
+        if longest_step(one) < wave_step(scene):
             key = "density" if one.free else "load"
             return f"the mass of {one.place} is too small for contact this stiff: raise its {key}"
-    if scene.axle is not None and longest_step(scene) < _wave_step(scene):
+    if scene.axle is not None and longest_step(scene) < wave_step(scene):
         return (
             f"the body's mass of {scene.axle.mass:.3g} kg is too small for contact this stiff: raise scene.load or "
             "lower scene.gravity"

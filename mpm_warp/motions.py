@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from .bed import Bed
-from .bodies import Box, Cylinder, Sphere, Tool
+from .bodies import Box, Cylinder, MeshBody, Sphere, Tool
 from .poses import (
     about_y,
     in_world_frame,
@@ -211,19 +211,19 @@ _MOST_POSES, _MOST_POINTS = 100_000, 1_000_000
 """That are looked at for walls in a way, and at a time."""
 
 
-def as_path(rows: Any) -> tuple[tuple[float, ...], ...]:
+def as_path(rows: Any, name: str) -> tuple[tuple[float, ...], ...]:
     """The rows of a path as numbers; whether they are poses is looked at where they are used."""
     for number, row in enumerate(rows, 1):
         if not isinstance(row, (list, tuple, np.ndarray)) or len(row) != 8:
             raise SceneError(
-                f"row {number} of the path is {short(row)}; it needs 8 numbers: t, x, y, z, qx, qy, qz, qw"
+                f"row {number} of {name} is {short(row)}; it needs 8 numbers: t, x, y, z, qx, qy, qz, qw"
             )
         for value in row:
             if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-                raise SceneError(f"row {number} of the path holds {short(value)}; allowed: numbers")
+                raise SceneError(f"row {number} of {name} holds {short(value)}; allowed: numbers")
             if _FARTHEST < abs(float(value)) < math.inf:
                 raise SceneError(
-                    f"row {number} of the path holds {value:.3g}; allowed: {-_FARTHEST:g} to {_FARTHEST:g}"
+                    f"row {number} of {name} holds {value:.3g}; allowed: {-_FARTHEST:g} to {_FARTHEST:g}"
                 )
     return tuple(tuple(float(v) for v in row) for row in rows)
 
@@ -231,6 +231,8 @@ def as_path(rows: Any) -> tuple[tuple[float, ...], ...]:
 class Moved:
     """A scene's body along its way: where it is, how far it goes, and whether it stays in the bin."""
 
+    path_name = "the path"
+    """As errors name it."""
     bed: Bed
     duration: float
     frame_rate: float
@@ -265,7 +267,9 @@ class Moved:
         Of a body with a free height the z of the start, which the solver replaces.
         """
         if self._path is not None:
-            poses = sampled_poses(np.asarray(self._path), np.atleast_1d(np.asarray(time, dtype=float)))
+            poses = sampled_poses(
+                np.asarray(self._path), np.atleast_1d(np.asarray(time, dtype=float)), self.path_name
+            )
             if self.body is not None and (point := self.body.path_point).any():
                 poses[:, :3] -= rotate(poses[:, 3:], point)
             return poses
@@ -371,7 +375,7 @@ class Other(Settings):
 
     group: ClassVar[str] = "scene.others"
 
-    tool: Sphere | Box | Cylinder = setting(Sphere, "the body")
+    tool: Sphere | Box | Cylinder | MeshBody = setting(Sphere, "the body")
     motion: Literal["free", "path", "follow"] = setting(
         "free",
         "free: it falls, turns and is pushed; path: prescribed; follow: as the scene's own body, beside it",
@@ -389,7 +393,7 @@ class Other(Settings):
     density: float = setting(
         2650.0, "of a free body: its mass by its volume, grousers left out", "kg/m^3", gt=0, le=1e6
     )
-    path: tuple[Any, ...] | None = setting(None, "for path: rows as of scene.path")
+    path: tuple[Any, ...] | None = setting(None, "for path: a CSV file, or rows, as of scene.path")
     load: float | None = setting(
         None,
         "with path or follow: the height is free, and this is the weight; None: as of the body it follows",
@@ -409,3 +413,6 @@ class Other(Settings):
                 )
         if self.motion == "path" and self.path is None:
             raise SceneError("scene.others.path is missing: rows t, x, y, z, qx, qy, qz, qw for motion=path")
+        if self.path is not None:  # as rows of plain data are
+            rows = tuple(tuple(row) if isinstance(row, list) else row for row in self.path)
+            object.__setattr__(self, "path", rows)

@@ -79,7 +79,7 @@ def fitted_poses(points: np.ndarray, world: np.ndarray) -> np.ndarray:
     return np.concatenate([place, Rotation.from_matrix(rotation).as_quat(canonical=True)], axis=1)
 
 
-def sampled_poses(samples: np.ndarray, time: np.ndarray) -> np.ndarray:
+def sampled_poses(samples: np.ndarray, time: np.ndarray, name: str = "the path") -> np.ndarray:
     """Poses at `time` (T,) [s] between samples (rows t, x, y, z, qx, qy, qz, qw), shape (T, 7).
 
     Positions are interpolated linearly, rotations along the shortest way; the body rests before the first
@@ -91,21 +91,21 @@ def sampled_poses(samples: np.ndarray, time: np.ndarray) -> np.ndarray:
     samples = np.asarray(samples, dtype=float)
     if samples.ndim != 2 or samples.shape[1] != 8 or len(samples) < 1:
         raise SceneError(
-            f"the path has shape {samples.shape}; it needs rows of 8 numbers: t, x, y, z, qx, qy, qz, qw"
+            f"{name} has shape {samples.shape}; it needs rows of 8 numbers: t, x, y, z, qx, qy, qz, qw"
         )
     bad = np.argwhere(~np.isfinite(samples))
     if len(bad):
         raise SceneError(
-            f"the path holds a value that is not finite in row {bad[0][0] + 1}, column {bad[0][1] + 1}"
+            f"{name} holds a value that is not finite in row {bad[0][0] + 1}, column {bad[0][1] + 1}"
         )
     t, quaternion = samples[:, 0], samples[:, 4:]
     late = np.diff(t) <= 0.0
     if late.any():
         row = int(np.argmax(late)) + 2
-        raise SceneError(f"the path's times must increase; row {row} does not come after the row before it")
+        raise SceneError(f"{name}'s times must increase; row {row} does not come after the row before it")
     odd = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) > 1e-3
     if odd.any():
-        raise SceneError(f"the path's quaternion in row {int(np.argmax(odd)) + 1} is not of length 1")
+        raise SceneError(f"{name}'s quaternion in row {int(np.argmax(odd)) + 1} is not of length 1")
     time = np.clip(time, t[0], t[-1])
     position = np.stack([np.interp(time, t, samples[:, 1 + axis]) for axis in range(3)], axis=-1)
     left = np.clip(np.searchsorted(t, time, side="right") - 1, 0, max(0, len(t) - 2))

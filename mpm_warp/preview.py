@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+import re
+from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 
 from .bed import PADDING
+from .limits import wave_step
 from .poses import rotation_matrices, rotation_vectors
-from .scene import Scene
+from .rigid_body import longest_step
+from .scene import Companion, Scene
 from .scenes import Wheel
 from .settings import likely_radians
 from .tool_geometry import Odd, odd_size, odd_times, place_unit
@@ -18,6 +22,8 @@ _NOTICED = 0.25
 """Depth of a tool's lowest point at the start that is told of [grid spacings]."""
 _MOST_LOOKED_AT = 500
 """Poses near a wall."""
+_MANY = 2.0
+"""Times as many steps as the soil takes, from which on a light body is told of."""
 
 
 @dataclass(frozen=True)
@@ -50,91 +56,133 @@ class Preview:
     @staticmethod
     def of(scene: Scene) -> Preview:
         """Of a scene; takes milliseconds."""
-        body, warnings = scene.body, [*_radians(scene), *scene.warnings(), *_buried(scene)]
-        free = [f"{one.place} is free and has {one.mass:.3g} kg" for one in scene.companions if one.free]
-        if body is None:
-            return Preview(warnings=tuple(warnings), lines=tuple(_bin(scene) + free))
-        times = scene.passing_times()
-        poses, outline = scene.poses_at(times), body.outline()
-        low = scene.lowest_points(poses)
-        deepest = int(np.argmin(low))
-        around = np.abs(rotation_matrices(poses[:, 3:]))[:, :2] @ body.half_size
-        over = np.all((poses[:, :2] + around > 0.0) & (poses[:, :2] - around < scene.bed.size[:2]), axis=1)
-        touching = np.flatnonzero((low < scene.bed.surface_at(*poses[:, :2].T)) & over)
-        touch = float(times[touching[0]]) if len(touching) else None
-        reach = np.stack([outline.min(axis=0), outline.max(axis=0)]) - body.path_point
-        found = [odd_size(body, scene.bed.size, scene.open_sides), *_of_path(scene, low, touch)]
-        odd = [one for one in found if one]
-        warnings += [one.words for one in odd] or _throws(scene, times, touching)
-        above = _to_begin_above(scene, -float(low[0]))
-        if len(scene.own_displaced):
-            deep = f", {_words(-low[0])} deep" if low[0] < 0.0 else ""
-            warnings.append(
-                f"the tool is in the soil at the start{deep}: {len(scene.own_displaced)} particles "
-                "that would lie inside it are left out; soil closes in on it in the first 0.2 s: let it rest so long"
-                + above
-            )
-        elif touch == 0.0 and above and -low[0] > _NOTICED * scene.bed.spacing:
-            warnings.append(
-                f"the tool is in the soil at the start, its lowest point {_words(-low[0])} deep{above}"
-            )
-        if touch is not None:
-            warnings += near_floor(scene, float(low[deepest]))
-        warnings += near_wall(scene, times, poses) + beside_wall(scene, poses)
-        lines = (
-            _bin(scene) + scene.remarks() + ([] if scene.axle is not None else _way(scene, low, times, touch))
-        )
-        given = scene.path_times()
-        if len(given) > 1 and given[-1] < scene.duration - 1.0 / scene.frame_rate:
-            lines.append(
-                f"the path ends at {given[-1]:.4g} s; the tool rests there until {scene.duration:g} s"
-            )
-        if getattr(scene, "motion", "path") == "path" and given.size:
-            sides = _sides(reach)
-            named = {
-                "com": "centre of mass",
-                "file": "origin in the file",
-                "tip": "tip (middle of its lowest face)",
-            }
-            used = getattr(body, "origin", "com")
-            places = {name: [round(1e3 * x) for x in place] for name, place in body.origins.items()}
-            others = "".join(
-                f"; the {named[name]} is at ({', '.join(map(str, place))}) mm from the centre of mass"
-                for name, place in places.items()
-                if name != "com" and any(place)
-            )
-            turned = rotation_vectors(np.array([0.0, 0.0, 0.0, 1.0]), poses[0, 3:])
-            angle = float(np.linalg.norm(turned))
-            if angle > 0.01:
-                there = (outline - body.path_point) @ rotation_matrices(poses[0, 3:]).T
-                about = ", ".join(f"{x:.2g}" for x in turned / angle + 0.0)
-                others += (
-                    f"; at the start it is turned by {math.degrees(angle):.0f} degrees about ({about}) and then "
-                    f"reaches from {_sides(np.stack([there.min(axis=0), there.max(axis=0)]))}"
-                )
-            lines.insert(
-                0,
-                f"the path is that of the tool's {named[used]}; around it the tool reaches from {sides}{others}",
-            )
-        return Preview(
-            lowest=float(low[deepest]),
-            lowest_at=float(times[deepest]),
-            first_touch=touch,
-            reach=reach,
+        warnings = [*_radians(scene), *scene.warnings()]
+        own = Preview(lines=tuple(_bin(scene))) if scene.body is None else _of_tool(scene)
+        every = [own, *map(_of_further, scene.companions)]
+        return replace(
+            own,
             displaced=len(scene.displaced),
-            warnings=tuple(warnings),
-            not_meant=tuple(one.words for one in odd if one.sure),
-            lines=tuple(lines + free),
+            warnings=(*warnings, *chain.from_iterable(one.warnings for one in every)),
+            not_meant=tuple(chain.from_iterable(one.not_meant for one in every)),
+            lines=tuple(chain.from_iterable(one.lines for one in every)),
         )
 
 
-def _buried(scene: Scene) -> list[str]:
-    """Of further bodies."""
-    return [
-        f"{one.place} is in the soil at the start: {len(one.displaced)} particles that would lie inside it are left out"
-        for one in scene.companions
-        if len(one.displaced)
-    ]
+def _of_tool(scene: Scene) -> Preview:
+    """Of the body of a scene, or of a further one that is not free, as if there were no other."""
+    body, warnings, given = scene.body, [], _path_times(scene)
+    assert body is not None
+    times = scene.passing_times()
+    poses, outline = scene.poses_at(times), body.outline()
+    low = scene.lowest_points(poses)
+    deepest = int(np.argmin(low))
+    around = np.abs(rotation_matrices(poses[:, 3:]))[:, :2] @ body.half_size
+    over = np.all((poses[:, :2] + around > 0.0) & (poses[:, :2] - around < scene.bed.size[:2]), axis=1)
+    touching = np.flatnonzero((low < scene.bed.surface_at(*poses[:, :2].T)) & over)
+    touch = float(times[touching[0]]) if len(touching) else None
+    reach = np.stack([outline.min(axis=0), outline.max(axis=0)]) - body.path_point
+    found = [odd_size(body, scene.bed.size, scene.open_sides), *_of_path(scene, low, touch)]
+    odd = [one for one in found if one]
+    warnings += [one.words for one in odd] or _throws(scene, times, touching)
+    above = _to_begin_above(scene, -float(low[0]))
+    if len(scene.own_displaced):
+        deep = f", {_words(-low[0])} deep" if low[0] < 0.0 else ""
+        warnings.append(
+            f"the tool is in the soil at the start{deep}: {len(scene.own_displaced)} particles "
+            "that would lie inside it are left out; soil closes in on it in the first 0.2 s: let it rest so long"
+            + above
+        )
+    elif touch == 0.0 and above and -low[0] > _NOTICED * scene.bed.spacing:
+        warnings.append(
+            f"the tool is in the soil at the start, its lowest point {_words(-low[0])} deep{above}"
+        )
+    if touch is not None:
+        warnings += near_floor(scene, float(low[deepest]))
+    warnings += near_wall(scene, times, poses) + beside_wall(scene, poses)
+    lines = [] if isinstance(scene, Companion) else _bin(scene) + scene.remarks()
+    lines += [] if scene.axle is not None else _way(scene, low, times, touch)
+    if len(given) > 1 and given[-1] < scene.duration - 1.0 / scene.frame_rate:
+        lines.append(f"the path ends at {given[-1]:.4g} s; the tool rests there until {scene.duration:g} s")
+    if getattr(scene, "motion", "path") == "path" and given.size:
+        sides = _sides(reach)
+        named = {
+            "com": "centre of mass",
+            "file": "origin in the file",
+            "tip": "tip (middle of its lowest face)",
+        }
+        used = getattr(body, "origin", "com")
+        places = {name: [round(1e3 * x) for x in place] for name, place in body.origins.items()}
+        others = "".join(
+            f"; the {named[name]} is at ({', '.join(map(str, place))}) mm from the centre of mass"
+            for name, place in places.items()
+            if name != "com" and any(place)
+        )
+        turned = rotation_vectors(np.array([0.0, 0.0, 0.0, 1.0]), poses[0, 3:])
+        angle = float(np.linalg.norm(turned))
+        if angle > 0.01:
+            there = (outline - body.path_point) @ rotation_matrices(poses[0, 3:]).T
+            about = ", ".join(f"{x:.2g}" for x in turned / angle + 0.0)
+            others += (
+                f"; at the start it is turned by {math.degrees(angle):.0f} degrees about ({about}) and then "
+                f"reaches from {_sides(np.stack([there.min(axis=0), there.max(axis=0)]))}"
+            )
+        lines.insert(
+            0,
+            f"the path is that of the tool's {named[used]}; around it the tool reaches from {sides}{others}",
+        )
+    return Preview(
+        lowest=float(low[deepest]),
+        lowest_at=float(times[deepest]),
+        first_touch=touch,
+        reach=reach,
+        warnings=tuple(warnings),
+        not_meant=tuple(one.words for one in odd if one.sure),
+        lines=tuple(lines),
+    )
+
+
+def _path_times(scene: Scene) -> np.ndarray:
+    """Times of the rows of a body's own path [s]."""
+    follows = isinstance(scene, Companion) and scene.settings.motion == "follow"
+    return np.zeros(0) if follows else scene.path_times()
+
+
+def _of_further(scene: Companion) -> Preview:
+    """Of a further body, by its name."""
+    warnings = scene.warnings()
+    found = _of_free(scene) if scene.free else _of_tool(scene)
+    if (more := wave_step(scene.scene) / longest_step(scene)) > _MANY:
+        key = "density, or make it larger" if scene.free else "load"
+        warnings.append(
+            f"the tool is so light that the run takes {more:.2g} times as many steps as the soil needs: raise its {key}"
+        )
+
+    def named(words: str) -> str:
+        words = re.sub(r"scene\.(path|tool)", rf"{scene.place}.\1", words)
+        return words.replace("the tool", scene.place) if "the tool" in words else f"{scene.place}: {words}"
+
+    return Preview(
+        warnings=tuple(map(named, (*warnings, *found.warnings))),
+        not_meant=tuple(map(named, found.not_meant)),
+        lines=tuple(map(named, found.lines)),
+    )
+
+
+def _of_free(scene: Companion) -> Preview:
+    """Of a body of six degrees of freedom, whose way is not known."""
+    low = float(scene.lowest_points(scene.poses_at(np.zeros(1)))[0])
+    begins = f"its lowest point begins {_words(abs(low))} {'above' if low >= 0.0 else 'below'} the surface"
+    odd, warnings = odd_size(scene.body, scene.bed.size, scene.open_sides), []
+    if len(scene.own_displaced):
+        warnings.append(
+            f"the tool is in the soil at the start: {len(scene.own_displaced)} particles that would lie inside it are "
+            "left out"
+        )
+    return Preview(
+        warnings=tuple(([odd.words] if odd else []) + warnings),
+        not_meant=(odd.words,) if odd and odd.sure else (),
+        lines=(f"the tool is free and has {scene.mass:.3g} kg; {begins}",),
+    )
 
 
 def near_floor(scene: Scene, lowest: float) -> list[str]:
@@ -317,7 +365,7 @@ def _way(scene: Scene, low: np.ndarray, times: np.ndarray, touch: float | None) 
 
 def _of_path(scene: Scene, low: np.ndarray, touch: float | None) -> list[Odd]:
     """One line at most on what is odd: a wrong unit explains the rest; and one where path and run end apart."""
-    times = scene.path_times()
+    times = _path_times(scene)
     if len(times) and (odd := odd_times(times, scene.duration)):
         return [odd]
     ends = []
@@ -344,6 +392,8 @@ def _of_poses(scene: Scene, times: np.ndarray, low: np.ndarray, touch: float | N
         remedy = "z = 0 is the surface and below it the z of a path is negative"
         if not len(times):
             remedy = "scene.depth, which is positive, counts from scene.clearance above the surface"
+            if isinstance(scene, Companion):
+                remedy = "its position counts from the body that it follows"
             if low.min() > max(scene.bed.size):
                 remedy = "lengths are in metres"
     return [Odd(f"the tool never touches soil: {place}; {likely or remedy}", bool(likely))]

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from .bodies import MeshBody
 from .kernels.contact import (
     COUNT,
     GAINED,
@@ -69,18 +70,26 @@ def longest_step(scene: Scene) -> float:
 
     Counted as if the whole lower half of the box around the body touched a particle per (particle spacing)^2. Of a body
     that is free in all directions all of its surface counts, and half of its mass: that is what a rod or a cylinder has
-    at its surface against being turned, and other shapes have more.
+    at its surface against being turned, and other shapes have more. Of a mesh all of its surface counts; what it has
+    against being turned is computed.
     """
-    if scene.body is None:
+    body = scene.body
+    if body is None:
         return math.inf
     volume = scene.bed.particle_volume
-    hx, hy, hz = scene.body.half_size
+    hx, hy, hz = body.half_size
     if isinstance(scene, Companion) and scene.free:
-        box = 8.0 * hx * hy * hz  # of spheres and cylinders, the same share of volume and surface
-        area = 8.0 * (hx * hy + hy * hz + hz * hx) * scene.mass / (scene.settings.density * box)
-        mass = 0.5 * scene.mass
+        if isinstance(body, MeshBody):
+            mass, (area, skin), (whole, solid) = scene.mass, body.surface_moments, body.moments
+            area = max(area, whole * float(np.linalg.eigvals(np.linalg.solve(solid, skin)).real.max()))
+        else:
+            box = 8.0 * hx * hy * hz  # of spheres and cylinders, the same share of volume and surface
+            area = 8.0 * (hx * hy + hy * hz + hz * hx) * scene.mass / (scene.settings.density * box)
+            mass = 0.5 * scene.mass
     elif scene.axle is not None:
         area, mass = 4.0 * hx * hy + 4.0 * hz * (hx + hy), scene.axle.mass
+        if isinstance(body, MeshBody):
+            area = max(area, body.surface_moments[0])
     else:
         return math.inf
     return stable_step(mass, area / volume ** (2.0 / 3.0), *contact_spring(scene, volume))
@@ -152,7 +161,8 @@ class RigidBody:
         if isinstance(scene, Companion) and scene.free:
             self._inertia = scene.inertia
             self._motion = wp.array(self._at_start(scene), dtype=wp.float64, device=device)
-            given = [time_step, scene.mass, wp.vec3d(*(1.0 / scene.inertia)), wp.vec3d(*scene.gravity_vector)]
+            inverse = wp.mat33d(*np.linalg.inv(scene.inertia).ravel())
+            given = [time_step, scene.mass, inverse, wp.vec3d(*scene.gravity_vector)]
             moving.append(Launch(free_step(real), 1, [data, self._motion, *given], device))
         impulses = threads.copies(data.impulse)
         for impulse in impulses[1:]:
@@ -170,7 +180,7 @@ class RigidBody:
         found = np.zeros(COUNT)
         found[:SPEED], found[SPEED:SPIN] = scene.poses_at(np.zeros(1))[0], scene.settings.velocity
         turn = rotation_matrices(found[TURNED:SPEED])
-        found[SPIN:GAINED] = turn @ (scene.inertia * (np.array(scene.settings.spin) @ turn))
+        found[SPIN:GAINED] = turn @ (scene.inertia @ (np.array(scene.settings.spin) @ turn))
         return found
 
     def head_for(self, frame: int, pose: np.ndarray) -> None:
@@ -223,7 +233,7 @@ class RigidBody:
             self.data.position.assign(motion[None, :TURNED])
             self.data.rotation.assign(motion[None, TURNED:SPEED])
             self.data.velocity.assign(motion[None, SPEED:SPIN])
-            self.data.spin.assign((turn @ (motion[SPIN:GAINED] @ turn / self._inertia))[None])
+            self.data.spin.assign((turn @ np.linalg.solve(self._inertia, motion[SPIN:GAINED] @ turn))[None])
             return
         times = (frame * self.substeps + np.arange(self.substeps + 1)) * self.time_step
         if self._axle is not None and self.scene.axle is not None:

@@ -7,6 +7,7 @@ import json
 import math
 from dataclasses import asdict, fields
 from functools import cached_property, partial
+from itertools import zip_longest
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,7 +22,7 @@ from .poses import (
 )
 from .settings import Settings, build, setting, settings, short
 from .state import SceneError, Soil
-from .tool_geometry import HOLDS, distances, odd_size, thickening
+from .tool_geometry import HOLDS, distances, odd_size, thickening, thin_walls
 
 MOST_FRAMES = 1_000_000
 MOST_COURANT = 0.8
@@ -113,7 +114,7 @@ class Scene(Settings, Moved):
                 f"bed.surface is given, but a scene of the kind {self.kind} has a start of its own"
             )
         if self._path is not None:
-            object.__setattr__(self, "path", as_path(self._path))
+            object.__setattr__(self, "path", as_path(self._path, self.path_name))
         for number, one in enumerate(self.others):
             if one.motion != "follow":  # what is followed is not known yet
                 Companion(self, number)
@@ -287,6 +288,11 @@ class Scene(Settings, Moved):
         return self.body.mesh if isinstance(self.body, MeshBody) else None
 
     @property
+    def meshes(self) -> tuple[tuple[np.ndarray, np.ndarray] | None, ...]:
+        """`mesh`, then that of each further body."""
+        return self.mesh, *(one.mesh for one in self.companions)
+
+    @property
     def axle(self) -> Axle | None:
         """The body's vertical motion if it is free; None: all of it is prescribed."""
         return None
@@ -353,26 +359,23 @@ class Scene(Settings, Moved):
         return json.loads(json.dumps(asdict(self)))
 
     @staticmethod
-    def from_dict(data: dict[str, Any], mesh: tuple[np.ndarray, np.ndarray] | None = None) -> Scene:
+    def from_dict(data: dict[str, Any], *meshes: tuple[np.ndarray, np.ndarray] | None) -> Scene:
         """The scene described by plain nested data, checked.
 
         Args:
             data: as from `to_dict`, or less. A `tool.file` without `tool.digest` is read: it is a person's wish. One
                 with a digest was read before, and is not read again: `data` may come from any file.
-            mesh: of such a tool, see `mesh`.
+            meshes: of such tools, see `meshes`.
         """
         kind = data.get("kind", "bed")
         if not isinstance(kind, str) or kind not in Scene.classes:
             raise SceneError(f"scene.kind is {kind!r}; allowed: {', '.join(Scene.classes)}")
-        tool = data.get("tool")
-        if isinstance(tool, dict) and tool.get("shape") == "mesh":
-            if mesh is not None:
-                data = data | {"tool": build(MeshBody, tool, "scene.tool", partial(MeshBody.of_mesh, *mesh))}
-            elif tool.get("digest"):
-                raise SceneError(
-                    "scene.tool is a mesh, which these data do not hold (nor does a checkpoint); take it from a "
-                    "run: Scene.from_dict(run.scene, run.mesh); or leave out tool.digest to read tool.file again"
-                )
+        own, *more = meshes or (None,)
+        data = _with_mesh(data, own, "scene")
+        if isinstance(others := data.get("others"), (list, tuple)):
+            known = zip_longest(others, more[: len(others)])
+            every = [_with_mesh(one, mesh, f"scene.others[{i}]") for i, (one, mesh) in enumerate(known)]
+            data = data | {"others": every}
         return build(Scene.classes[kind], data, "scene")
 
     def _check_thickness(self, body: Tool, what: str) -> None:
@@ -387,6 +390,21 @@ class Scene(Settings, Moved):
             )
 
 
+def _with_mesh(body: Any, mesh: tuple[np.ndarray, np.ndarray] | None, place: str) -> Any:
+    """Plain data of a scene or of a further body; where its tool is a mesh that was read before, with that mesh."""
+    tool = body.get("tool") if isinstance(body, dict) else None
+    if not isinstance(tool, dict) or tool.get("shape") != "mesh":
+        return body
+    if mesh is not None:
+        return body | {"tool": build(MeshBody, tool, f"{place}.tool", partial(MeshBody.of_mesh, *mesh))}
+    if tool.get("digest"):
+        raise SceneError(
+            f"{place}.tool is a mesh, which these data do not hold (nor does a checkpoint); take it from a run: "
+            "Scene.from_dict(run.scene, *run.meshes); or leave out tool.digest to read tool.file again"
+        )
+    return body
+
+
 class Companion(Scene):
     """One of the further bodies of a scene, seen as if it were the only one in it.
 
@@ -397,13 +415,14 @@ class Companion(Scene):
     def __init__(self, scene: Scene, number: int) -> None:
         self.__dict__.update({one.name: getattr(scene, one.name) for one in fields(Scene)}, others=())
         self.scene, self.settings, self.place = scene, scene.others[number], f"scene.others[{number}]"
-        if self.settings.path is not None:
-            self._rows = as_path(self.settings.path)
+        self.path_name = f"{self.place}.path"
+        self.path = None if self.settings.path is None else as_path(self.settings.path, self.path_name)
         if self.settings.motion == "follow" and scene.body is None:
             raise SceneError(f"{self.place} has nothing to follow: a scene of kind {scene.kind} has no body")
         if self.settings.load is not None and not self.gravity > 0:
             raise SceneError(f"{self.place}.load needs scene.gravity above 0 m/s^2")
-        self._check_thickness(self.body, self.place)
+        if not isinstance(self.body, MeshBody):  # whose thin walls are made to hold
+            self._check_thickness(self.body, self.place)
         self._check_inside(self.body, self.place, "change its position or path")
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -425,8 +444,14 @@ class Companion(Scene):
 
     @property
     def inertia(self) -> np.ndarray:
-        """Of a free body, about its axes [kg m^2], shape (3,)."""
+        """Of a free body, about its axes [kg m^2], shape (3, 3)."""
         return self.settings.density * self.settings.tool.moments[1]
+
+    def warnings(self) -> list[str]:
+        odd = odd_size(self.body, self.bed.size, self.open_sides)
+        return self.body.warnings() + (
+            [] if odd else thin_walls(self.body, self.contact_distance, self.bed.spacing)
+        )
 
     @property
     def axle(self) -> Axle | None:
@@ -442,10 +467,6 @@ class Companion(Scene):
     @property
     def filled(self) -> tuple[np.ndarray, float]:
         return self.scene.filled
-
-    @property
-    def _path(self) -> tuple[tuple[float, ...], ...] | None:
-        return self.__dict__.get("_rows")
 
     @property
     def impact_speed(self) -> float:

@@ -17,7 +17,7 @@ from .poses import about_y, about_z_y
 from .scene import Scene
 from .settings import same, setting, settings
 from .state import SceneError
-from .tool_geometry import least_thickness, odd_size, thickening, thinnest
+from .tool_geometry import odd_size, thin_walls
 
 _PATH = "rows t [s], x, y, z [m], qx, qy, qz, qw of the body's centre of mass, or of tool.origin"
 _SHARE = ", a share of the bin's length"
@@ -197,22 +197,9 @@ class Body(Scene):
         return self.passes.turns(self.depth, self.speed) if self.motion == "passes" else super().path_times()
 
     def warnings(self) -> list[str]:
-        found, h = super().warnings(), self.bed.spacing
         if odd_size(self.tool, self.bed.size, self.open_sides):
-            return found  # which is another matter
-        thickness = thinnest(self.tool, 2.0 * h)
-        if thickness < 1.999 * h:  # in single precision
-            found.append(
-                f"the tool's thinnest part is {1e3 * thickness:.3g} mm, {thickness / h:.2g} grid spacings; below 2 the "
-                "soil on its two sides feels each other: use a smaller bed.spacing"
-            )
-        thicker = thickening(self.tool, self.contact_distance, h)
-        if thicker is not None:
-            found.append(
-                f"contact with the tool's thin walls begins up to {1e3 * thicker.max():.2g} mm further out, for soil "
-                f"not to go through them; walls of {1e3 * least_thickness(self.contact_distance, h):.3g} mm need none"
-            )
-        return found
+            return super().warnings()  # which is another matter
+        return super().warnings() + thin_walls(self.tool, self.contact_distance, self.bed.spacing)
 
     def results(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> dict[str, float]:
         names = (f"mean_force_{axis}_N" for axis in "xyz")

@@ -88,6 +88,22 @@ def _moments(vertices: np.ndarray, triangles: np.ndarray) -> tuple[float, np.nda
     return volume, (parts[:, None] * (a + b + c)).sum(axis=0) / (4.0 * volume or 1.0)
 
 
+def solid_and_surface(vertices: np.ndarray, triangles: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """Volume [m^3] of what a closed mesh bounds and its inertia about the origin per density [m^5], shape (3, 3); area
+    [m^2] of the mesh itself, likewise [m^4]."""
+    corners = vertices[triangles]
+    a, b, c = corners.swapaxes(0, 1)
+    total = corners.sum(axis=1)
+    squares = np.einsum("tki,tkj->tij", corners, corners) + np.einsum("ti,tj->tij", total, total)
+    volumes = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0  # of the tetrahedra with the origin
+    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    found = []
+    for parts, share in ((volumes, 20.0), (areas, 12.0)):
+        second = np.tensordot(parts, squares, 1) / share
+        found.append((float(parts.sum()), np.trace(second) * np.eye(3) - second))
+    return found
+
+
 def _edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of each side of each triangle, first all first sides: its edge's number, whether it goes from the edge's lower to
     its higher vertex, all (3 t,); and the vertices of each edge (e, 2)."""

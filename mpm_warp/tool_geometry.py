@@ -111,6 +111,23 @@ def thickening(body: Tool, contact_distance: float, spacing: float) -> np.ndarra
     return found
 
 
+def thin_walls(body: Tool, contact_distance: float, spacing: float) -> list[str]:
+    """What a user should know of a tool's thin parts, with contact beginning at a distance on a grid [m]."""
+    found, thickness = [], thinnest(body, 2.0 * spacing)
+    if thickness < 1.999 * spacing:  # in single precision
+        found.append(
+            f"the tool's thinnest part is {1e3 * thickness:.3g} mm, {thickness / spacing:.2g} grid spacings; below 2 "
+            "the soil on its two sides feels each other: use a smaller bed.spacing"
+        )
+    thicker = thickening(body, contact_distance, spacing)
+    if thicker is not None:
+        found.append(
+            f"contact with the tool's thin walls begins up to {1e3 * thicker.max():.2g} mm further out, for soil not "
+            f"to go through them; walls of {1e3 * least_thickness(contact_distance, spacing):.3g} mm need none"
+        )
+    return found
+
+
 # --- Units: the one that a path or a tool was likely given in, where its numbers cannot be metres and seconds
 
 

@@ -241,8 +241,8 @@ def free_step(real: type) -> SceneKernel:
     Body = body_struct(real)
 
     @wp.func
-    def spin(q: wp.quatd, momentum: wp.vec3d, inverse_inertia: wp.vec3d):
-        return wp.quat_rotate(q, wp.cw_mul(inverse_inertia, wp.quat_rotate_inv(q, momentum)))
+    def spin(q: wp.quatd, momentum: wp.vec3d, inverse_inertia: wp.mat33d):
+        return wp.quat_rotate(q, inverse_inertia * wp.quat_rotate_inv(q, momentum))
 
     @wp.func
     def turned(q: wp.quatd, w: wp.vec3d, dt: wp.float64):
@@ -269,7 +269,7 @@ def free_step(real: type) -> SceneKernel:
         motion: wp.array(dtype=wp.float64),
         dt: wp.float64,
         mass: wp.float64,
-        inverse_inertia: wp.vec3d,  # about the body's axes [1 / (kg m^2)]
+        inverse_inertia: wp.mat33d,  # about the body's axes [1 / (kg m^2)]
         gravity: wp.vec3d,
     ):
         push = wp.vec3d(body.impulse[0])

@@ -26,7 +26,7 @@ from sgns.config import UserError
 from sgns.data.files import require_new, require_replaceable, whole_file
 from sgns.data.run import Run
 from sgns.data.surface import columns, height_map, particle_spacing
-from sgns.evaluate.body_shape import body_silhouette
+from sgns.evaluate.body_shape import bodies, body_silhouette
 from sgns.evaluate.figures import (
     NETWORK,
     PICTURE_WIDTH,
@@ -120,7 +120,8 @@ def surface_figure(run: Any, frame: int, start: np.ndarray) -> Figure:
     axis = figure.subplots()
     extent = (left, right, front, back)
     colours = axis.imshow(heights.T, origin="lower", extent=extent, cmap="PuOr_r", norm=scale)
-    draw_body(axis, body_silhouette(run, frame, (0, 1)))
+    for body in bodies(run):
+        draw_body(axis, body_silhouette(body, frame, (0, 1)))
     axis.set(xlim=(left, right), ylim=(front, back), xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axis.set_title(f"surface from above, t = {run.time[frame]:.2f} s")
     label = "height z of the surface [mm]"
@@ -128,23 +129,53 @@ def surface_figure(run: Any, frame: int, start: np.ndarray) -> Figure:
     return figure
 
 
-def curves(run: Run) -> list[Panel]:
-    """Forces and torques worth mentioning, and the sinkage of a wheel, through time."""
+LEAST_ARM = 1e-6
+"""A torque with a shorter lever of the largest force is rounding [m]."""
+
+
+def shown_bodies(run: Run) -> list[tuple[str, str, Any]]:
+    """Of each body whose forces are drawn its name, its colour, and what `bodies` has for it."""
+    own, *more = bodies(run)
     name, colour = ("simulated (MPM)", TRUTH) if run.producer == "mpm" else ("network", NETWORK)
-    forces, torques = named_forces(run.scene, run.force), named_torques(run.scene, run.torque)
-    parts = []
-    for (names, values), unit in ((forces, "N"), (torques, "N m")):
-        shown = np.flatnonzero(worth_showing(values))  # the others are zero by symmetry
-        parts += [(f"{names[axis]} [{unit}]", values[:, axis]) for axis in shown]
+    further = [(f"others[{i}]", body.colour, body) for i, body in enumerate(more)]
+    return further if further and not run.body_point_count else [(name, colour, own), *further]
+
+
+def curves(run: Run) -> list[Panel]:
+    """Forces and torques worth mentioning, the sinkage of a wheel and the height of free bodies, through time."""
+    shown = shown_bodies(run)
+    forces = [named_forces(run.scene, body.force) for _, _, body in shown]
+    torques = [named_torques(run.scene, body.torque) for _, _, body in shown]
+    parts: list[tuple[str, list[np.ndarray | None]]] = []
+    largest = max(float(np.abs(values).max()) for _, values in forces)
+    for named, unit in ((forces, "N"), (torques, "N m")):
+        names, every = named[0][0], [values for _, values in named]
+        if not max(float(np.abs(values).max()) for values in every) > LEAST_ARM * largest:
+            continue
+        worth = np.flatnonzero(worth_showing(*every))  # the others are zero by symmetry
+        parts += [(f"{names[axis]} [{unit}]", [values[:, axis] for values in every]) for axis in worth]
     if not parts:
-        parts = [(f"{forces[0][0]} [N]", forces[1][:, 0])]
+        parts = [(f"{forces[0][0][0]} [N]", [values[:, 0] for _, values in forces])]
     if is_wheel(run.scene):
-        parts.append(("sinkage [mm]", 1e3 * sinkage(run.scene, run.pose)))
+        parts.append(("sinkage [mm]", [1e3 * sinkage(run.scene, run.pose), *([None] * (len(shown) - 1))]))
+    if any(body.scene.get("motion") == "free" for _, _, body in shown):
+        heights = [
+            1e3 * body.pose[:, 2] if body.scene.get("motion") == "free" else None for _, _, body in shown
+        ]
+        parts.append(("z of centre [mm]", heights))
     # A small component is drawn as small as it is beside the largest force.
-    least = 0.1 * float(np.ptp(forces[1], axis=0).max())
+    least = 0.1 * max(float(np.ptp(values, axis=0).max()) for _, values in forces)
     return [
-        Panel(label, [Curve(name, run.time, values, colour)], least_height=least if "[N]" in label else 0.0)
-        for label, values in parts
+        Panel(
+            label,
+            [
+                Curve(name, run.time, values, colour)
+                for (name, colour, _), values in zip(shown, every, strict=True)
+                if values is not None
+            ],
+            least_height=least if "[N]" in label else 0.0,
+        )
+        for label, every in parts
     ]
 
 
@@ -244,22 +275,27 @@ def drawn(runs: Mapping[str, Run], frame: int, scales: Scales) -> np.ndarray:
 
 
 def draw_chart(figure: Figure, runs: Mapping[str, Run], frame: int) -> None:
-    """The forward force through time, on the right of a picture."""
+    """The forward force through time, on the right of a picture; the vertical one where only further bodies are."""
     height = figure.get_figheight()
     axis = figure.add_axes((4.6 / WIDTH, 0.55 / height, 2.05 / WIDTH, (height - 0.9) / height))
-    named = {title: named_forces(run.scene, run.force) for title, run in runs.items()}
-    label = next(iter(named.values()))[0][0].replace("\n", " ")
-    values = {title: force[:, 0] for title, (_, force) in named.items()}
-    for title, run in runs.items():
-        colour = TRUTH if run.producer == "mpm" else NETWORK
-        axis.plot(run.time[: frame + 1], values[title][: frame + 1], color=colour, label=title)
-    finite = np.concatenate([some[np.isfinite(some)] for some in values.values()])
+    shown = [(title, run, *one) for title, run in runs.items() for one in shown_bodies(run)]
+    way = 0 if any(run.body_point_count for run in runs.values()) else 2
+    label, values = "", []
+    for title, run, name, colour, body in shown:
+        if body is run:
+            name = title if len(runs) > 1 else "own body"
+        names, force = named_forces(run.scene, body.force)
+        label = names[way].replace("\n", " ")
+        values.append(force[:, way])
+        axis.plot(run.time[: frame + 1], values[-1][: frame + 1], color=colour, label=name)
+    finite = np.concatenate([some[np.isfinite(some)] for some in values])
     low, high = min(0.0, float(finite.min())), max(0.0, float(finite.max()))
     room = (high - low) or 1.0
+    above = 0.13 + 0.12 * math.ceil(0.5 * len(shown)) if len(shown) > 1 else 0.05
     longest = max(float(run.time[-1]) for run in runs.values()) or 1.0
-    axis.set(xlim=(0.0, longest), ylim=(low - 0.05 * room, high + (0.25 if len(runs) > 1 else 0.05) * room))
+    axis.set(xlim=(0.0, longest), ylim=(low - 0.05 * room, high + above * room))
     axis.set(title=f"{label} [N]", xlabel="time [s]")
-    if len(runs) > 1:
+    if len(shown) > 1:
         axis.legend(loc="upper left", ncols=2, columnspacing=1.0, handlelength=1.2)
 
 

@@ -113,7 +113,7 @@ def write_rollout(
             "outside_training": None if excess is None else excess.largest,
             "outside_training_words": None if excess is None else excess.words(),
         },
-        mesh=mesh,
+        meshes=(mesh,),
         spread=rollout.force_spread is not None,
     ) as writer:
         previous = None
@@ -196,7 +196,8 @@ def scene_groups(checkpoint: str | Path) -> dict[str, dict[str, Any]]:
     """Groups of settings, `scene` and `material`, of the scene that a checkpoint was trained on.
 
     What a person has to give is missing (???): the path of a body, and the mesh file of a tool, since no file may name
-    another one to be read.
+    another one to be read. For the same reason there are no further bodies, which no network knows, and no heights from
+    a file.
 
     Raises:
         UserError: The checkpoint cannot be read.
@@ -211,6 +212,10 @@ def scene_groups(checkpoint: str | Path) -> dict[str, dict[str, Any]]:
         scene = scene | {"tool": tool | {"file": "???", "digest": ""}}
     if scene.get("path") is not None:
         scene = scene | {"path": "???"}
+    if scene.get("others"):
+        scene = scene | {"others": []}
+    if isinstance(bed := scene.get("bed"), dict) and isinstance(bed.get("surface"), str):
+        scene = scene | {"bed": bed | {"surface": "???"}}
     return {"material": scene["material"], "scene": {k: v for k, v in scene.items() if k != "material"}}
 
 

@@ -33,4 +33,4 @@ def job(scene: Scene, file: Path) -> Any:
     effects = Effects()
     physics = {"effects": effects, "reasons": effects.described(), "seed": 0}
     physics |= {"device": "cpu", "precision": "float32"}
-    return _Job("tiny", 0, scene.to_dict(), scene.mesh, file, physics)
+    return _Job("tiny", 0, scene.to_dict(), scene.meshes, file, physics)

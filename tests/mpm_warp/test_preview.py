@@ -169,7 +169,7 @@ def test_a_checkpoints_scene_with_a_mesh_says_where_the_mesh_is():
     scene = body(tool=mesh(1.0))
     data = scene.to_dict()
     data["tool"]["digest"] = "0123"
-    with pytest.raises(SceneError, match=r"from a run: Scene.from_dict\(run.scene, run.mesh\)"):
+    with pytest.raises(SceneError, match=r"from a run: Scene.from_dict\(run.scene, \*run.meshes\)"):
         Scene.from_dict(data)
 
 

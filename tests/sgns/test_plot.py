@@ -7,11 +7,16 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
+from mpm_warp import Bed, Box, Effects, MeshBody, Other, Scene, Sphere
 from sgns import plot
 from sgns.config import UserError
 from sgns.data.run import Run
+from sgns.evaluate import views
+from sgns.evaluate.body_shape import bodies, body_silhouette
 from sgns.evaluate.figures import DPI, PICTURE_WIDTH
+from sgns.simulate.run import simulate_scene
 from sgns_testing.commands import sgns
+from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 from sgns_testing.runs import make_run
 
 WHEEL = {"blade": None, "kind": "wheel", "diameter": 0.15, "width": 0.08}
@@ -53,6 +58,41 @@ def test_a_turned_wheel_has_the_forces_and_the_torque_of_its_own_axes(tmp_path):
     for name, column in (("drawbar pull", "pull"), ("lateral force", "lateral"), ("drive torque", "drive")):
         assert panels[name].curves[0].values == pytest.approx(table[column].to_numpy())
     assert panels["lateral force"].label == "lateral force\n(along axle) [N]"
+
+
+def test_all_bodies_are_drawn_where_they_are(tmp_path, monkeypatch):
+    turn = (0.0, 0.0, 0.0, 1.0)
+    rock = MeshBody(file=str(write_obj(tmp_path / "rock.obj", box_corners((0.05, 0.06, 0.07)), BOX_FACES)))
+    others = (
+        Other(tool=rock, motion="path", path=((0.0, 0.1, 0.1, 0.1, *turn), (0.1, 0.3, 0.1, 0.05, *turn))),
+        Other(tool=Sphere(diameter=0.1), position=(0.2, 0.1, 0.045)),
+        Other(tool=Box(size=(0.06, 0.04, 0.05)), position=(0.3, 0.1, 0.2)),
+    )
+    scene = Scene(bed=Bed(size=(0.4, 0.2, 0.16), spacing=0.04), duration=0.1, frame_rate=100.0, others=others)
+    simulate_scene(scene, tmp_path / "run.h5", effects=Effects())
+    with Run(tmp_path / "run.h5") as run:
+        own, *further = bodies(run)
+        assert own is run and body_silhouette(run, 0) == []
+        for body, size in zip(further, ((0.05, 0.07), (0.1, 0.1), (0.06, 0.05)), strict=True):
+            for frame in (0, 10):
+                outline = np.concatenate(body_silhouette(body, frame))
+                assert np.ptp(outline, axis=0) == pytest.approx(size, rel=0.01)
+                middle = 0.5 * (outline.min(axis=0) + outline.max(axis=0))
+                assert middle == pytest.approx(body.pose[frame, [0, 2]], abs=1e-3)
+        panels = {panel.label: panel.curves for panel in plot.curves(run)}
+        assert [curve.label for curve in panels["vertical Fz [N]"]] == ["others[0]", "others[1]", "others[2]"]
+        assert [curve.label for curve in panels["z of centre [mm]"]] == ["others[1]", "others[2]"]
+        assert panels["z of centre [mm]"][1].values == pytest.approx(1e3 * run.other_pose[:, 2, 2])
+        drawn, whole = [], views.draw_body
+        for module in (views, plot):
+            monkeypatch.setattr(
+                module, "draw_body", lambda *given, **kw: drawn.append(given) or whole(*given, **kw)
+            )
+        plot.run_page(run)
+        assert len(drawn) == 4 * 4  # three side views and the map; a mesh is seen from the side, and cut
+        plot.moving_picture({"run": run}, tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as picture:
+        assert picture.n_frames == 3
 
 
 def test_a_moving_picture_plays_in_real_time(run_file, tmp_path):

@@ -186,6 +186,21 @@ def test_changes_that_the_network_cannot_feel_are_named():
     assert unlearned(mesh, {"tool": mesh["tool"] | {"digest": "b"}}) == ["another mesh than in training"]
 
 
+def test_the_scene_of_a_checkpoint_names_no_file(monkeypatch):
+    scene = {
+        "material": {},
+        "path": [[0.0]],
+        "bed": {"surface": "secret.csv", "spacing": 0.02},
+        "kind": "body",
+    }
+    scene |= {"tool": {"shape": "mesh", "file": "secret.stl", "digest": ""}}
+    scene |= {"others": [{"motion": "path", "path": "secret.csv"}]}
+    monkeypatch.setattr(rolling, "read_checkpoint", lambda _: {"hyper_parameters": {"scene": scene}})
+    found = rolling.scene_groups("a.ckpt")["scene"]
+    assert "secret" not in str(found)
+    assert found["others"] == [] and found["bed"] == {"surface": "???", "spacing": 0.02}
+
+
 def test_a_rollout_holds_the_mesh_of_its_tool(simulator, tmp_path):
     scene = FakeScene(simulator)
     scene.mesh = box_corners((0.2, 0.2, 0.2), (-0.1, -0.1, -0.1)), box_triangles()

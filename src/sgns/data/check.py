@@ -250,12 +250,16 @@ def _check_others(file: h5py.File) -> Iterator[str]:
 
 
 def _check_mesh(file: h5py.File) -> Iterator[str]:
-    """That the tool's mesh is one, and that the body points are vertices of it."""
-    try:
-        mesh = read_mesh(file)
-    except BROKEN as error:
-        yield f"the tool's mesh is damaged ({one_line(error)})"
-        return
+    """That the meshes are such, and that the body points are vertices of the tool's."""
+    mesh, k = None, series(file, "other_pose").shape[1] if "other_pose" in recorded_in(file) else 0
+    for body in range(1 + k):
+        try:
+            found = read_mesh(file, body)
+        except BROKEN as error:
+            whose = f"the mesh of scene.others[{body - 1}]" if body else "the tool's mesh"
+            yield f"{whose} is damaged ({one_line(error)})"
+            continue
+        mesh = mesh if body else found
     if mesh is not None:
         pose, points = (series(file, name)[0].astype(float) for name in ("pose", "body_points"))
         away, _ = cKDTree(mesh[0]).query(in_body_frame(pose, points))

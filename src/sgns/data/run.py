@@ -119,12 +119,12 @@ class Run:
     def mesh(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Of a tool that is a mesh: vertices (V, 3) about its centre of mass [m], float64, and triangles (F, 3), both
         read-only; None for other tools."""
-        if "mesh" not in self._cache:
-            with self._reading("the tool's mesh"):
-                self._cache["mesh"] = read_mesh(self._file)
-            for array in self._cache["mesh"] or ():
-                array.flags.writeable = False
-        return self._cache["mesh"]
+        return self._mesh(0)
+
+    @property
+    def meshes(self) -> list[tuple[np.ndarray, np.ndarray] | None]:
+        """`mesh`, then that of each of the k further bodies."""
+        return [self._mesh(body) for body in range(1 + self.other_pose.shape[1])]
 
     # --- what was recorded --------------------------------------------------------------------------------
 
@@ -296,7 +296,7 @@ class Run:
                 f"{self.path} holds {self.frame_count} frames but the state of frame {state.frame}; repeat the run"
             )
         try:
-            scene = Scene.from_dict(self.scene, self.mesh)
+            scene = Scene.from_dict(self.scene, *self.meshes)
             return Soil(scene, state, self.pose[-1], f"{self.path}@{state.frame}")
         except SceneError as error:
             raise UserError(f"{self.path}: {error}; repeat the run") from error
@@ -318,6 +318,14 @@ class Run:
     def __repr__(self) -> str:
         size = f"{self.frame_count} frames, {self.particle_count} particles"
         return f"Run({str(self.path)!r}: {self.producer}, {size})"
+
+    def _mesh(self, body: int) -> tuple[np.ndarray, np.ndarray] | None:
+        if (key := f"mesh/{body}") not in self._cache:
+            with self._reading(f"the mesh of scene.others[{body - 1}]" if body else "the tool's mesh"):
+                self._cache[key] = read_mesh(self._file, body)
+            for array in self._cache[key] or ():
+                array.flags.writeable = False
+        return self._cache[key]
 
     def _dataset(self, name: str, part: str = "value") -> h5py.Dataset:
         if not self._file:

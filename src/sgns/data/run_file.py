@@ -112,15 +112,18 @@ SPREAD = {
     )
 }
 """What a rollout has besides whose checkpoint holds several networks, where it was asked for."""
-MESH = {
-    "vertices": Recorded(
-        "parameters/tool/vertices", ("V", 3), "<f8", "m", "of the tool, about its centre of mass, body frame"
-    ),
-    "triangles": Recorded(
-        "parameters/tool/triangles", ("F", 3), "<i4", "", "vertices of each triangle, facing outwards"
-    ),
-}
-"""What a run has besides whose tool is a mesh."""
+OTHER_MESHES = "parameters/others"
+"""Group of the meshes of further bodies, each in a group that has its number."""
+
+
+def mesh_parts(body: int = 0) -> tuple[Recorded, Recorded]:
+    """What a run has besides where a body is a mesh: the tool, number 0, or a further one, from 1 on."""
+    place = f"{OTHER_MESHES}/{body - 1}" if body else "parameters/tool"
+    words = "of the tool, about its centre of mass, body frame"
+    return (
+        Recorded(f"{place}/vertices", ("V", 3), "<f8", "m", words),
+        Recorded(f"{place}/triangles", ("F", 3), "<i4", "", "vertices of each triangle, facing outwards"),
+    )
 
 
 def series(file: h5py.File, name: str, part: str = "value") -> h5py.Dataset:
@@ -204,32 +207,37 @@ def read_attributes(file: h5py.File) -> dict[str, Any]:
     return {name: own_attribute(file, name) for name in (*ATTRIBUTES, STOPPED) if name in file.attrs}
 
 
-def read_mesh(file: h5py.File) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices (V, 3) about the centre of mass [m] and triangles (F, 3) of a run whose tool is a mesh, checked; None if
-    there is none.
+def read_mesh(file: h5py.File, body: int = 0) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices (V, 3) about the centre of mass [m] and triangles (F, 3) of a body that is a mesh, see `mesh_parts`,
+    checked; None if there is none.
 
     Raises:
         One of sgns.data.hdf5.BROKEN: It is damaged.
     """
-    if own_object(file, MESH["vertices"].path) is None:
+    parts = mesh_parts(body)
+    if own_object(file, parts[0].path) is None:
         return None
     try:
-        return checked_mesh(*(own_dataset(file, part.path)[...] for part in MESH.values()))
+        return checked_mesh(*(own_dataset(file, part.path)[...] for part in parts))
     except SceneError as error:
         raise ValueError(str(error)) from error
 
 
 def require_mesh_was_read(scene: object) -> None:
-    """Refuses a scene out of a file whose tool is a mesh without a digest: such a scene is a person's wish to read the
-    file it names, and no file may have wishes.
+    """Refuses a scene out of a file in which a body is a mesh without a digest: such a scene is a person's wish to read
+    the file it names, and no file may have wishes.
 
     Raises:
         ValueError: It is one.
     """
-    tool = scene.get("tool") if isinstance(scene, dict) else None
-    if isinstance(tool, dict) and tool.get("shape") == "mesh":
-        if not isinstance(tool.get("digest"), str) or not tool["digest"]:
-            raise ValueError("its scene names a mesh file without the digest of what was read from it")
+    if not isinstance(scene, dict):
+        return
+    others = scene.get("others")
+    for body in (scene, *(others if isinstance(others, list) else ())):
+        tool = body.get("tool") if isinstance(body, dict) else None
+        if isinstance(tool, dict) and tool.get("shape") == "mesh":
+            if not isinstance(tool.get("digest"), str) or not tool["digest"]:
+                raise ValueError("its scene names a mesh file without the digest of what was read from it")
 
 
 def structure_problems(file: h5py.File) -> list[str]:
@@ -241,7 +249,10 @@ def structure_problems(file: h5py.File) -> list[str]:
     problems = list(_attribute_problems(file))
     for recorded in recorded_in(file).values():
         problems += _series_problems(file, recorded, counts)
-    return problems + _mesh_problems(file)
+    meshes = own_object(file, OTHER_MESHES)
+    numbers = meshes if isinstance(meshes, h5py.Group) else ()
+    bodies = [0, *(1 + int(number) for number in numbers if number.isdecimal())]
+    return problems + [words for body in bodies for words in _mesh_problems(file, body)]
 
 
 def _attribute_problems(file: h5py.File) -> Iterator[str]:
@@ -290,9 +301,9 @@ def _series_problems(file: h5py.File, recorded: Recorded, counts: dict[str, int]
         counts |= {size: n for size, n in zip(known, found.shape, strict=True) if isinstance(size, str)}
 
 
-def _mesh_problems(file: h5py.File) -> list[str]:
+def _mesh_problems(file: h5py.File, body: int) -> list[str]:
     missing, problems = [], []
-    for part in MESH.values():
+    for part in mesh_parts(body):
         path = part.path
         try:
             if own_object(file, path) is None:

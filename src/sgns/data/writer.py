@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
 from types import TracebackType
 from typing import Any
@@ -25,7 +25,6 @@ from sgns.data.hdf5 import BROKEN, NewFile
 from sgns.data.run_file import (
     FORMAT,
     FORMAT_VERSION,
-    MESH,
     OTHERS,
     SERIES,
     SPREAD,
@@ -33,6 +32,7 @@ from sgns.data.run_file import (
     STOPPED,
     WHOLE,
     Recorded,
+    mesh_parts,
     open_run,
     read_attributes,
     series,
@@ -173,8 +173,8 @@ class RunWriter:
         seed: of the run.
         producer: "mpm" or "rollout".
         extra: more provenance as plain nested data; "author" also becomes H5MD's author name.
-        mesh: of a tool that is one: vertices (V, 3) about its centre of mass [m] and triangles (F, 3).
-        others: k, the number of further bodies.
+        meshes: of the tool and of each of the k further bodies: vertices (V, 3) about its centre of mass [m] and
+            triangles (F, 3) of one that is a mesh, else None.
         spread: whether every frame has a spread of the force.
 
     Raises:
@@ -196,11 +196,11 @@ class RunWriter:
         seed: int,
         producer: str,
         extra: Mapping[str, Any] | None = None,
-        mesh: tuple[np.ndarray, np.ndarray] | None = None,
-        others: int = 0,
+        meshes: Sequence[tuple[np.ndarray, np.ndarray] | None] = (None,),
         spread: bool = False,
     ) -> None:
         self.path = Path(path)
+        others = len(meshes) - 1
         counts = {"n": int(particle_count), "M": int(body_points), "k": others}
         self._recorded = SERIES | (OTHERS if others else {}) | (SPREAD if spread else {})
         self._shapes = {  # of one frame
@@ -234,11 +234,12 @@ class RunWriter:
                 _set(self._file, name, value)
             _write_h5md(self._file, str(extra.get("author", "unknown")))
             self._create_soil(self._file)
-            for part, values in zip(MESH.values(), mesh or (), strict=mesh is not None):
-                data = np.asarray(values, dtype=part.dtype)
-                # Checksummed: no content hash guards it.
-                dataset = self._file.create_dataset(part.path, data=data, chunks=True, fletcher32=True)
-                _describe(dataset, part)
+            for body, mesh in enumerate(meshes):
+                for part, values in zip(mesh_parts(body), mesh or (), strict=mesh is not None):
+                    data = np.asarray(values, dtype=part.dtype)
+                    # Checksummed: no content hash guards it.
+                    dataset = self._file.create_dataset(part.path, data=data, chunks=True, fletcher32=True)
+                    _describe(dataset, part)
             self._disk.check()
         except BaseException:
             self._discard()

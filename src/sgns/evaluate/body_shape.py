@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from mpm_warp import Plate
+from mpm_warp import Box, Plate, Sphere
 from mpm_warp.poses import in_world_frame
 from sgns.model.features import is_wheel
 
@@ -18,15 +18,39 @@ CUBE = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 # A mesh of more triangles is drawn on a lattice: corners in the same one of so many cells of its longest side are one.
 MOST_TRIANGLES = 20_000
 CELLS = 64
+ROUND_OR_SQUARE: dict[str, type[Box] | type[Sphere]] = {"sphere": Sphere, "box": Box}
+FURTHER = ("#009e73", "#e69f00", "#cc79a7", "#56b4e9")
+"""Colours of further bodies, of Okabe and Ito's palette as those of figures.py."""
+
+
+class FurtherBody(NamedTuple):
+    """One of scene.others, with what is asked here of a run about its own body."""
+
+    scene: Mapping[str, Any]  # its entry in scene.others
+    pose: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    mesh: tuple[np.ndarray, np.ndarray] | None
+    colour: str  # of its forces
+
+
+def bodies(run: Any) -> list[Any]:
+    """The run, which stands for its own body, and what stands for each of its further bodies likewise."""
+    others, found = run.scene.get("others") or [], [run]
+    for i, (one, mesh) in enumerate(zip(others, run.meshes[1:] if others else (), strict=False)):
+        pose, force, torque = (values[:, i] for values in (run.other_pose, run.other_force, run.other_torque))
+        found.append(FurtherBody(one, pose, force, torque, mesh, FURTHER[i % len(FURTHER)]))
+    return found
 
 
 def body_corners(run: Any, frame: int) -> np.ndarray:
     """Points [m] of the body at a frame, shape (k, 3), world frame.
 
     The corners of the scene's blade, points along the rims of its wheel or cylinder, the vertices of the mesh that the
-    run holds, else the recorded body points. Of all but the mesh, the body is their convex hull and the `grousers`.
+    run holds, points of a sphere, else the recorded body points, the corners of a box. Of all but the mesh, the body is
+    their convex hull and the `grousers`.
     """
-    blade, drum = run.scene.get("blade"), cylinder(run.scene)
+    blade, drum, tool = run.scene.get("blade"), cylinder(run.scene), run.scene.get("tool")
     if drum:
         rim = np.insert(circle(float(drum["diameter"]), 64), 1, 0.5 * float(drum["width"]), axis=1)
         corners = np.concatenate([rim, rim * [1.0, -1.0, 1.0]])
@@ -35,6 +59,8 @@ def body_corners(run: Any, frame: int) -> np.ndarray:
         corners = Plate.from_dict(sizes).level_at(run.pose[0, 3:]).corners
     elif run.mesh is not None:
         corners = run.mesh[0]
+    elif isinstance(tool, Mapping) and tool.get("shape") in ROUND_OR_SQUARE:
+        corners = ROUND_OR_SQUARE[tool["shape"]].from_dict(tool).outline()
     else:
         return np.asarray(run.body_points[frame])
     return in_world_frame(run.pose[[frame]], corners)[0]

@@ -121,7 +121,7 @@ def solver_rates(run: Run) -> Iterator[float]:
     where the file does not hold all that is needed to compute it again.
     """
     try:
-        scene = Scene.from_dict(run.scene, run.mesh)
+        scene = Scene.from_dict(run.scene, *run.meshes)
         known = {one.name for one in fields(Effects)}
         effects = Effects.from_dict({name: e["on"] for name, e in run.effects.items() if name in known})
         frames = Solver(scene, effects, precision=run.extra["precision"]).frames()

@@ -24,6 +24,8 @@ from sgns.data.surface import particle_spacing
 from sgns.evaluate.body_shape import (
     CUBE,
     DepthBuffer,
+    FurtherBody,
+    bodies,
     body_cut,
     body_silhouette,
     body_triangles,
@@ -76,16 +78,26 @@ def draw_force(
     tip: np.ndarray,
     head: str = "-|>",
     clip: bool | None = None,
+    line: int = 0,
 ) -> None:
-    """A force [N] as an arrow between two points of the picture, and its size in the corner."""
-    colour = TRUTH if run.producer == "mpm" else NETWORK
+    """A force [N] as an arrow between two points of the picture, and its size on a line in the corner."""
+    colour = run.colour if isinstance(run, FurtherBody) else TRUTH if run.producer == "mpm" else NETWORK
     size = float(np.linalg.norm(force))
     if not 0.0 < size < math.inf:
         return
     arrow = {"arrowstyle": head, "color": colour, "linewidth": 2.0, "shrinkA": 0.0, "shrinkB": 0.0}
     axis.annotate("", xy=tuple(tip), xytext=tuple(foot), zorder=4, arrowprops=arrow, annotation_clip=clip)
-    axis.text(
-        0.99, 0.97, f"{size:.0f} N", color=colour, fontsize=9, ha="right", va="top", transform=axis.transAxes
+    words = f"{size:.0f} N" if size > 9.5 else f"{size:.2g} N"
+    axis.annotate(
+        words,
+        (0.99, 0.97),
+        (0.0, -11.0 * line),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        color=colour,
+        fontsize=9,
+        ha="right",
+        va="top",
     )
 
 
@@ -181,12 +193,19 @@ def common_scales(runs: Sequence[Any], frames: Sequence[int], start: np.ndarray)
     right = max(high[0], *(float(soil[:, 0].max()) for soil in reach))
     x_limits = (left - 1.5 * spacing, right + 1.5 * spacing)
     tool = max(
-        (float(part[:, 1].max()) for run, frame in shown for part in body_silhouette(run, frame)),
+        (
+            float(part[:, 1].max())
+            for run, frame in shown
+            for body in bodies(run)
+            for part in body_silhouette(body, frame)
+        ),
         default=-np.inf,
     )
     highest = max(float(soil[:, 2].max()) for soil in reach)
     top = max(min(tool + spacing, high[2] + TOOL_ABOVE), highest + 2.0 * spacing)
-    strongest = max(float(np.linalg.norm(run.force[frame, [0, 2]])) for run, frame in shown)
+    strongest = max(
+        float(np.linalg.norm(body.force[frame, [0, 2]])) for run, frame in shown for body in bodies(run)
+    )
     arrow = SIDE_ARROW * (x_limits[1] - x_limits[0]) / strongest if strongest > 0.0 else 0.0
     speed = upper_scale(*(speeds(runs[0], frame, chosen) for frame in frames), least=LEAST_SPEED)
     disc = spacing
@@ -245,21 +264,22 @@ def draw_view(axis: Axes, title: str, run: Any, frame: int, scales: Scales, widt
     order = np.argsort(speed)  # the fast ones on top
     x, _, z = run.positions(frame)[0, scales.chosen][order].T
     axis.scatter(x, z, c=speed[order], s=disc**2, cmap=SPEED, norm=scales.speed, linewidths=0.0)
-    silhouette = body_silhouette(run, frame)
-    if is_mesh(run):
-        draw_body(axis, silhouette, BEHIND, STEEL, zorder=0.5)
-        draw_cut(axis, body_cut(run, frame, scales.middle))
-    else:
-        draw_body(axis, silhouette)
-    force = run.force[frame, [0, 2]]
-    size = float(np.linalg.norm(force)) * scales.arrow
-    if size > 0.0 and silhouette:
-        outline = np.concatenate(silhouette)
-        head = "-|>,head_width=0.25,head_length=0.5" if size > SHORTEST_ARROW else "-"
-        # From the lowest point, but moved so that the head is in the picture.
-        low, high = np.transpose([scales.x_limits, scales.z_limits])
-        tip = np.clip(outline[np.argmin(outline[:, 1])] + force * scales.arrow, low, high)
-        draw_force(axis, run, force, tip - force * scales.arrow, tip, head=head, clip=False)
+    for line, body in enumerate(bodies(run)):
+        silhouette = body_silhouette(body, frame)
+        if is_mesh(body):
+            draw_body(axis, silhouette, BEHIND, STEEL, zorder=0.5)
+            draw_cut(axis, body_cut(body, frame, scales.middle))
+        else:
+            draw_body(axis, silhouette)
+        force = body.force[frame, [0, 2]]
+        size = float(np.linalg.norm(force)) * scales.arrow
+        if size > 0.0 and silhouette:
+            outline = np.concatenate(silhouette)
+            head = "-|>,head_width=0.25,head_length=0.5" if size > SHORTEST_ARROW else "-"
+            # From the lowest point, but moved so that the head is in the picture.
+            low, high = np.transpose([scales.x_limits, scales.z_limits])
+            tip = np.clip(outline[np.argmin(outline[:, 1])] + force * scales.arrow, low, high)
+            draw_force(axis, body, force, tip - force * scales.arrow, tip, head=head, clip=False, line=line)
     axis.set(xlim=scales.x_limits, ylim=scales.z_limits, aspect="equal")
     axis.set_title(f"{title}, t = {run.time[frame]:.2f} s")
 
@@ -305,7 +325,7 @@ def solid_figure(
     start: np.ndarray,
     strongest: float,
 ) -> Figure:
-    """Particles (n, 3) [m] as spheres coloured by values (n,), and the body of a run with the force on it.
+    """Particles (n, 3) [m] as spheres coloured by values (n,), and the own body of a run with the force on it.
 
     The particles at rest, `start`, set the frame of the picture; the force `strongest` [N] has the longest arrow.
     """

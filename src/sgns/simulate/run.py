@@ -12,7 +12,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mpm_warp import Effects, Scene, Soil, Solver, SolverStopped, State
+from mpm_warp import Effects, Scene, SceneError, Soil, Solver, SolverStopped, State
 from mpm_warp.launch import Job, run_concurrently
 from sgns.config import Interrupted, UserError, differences, heed, held_back
 from sgns.data.run import Run
@@ -73,7 +73,7 @@ class Restart:
     @property
     def changed_scene(self) -> Scene:
         """What is computed from here on."""
-        found = Scene.from_dict(replaced(self.scene.to_dict(), self.changes), self.scene.mesh)
+        found = Scene.from_dict(replaced(self.scene.to_dict(), self.changes), *self.scene.meshes)
         return found if self.scene.soil is None else found.starting_from(self.scene.soil)
 
     def on(self, soil: Soil | None) -> Restart:
@@ -185,9 +185,11 @@ def _read_stopped(path: Path) -> Restart:
     with Run(path) as run:
         if run.stopped is None:
             raise UserError(f"continue_from: {path} is a whole run; there is nothing to go on with")
-        scene, mesh, state = run.scene, run.mesh, run.state
-    if mesh is None and isinstance(tool := scene.get("tool"), dict) and tool.get("shape") == "mesh":
-        raise UserError(f"{path} does not hold the mesh of its tool; repeat the run")
+        state = run.state
+        try:
+            scene = Scene.from_dict(run.scene, *run.meshes)
+        except SceneError as error:
+            raise UserError(f"{path}: {error}; repeat the run") from error
     if state.frame != run.frame_count - 1:
         raise UserError(
             f"{path} holds {run.frame_count} frames but the state of frame {state.frame}; repeat the run"
@@ -196,7 +198,7 @@ def _read_stopped(path: Path) -> Restart:
     earlier = _earlier(extra, path)
     return Restart(
         path=path,
-        scene=Scene.from_dict(scene, mesh),
+        scene=scene,
         changes={key: value for one in earlier for key, value in one["changed"].items()},
         effects=_effects(reasons, path),
         reasons=reasons,
@@ -330,8 +332,7 @@ def scene_stages(
             extra=made_with
             | ({"continued": restart.record} if restart is not None else {})
             | ({"start_from": _origin(scene)} if scene.soil is not None else {}),
-            mesh=scene.mesh,
-            others=len(scene.others),
+            meshes=scene.meshes,
         ) as writer,
         ExitStack() as to_the_end,
     ):

@@ -55,18 +55,32 @@ def data_from_config(cfg: DictConfig, overrides: Sequence[str]) -> dict[str, Any
 
 
 def scene_from_data(data: dict[str, Any]) -> Scene:
-    """A scene from nested data, in which `path` and `bed.surface` may be the names of files."""
+    """A scene from nested data, in which `bed.surface`, `path` and those of further bodies may be names of files."""
     if isinstance(data.get("bed"), dict) and isinstance(data["bed"].get("surface"), str):
         data = replaced(data, {"bed.surface": read_heights(Path(data["bed"]["surface"]))})
-    if not isinstance(data.get("path"), str):
-        return Scene.from_dict(data)
-    file = Path(data["path"])
-    rows = _rows_by_line(file)
-    lines = list(rows)
+    read: dict[str, tuple[Path, list[int]]] = {}
+
+    def with_path(body: Any, place: str) -> Any:
+        """A body's data with the rows of its path file; remembers which line each row was."""
+        if not isinstance(body, dict) or not isinstance(body.get("path"), str):
+            return body
+        file = Path(body["path"])
+        rows = _rows_by_line(file, f"{place}.path")
+        read[place] = file, list(rows)
+        return {**body, "path": list(rows.values())}
+
+    data = with_path(data, "scene")
+    if isinstance(others := data.get("others"), list):
+        every = [with_path(one, f"scene.others[{number}]") for number, one in enumerate(others)]
+        data = {**data, "others": every}
     try:
-        return Scene.from_dict({**data, "path": list(rows.values())})
+        return Scene.from_dict(data)
     except SceneError as error:  # its rows are lines of the file
-        words = re.sub(r"\brow (\d+)", lambda row: f"line {lines[int(row[1]) - 1]} of {file}", str(error))
+        further = re.search(r"scene\.others\[\d+\]", words := str(error))
+        file, lines = read.get(further[0] if further else "scene", (None, []))
+        if file is None:
+            raise
+        words = re.sub(r"\brow (\d+)", lambda row: f"line {lines[int(row[1]) - 1]} of {file}", words)
         raise SceneError(words) from None
 
 
@@ -139,8 +153,8 @@ def read_path(file: Path) -> list[list[float]]:
     return list(_rows_by_line(file).values())
 
 
-def _rows_by_line(file: Path) -> dict[int, list[float]]:
-    """As `read_path`, by the number of the line."""
+def _rows_by_line(file: Path, place: str = "scene.path") -> dict[int, list[float]]:
+    """As `read_path`, by the number of the line; errors name the setting `place`."""
     values: dict[int, list[float]] = {}
     first, rows = True, csv.reader([])
     try:
@@ -152,22 +166,22 @@ def _rows_by_line(file: Path) -> dict[int, list[float]]:
             if len(row) == len(_COLUMNS) and all(map(_is_number, row)):
                 values[rows.line_num] = [float(value) for value in row]
             elif not first or [name.lower() for name in row] != _COLUMNS:
-                raise UserError(_not_a_row(file, rows.line_num, row, first))
+                raise UserError(f"{place}: {_not_a_row(file, rows.line_num, row, first)}")
             first = False
     except csv.Error as error:
-        raise UserError(f"scene.path: cannot read {file} after line {rows.line_num}: {error}") from None
+        raise UserError(f"{place}: cannot read {file} after line {rows.line_num}: {error}") from None
     except (OSError, ValueError) as error:
         words = getattr(error, "strerror", None) or error
-        raise UserError(f"scene.path: cannot read {file}: {words}") from None
+        raise UserError(f"{place}: cannot read {file}: {words}") from None
     if first:
-        raise UserError(f"scene.path: {file} is empty; it needs rows {','.join(_COLUMNS)}")
+        raise UserError(f"{place}: {file} is empty; it needs rows {','.join(_COLUMNS)}")
     return values
 
 
 def _not_a_row(file: Path, number: int, row: list[str], first: bool) -> str:
     """What is wrong with a line of a path."""
     text, names = ",".join(row), [name.lower() for name in row]
-    begin = f"scene.path: line {number} of {file} is {short(text)}"
+    begin = f"line {number} of {file} is {short(text)}"
     for mark, words in ((";", "semicolons"), ("\t", "tabs"), (None, "spaces")):
         if len(row) < len(_COLUMNS) <= len(text.split(mark)):
             return f"{begin}: its values have {words} between them; they need commas (and points in 0.5)"

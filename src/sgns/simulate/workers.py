@@ -141,14 +141,14 @@ class _Job:
     number: int
     """Among the runs to make."""
     scene: dict[str, Any]
-    """With the mesh, for `Scene.from_dict`."""
-    mesh: tuple[np.ndarray, np.ndarray] | None
+    """With the meshes, for `Scene.from_dict`."""
+    meshes: tuple[tuple[np.ndarray, np.ndarray] | None, ...]
     file: Path
     physics: dict[str, Any]
     """As `scene_stages` takes it: effects, reasons, seed, device and precision."""
 
     def read_scene(self) -> Scene:
-        return Scene.from_dict(self.scene, self.mesh)
+        return Scene.from_dict(self.scene, *self.meshes)
 
 
 class Workers:
@@ -165,7 +165,7 @@ class Workers:
             physics = {"effects": effects, "reasons": recorded(decisions), "seed": campaign.seed}
             physics |= {"device": device, "precision": campaign.precision}
             file = campaign.file(name)
-            self._jobs.append(_Job(name, number, scene.to_dict(), scene.mesh, file, physics))
+            self._jobs.append(_Job(name, number, scene.to_dict(), scene.meshes, file, physics))
         context = multiprocessing.get_context("spawn")
         # Of every run: frames done, those of them that an attempt before had made, and whether it has ended. Each entry
         # has one writer, so there is no lock.

@@ -156,7 +156,7 @@ def test_a_load_is_a_number_or_rows_of_numbers(tmp_path):
 
 def mesh_run(path, mesh=BOX, scene=TOOL):
     """A run of two frames whose tool is a box."""
-    with make_writer(path, n=3, m=2, scene=scene, mesh=mesh) as writer:
+    with make_writer(path, n=3, m=2, scene=scene, meshes=(mesh,)) as writer:
         for i in range(2):
             frame = random_frame(i, n=3, m=2)
             writer.append(**frame | {"body_points": frame["body_pose"][:3] + CORNERS[[0, 5]]})

@@ -285,6 +285,42 @@ def test_damaged_further_bodies_are_named(name, at, value, words, tmp_path):
         Run(tmp_path / "run.h5")
 
 
+def test_a_run_holds_the_meshes_of_further_bodies(tmp_path):
+    """Where the file was is not looked at again."""
+    file = write_obj(tmp_path / "rock.obj", box_corners((0.05, 0.06, 0.07)), BOX_FACES)
+    rock, turn = MeshBody(file=str(file)), (0.0, 0.0, 0.0, 1.0)
+    rows = ((0.0, 0.2, 0.1, 0.05, *turn), (0.1, 0.2, 0.1, 0.0, *turn))
+    dropped = Other(tool=rock, position=(0.2, 0.05, 0.05), velocity=(0.0, 0.0, -1.0))
+    scene = small(others=(SEVERAL.others[0], dropped, Other(tool=rock, motion="path", path=rows)))
+    first, second = tmp_path / "first.h5", tmp_path / "second.h5"
+    simulate_scene(scene, first, effects=Effects())
+    file.unlink()
+    with Run(first) as run:
+        soil = run.soil
+        assert np.abs(run.other_force[:, 2]).max() > 0.0
+    simulate_scene(small(others=soil.scene.others[1:]).starting_from(soil), second, effects=Effects())
+    for path, known in ((first, [None, None, rock.mesh, rock.mesh]), (second, [None, rock.mesh, rock.mesh])):
+        assert check_run(path) == []
+        with Run(path) as run:
+            assert run.mesh is None and len(run.meshes) == len(known)
+            for found, mesh in zip(run.meshes, known, strict=True):
+                assert (found is None) == (mesh is None)
+                for one, two in zip(found or (), mesh or (), strict=True):
+                    np.testing.assert_array_equal(one, two)
+    with h5py.File(first, "a") as content:
+        content["parameters/others/1/vertices"][0, 0] = np.nan
+        scene = yaml.safe_load(content.attrs["scene"])
+        scene["others"][2]["tool"]["digest"] = ""
+        content.attrs["scene"] = yaml.safe_dump(scene)
+    problems = "; ".join(check_run(first))
+    assert "the mesh of scene.others[1] is damaged (the mesh has a vertex that is not finite" in problems
+    assert "its scene names a mesh file without the digest" in problems
+    with h5py.File(second, "a") as content:
+        del content["parameters/others/1/triangles"]
+    with pytest.raises(UserError, match="dataset /parameters/others/1/triangles is missing"):
+        Run(second)
+
+
 def test_the_same_command_goes_on_and_another_is_refused_by_key(interrupted, tmp_path):
     done = sgns(tmp_path, "simulate", *SMALL, "output=run.h5")
     assert done.returncode == 128 + signal.SIGTERM
@@ -511,7 +547,9 @@ def test_a_run_without_its_mesh_is_refused(stopped_mesh, tmp_path):
     with h5py.File(kept, "r+") as file:
         del file["parameters"]
     (tmp_path / "box.obj").write_text(content)  # where the run says it was
-    with pytest.raises(UserError, match="does not hold the mesh of its tool; repeat the run"):
+    with pytest.raises(
+        UserError, match=r"scene\.tool is a mesh, which these data do not hold .* repeat the run"
+    ):
         restarted(kept)
 
 

@@ -274,6 +274,30 @@ def test_what_is_wrong_with_poses_is_told_by_the_line_of_the_file(tmp_path, rows
         scene_from_data({"kind": "body", "path": str(tmp_path / "path.csv")})
 
 
+def test_a_further_body_has_its_path_from_a_file(tmp_path):
+    file = tmp_path / "path.csv"
+    data = {"others": [{"position": [0.2, 0.2, 0.2]}, {"motion": "path", "path": str(file)}]}
+    file.write_text("t,x,y,z,qx,qy,qz,qw\n0,0.2,0.3,0.2,0,0,0,1\n0.5,0.3,0.3,0.2,0,0,0,1 # end\n")
+    assert scene_from_data(data).others[1].path[1] == (0.5, 0.3, 0.3, 0.2, 0.0, 0.0, 0.0, 1.0)
+    for text, error, words in (
+        (
+            "0,0.2\n",
+            UserError,
+            r"scene.others\[1\].path: line 1 of .*path.csv is '0,0.2': 2 values instead of 8",
+        ),
+        ("\n0,1e14,2,3,0,0,0,1", SceneError, r"line 2 of .*path.csv of scene.others\[1\].path holds"),
+        (
+            "\n0,1,2,3,0,0,0,2",
+            SceneError,
+            r"scene.others\[1\].path's quaternion in line 2 of .*path.csv is not of",
+        ),
+        (None, UserError, r"scene.others\[1\].path: cannot read .*path.csv: No such file"),
+    ):
+        file.unlink() if text is None else file.write_text(text)
+        with pytest.raises(error, match=words):
+            scene_from_data(data)
+
+
 def test_numbers_in_another_unit_are_refused_before_the_run(tmp_path):
     """And not where a person says that they are meant."""
     (tmp_path / "path.csv").write_text("0,200,300,300,0,0,0,1\n0.1,205,300,300,0,0,0,1\n")
