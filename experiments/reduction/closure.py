@@ -1,25 +1,29 @@
 """How much of the soil do modes hold that follow from the first few, and what does decoding them cost?
 
-    python experiments/reduction/closure.py data/quick
+    python experiments/reduction/closure.py data/quick --checkpoint outputs/demo/best.ckpt
+    python experiments/reduction/closure.py data/paper_excavation --runs 25 50 100 200
 
-True coordinates of the test runs, no network. Decode times are processor times of single frames on one thread, in turn.
-Writes closure.csv.
+True coordinates of the test runs; with `--checkpoint`, of a training on this dataset, also those of its rollouts from
+rest, which have errors. The basis is always that of all training runs; with `--runs` closures
+are fitted to so many of them, drawn at random, once for each number. Decode times are processor times of single frames
+on one thread, in turn. Puts the rows of this dataset into closure.csv, in place of those of the same name.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import torch
-from common import write_rows
-from torch import Tensor
+from common import read_rows, write_rows
 
 from sgns.data.dataset import Dataset
 from sgns.data.run import Run
@@ -27,102 +31,106 @@ from sgns.data.surface import height_map, surface_grid
 from sgns.evaluate.metrics import height_error
 from sgns.reduction.basis import Basis
 from sgns.reduction.closure import fit_closure
-from sgns.reduction.reduce import reduce_dataset
+from sgns.reduction.reduce import ReducedDataset, reduce_dataset
 from sgns.settings import ReductionSettings
+from sgns.simulator import Simulator
 
 EVERY = 12  # of the test runs' frames every twelfth counts
-Latents = Sequence[np.ndarray]
-Decoder = Callable[[Tensor], Tensor]
+LINEAR = (8, 16, 32, 64)
+CLOSURES = [(kind, *modes) for kind in ("kernel", "quadratic") for modes in ((8, 32), (8, 64), (16, 64))]
+TABLE = Path(__file__).with_name("closure.csv")
 
 
-def kernel(r: int, last: int) -> Callable[[Basis, Latents, Latents], Decoder]:
-    def fitted(basis: Basis, train: Latents, validation: Latents) -> Decoder:
-        closure = fit_closure(basis.modes[:, :last], r, train, validation).closure
-        return replace(basis.sliced(r), closure=closure).inverse
+class Method(NamedTuple):
+    """A way to decode the soil."""
 
-    return fitted
-
-
-def linear(r: int) -> Callable[[Basis, Latents, Latents], Decoder]:
-    return lambda basis, train, validation: basis.sliced(r).inverse
+    name: str
+    training_runs: int
+    basis: Basis
 
 
-def quadratic(r: int, last: int) -> Callable[[Basis, Latents, Latents], Decoder]:
-    """Ridge regression on products of two standardised coordinates; validation runs choose the penalty."""
-
-    def fitted(basis: Basis, train: Latents, validation: Latents) -> Decoder:
-        known, other = (torch.from_numpy(np.concatenate(runs))[:, :last] for runs in (train, validation))
-        mean, scale = known[:, :r].mean(0), known[:, :r].std(0)
-        scale = scale.clamp_min(0.01 * float(scale.max()))
-
-        def terms(z: Tensor) -> Tensor:
-            x = ((z - mean) / scale).flatten(-2)
-            x = torch.nn.functional.pad(x, (1, 0), value=1.0)
-            i, j = torch.triu_indices(x.shape[-1], x.shape[-1])
-            return x[..., i] * x[..., j]
-
-        a, target = terms(known[:, :r]), known[:, r:].flatten(1)
-        free = torch.eye(a.shape[1], dtype=a.dtype)
-        free[0, 0] = 0.0
-
-        def weights(penalty: float) -> Tensor:
-            return torch.linalg.solve(a.T @ a / len(a) + penalty * free, a.T @ target / len(a))
-
-        seen = terms(other[:, :r])
-        best = min(
-            (weights(10.0**k) for k in range(-3, 4)),
-            key=lambda w: float((seen @ w - other[:, r:].flatten(1)).square().sum()),
-        )
-        whole = basis.sliced(last)
-        return lambda z: whole.inverse(torch.cat([z, (terms(z) @ best).unflatten(-1, (last - r, 3))], dim=-2))
-
-    return fitted
+def methods(reduced: ReducedDataset, counts: Sequence[int]) -> list[Method]:
+    """All that the basis has modes for; closures of so many training runs each."""
+    basis, known = reduced.basis, reduced.runs("train")
+    found = [Method(f"linear {r}", len(known), basis.sliced(r)) for r in LINEAR if r <= basis.num_modes]
+    order = np.random.default_rng(0).permutation(len(known))
+    validation = [run.latent for run in reduced.runs("validation")]
+    for count in counts or [len(known)]:
+        if not 0 < count <= len(known):
+            raise SystemExit(f"--runs {count}: there are {len(known)} training runs")
+        train = [known[i].latent for i in sorted(order[:count])]
+        for kind, r, last in CLOSURES:
+            if last <= basis.num_modes:
+                closure = fit_closure(kind, basis.modes[:, :last], r, train, validation).closure
+                closed = replace(basis.sliced(r), closure=closure)
+                found.append(Method(f"{kind} {r} to {last}", count, closed))
+    return found
 
 
-METHODS = {f"linear {r}": (r, linear(r)) for r in (8, 16, 32, 64)}
-METHODS |= {f"quadratic {r} to {last}": (r, quadratic(r, last)) for r, last in ((8, 32),)}
-METHODS |= {f"kernel {r} to {last}": (r, kernel(r, last)) for r, last in ((8, 32), (16, 64))}
-
-
-def decoded(paths: Sequence[Path], basis: Basis, decoders: dict[str, Decoder]) -> dict[str, np.ndarray]:
-    """By method, of every frame, (t, 3): mean squares of positions and of the surface [m^2], and decode time [s]."""
-    found: dict[str, list[list[float]]] = {name: [] for name in decoders}
+def decoded(
+    paths: Sequence[Path], basis: Basis, ways: Sequence[Method], simulator: Simulator | None
+) -> np.ndarray:
+    """Of every way and frame: mean squares of positions and of the surface [m^2], decode time [s], and both mean
+    squares after a rollout or NaN, (m, t, 5)."""
+    found: list[list[tuple[float, ...]]] = []
     for path in paths:
         with Run(path) as run:
-            frames = run.positions(slice(0, None, EVERY)).astype(np.float64)
-        grid = surface_grid(frames[0])
-        for frame in frames:
+            grid = surface_grid(run.positions(slice(0, 1))[0])
+            frames = run.positions(slice(EVERY, None, EVERY)).astype(np.float64)
+            rolled = torch.as_tensor(simulator.rollout(run.pose).latent)[EVERY::EVERY] if simulator else None
+        for index, frame in enumerate(frames):
             latent, heights = basis.transform(frame), height_map(frame, grid)
-            for name, decode in decoders.items():
+
+            def errors(soil: np.ndarray, frame=frame, heights=heights, grid=grid) -> tuple[float, float]:
+                return float(np.mean((soil - frame) ** 2)), height_error(height_map(soil, grid), heights)
+
+            found.append([])
+            for way in ways:
                 began = time.process_time()
-                soil = decode(latent[: METHODS[name][0]]).numpy()
+                soil = way.basis.inverse(latent[: way.basis.num_modes]).numpy()
                 seconds = time.process_time() - began
-                surface = height_error(height_map(soil, grid), heights)
-                found[name].append([float(np.mean((soil - frame) ** 2)), surface, seconds])
-    return {name: np.array(values) for name, values in found.items()}
+                after = np.nan, np.nan
+                if rolled is not None and rolled.shape[1] == way.basis.num_modes:
+                    after = errors(way.basis.inverse(rolled[index]).numpy())
+                found[-1].append((*errors(soil), seconds, *after))
+    return np.array(found).swapaxes(0, 1)
 
 
-def main(folder: Path) -> None:
+def measured(
+    folder: Path, counts: Sequence[int], checkpoint: Path | None = None, table: Path = TABLE
+) -> None:
+    """Write the rows of a dataset."""
     torch.set_num_threads(1)
     dataset = Dataset.open(folder)
-    reduced = reduce_dataset(dataset, ReductionSettings().to_dict(), progress=False)
-    basis = reduced.basis
-    train, validation = ([run.latent for run in reduced.runs(split)] for split in ("train", "validation"))
-    decoders = {name: fit(basis, train, validation) for name, (_, fit) in METHODS.items()}
-    tested = decoded(dataset.runs("test"), basis, decoders)
-    rows = []
-    for name in METHODS:
-        position, surface, _ = tested[name].mean(axis=0)
-        rows.append(
-            {
-                "method": name,
-                "test_position_rmse_mm": 1e3 * float(position) ** 0.5,
-                "test_surface_rmse_mm": 1e3 * float(surface) ** 0.5,
-                "decode_ms_per_frame": 1e3 * float(np.median(tested[name][:, 2])),
-            }
-        )
-    write_rows(Path(__file__).with_name("closure.csv"), rows)
+    reduced = reduce_dataset(dataset, ReductionSettings().to_dict())
+    simulator = Simulator.load(checkpoint) if checkpoint else None
+    if simulator and not torch.equal(simulator.basis.modes, reduced.basis.modes[:, : simulator.num_modes]):
+        raise SystemExit(f"{checkpoint} belongs to another basis; train it on {folder}")
+    ways = methods(reduced, counts)
+    rows = [row for row in read_rows(table) if row["dataset"] != dataset.title]
+    found = decoded(dataset.runs("test"), reduced.basis, ways, simulator)
+    for way, errors in zip(ways, found, strict=True):
+        position, surface, _, *after = (float(value) for value in errors.mean(axis=0))
+        row: dict[str, object] = {
+            "dataset": dataset.title,
+            "method": way.name,
+            "training_runs": way.training_runs,
+            "test_position_rmse_mm": 1e3 * position**0.5,
+            "test_surface_rmse_mm": 1e3 * surface**0.5,
+            "decode_ms_per_frame": 1e3 * float(np.median(errors[:, 2])),
+        }
+        if not np.isnan(after[0]):
+            row["rollout_position_rmse_mm"], row["rollout_surface_rmse_mm"] = (1e3 * x**0.5 for x in after)
+        rows.append(row)
+    write_rows(table, rows)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dataset", type=Path, help="folder of a dataset")
+    parser.add_argument("--runs", type=int, nargs="+", default=[], help="training runs of the closures")
+    parser.add_argument("--checkpoint", type=Path, help="a training on this dataset, to roll out")
+    given = parser.parse_args()
+    measured(given.dataset, given.runs, given.checkpoint)

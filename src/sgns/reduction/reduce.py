@@ -275,9 +275,10 @@ def fitted_closure(
             f"{last} in all; raise reduction.closure_modes and reduction.max_modes, or lower reduction.num_modes"
         )
     train, validation = ([run.latent for run in runs[split]] for split in ("train", "validation"))
-    closure, without, error = fit_closure(basis.modes[:, :last], r, train, validation)
+    closure, without, error = fit_closure(settings["closure"], basis.modes[:, :last], r, train, validation)
     log.info(
-        "closure: modes %d to %d follow from the first %d with an RMSE of %.3g mm on %s; without it %.3g mm",
+        "%s closure: modes %d to %d follow from the first %d with an RMSE of %.3g mm on %s; without it %.3g mm",
+        settings["closure"],
         r + 1,
         last,
         r,

@@ -141,13 +141,14 @@ def train(
     if not validation_runs:
         log.warning("the validation split is empty; %s", fit.stand_ins_do)
         validation_runs = reduced.runs("train")[fit.stand_ins]
+    closure = reduced.of_modes(num_modes).closure
     asked = {
         "num_modes": num_modes,
         "model": settings.to_dict(),
         "training": {k: v for k, v in how.to_dict().items() if k not in _NO_MATTER},
         "seed": seed,
         "basis": reduced.folder.name,
-        **({} if (closure := reduced.closure) is None else {"closure_modes": num_modes + closure.num_modes}),
+        **({"closure": f"{closure.kind} to {num_modes + closure.num_modes} modes"} if closure else {}),
         "validation_runs": [run.name for run in validation_runs],
         "start_from": None if start_from is None else str(start_from),
         **(provenance or {}),

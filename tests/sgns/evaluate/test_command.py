@@ -130,7 +130,7 @@ def test_perfect_network_is_limited_by_the_reduction_alone(dataset, basis, tmp_p
         assert words in caplog.text
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
     r, n = basis.num_modes, basis.num_particles
-    shapes = (n, 1), (r, 3), (r, 3), (1, 3 * r), (1, 3), (1, 3)
+    shapes = (n, 1), (r, 3), (1,), (1, 3), (1, 3), (1, 3 * r)
     closed = replace(result, basis=replace(basis, closure=Closure(*map(torch.ones, shapes))))
     with caplog.at_level("INFO"):
         evaluate_module.log_summary(closed, tmp_path / "report.html")

@@ -21,7 +21,7 @@ from sgns_testing.commands import composed
 from sgns_testing.tiny import FIT, POLYNOMIAL, REDUCTION, make_dataset
 
 N, R, C = 40, 2, 3
-CLOSED = REDUCTION | {"closure": "kernel"}
+KINDS = "kernel", "quadratic"
 
 
 def modes() -> torch.Tensor:
@@ -39,45 +39,68 @@ def curved(seed: int, frames: int = 30) -> np.ndarray:
 
 
 @cache
-def fitted(validation: int = 2):
+def fitted(kind: str, validation: int = 2):
     runs = [curved(seed) for seed in range(20)]
-    return fit_closure(modes(), R, runs[validation:], runs[:validation])
+    return fit_closure(kind, modes(), R, runs[validation:], runs[:validation])
 
 
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("validation", [2, 0])
-def test_products_of_coordinates_are_found_on_an_unseen_run(validation) -> None:
-    found, new = fitted(validation), torch.from_numpy(curved(99))
-    assert found.error < 0.02 * found.without
+def test_products_of_coordinates_are_found_on_an_unseen_run(kind, validation) -> None:
+    found, new = fitted(kind, validation), torch.from_numpy(curved(99))
+    assert found.error < 0.15 * found.without
     truth = new[:, R:]
     error = (found.closure.coordinates(new[:, :R]) - truth).square().mean() ** 0.5
-    assert float(error) < 0.02 * float((truth - truth.mean(0)).square().mean() ** 0.5)
+    assert float(error) < 0.15 * float((truth - truth.mean(0)).square().mean() ** 0.5)
 
 
-def test_what_does_not_follow_is_left_at_its_mean() -> None:
+def shadow(seed: int) -> np.ndarray:
+    """Two modes that are nearly one; the rest follows from their small difference, which no rollout gets right."""
+    first, difference = curved(seed)[:, :1], 1e-3 * curved(seed)[:, 1:2]
+    return np.concatenate([first, 0.5 * first + difference, *[1e2 * difference] * C], axis=1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_errors_of_the_coordinates_do_not_grow(kind) -> None:
+    runs, new = [shadow(seed) for seed in range(20)], torch.from_numpy(shadow(99))
+    z, truth = new[:, :R], new[:, R:]
+    chance = torch.Generator().manual_seed(1)
+    missed = 0.2 * z.std(0) * torch.randn(z.shape, generator=chance, dtype=z.dtype)
+    closure = fit_closure(kind, modes(), R, runs[2:], runs[:2]).closure
+    errors = [g - truth for g in (closure.coordinates(z + missed), closure.offset)]
+    error, without = (float(one.square().mean().sqrt()) for one in errors)
+    assert error < 1.2 * without
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_does_not_follow_is_left_at_its_mean(kind) -> None:
     chance = np.random.default_rng(1)
     runs = [
         np.concatenate([one[:, :R], chance.normal(size=(30, C, 3))], axis=1) for one in map(curved, range(8))
     ]
-    found = fit_closure(modes(), R, runs[2:], runs[:2])
+    found = fit_closure(kind, modes(), R, runs[2:], runs[:2])
     assert found.without * 0.9 < found.error < found.without * 1.02
 
 
 def test_far_from_all_frames_it_is_their_mean() -> None:
-    closure = fitted().closure
+    closure = fitted("kernel").closure
     torch.testing.assert_close(closure.coordinates(torch.full((R, 3), 1e3)).float(), closure.offset)
 
 
-def test_frames_that_are_alike_make_no_trouble() -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_that_are_alike_make_no_trouble(kind) -> None:
     still = np.repeat(curved(3)[:1], 200, axis=0)
-    found = fit_closure(modes(), R, [still, *map(curved, range(4))], [curved(5)])
+    found = fit_closure(kind, modes(), R, [still, *map(curved, range(4))], [curved(5)])
     assert found.error < found.without
 
 
-@pytest.fixture
-def basis() -> Basis:
+@pytest.fixture(params=KINDS)
+def basis(request) -> Basis:
     chance = np.random.default_rng(2)
     mean, values = (torch.from_numpy(chance.uniform(size=shape)) for shape in ((N, 3), R))
-    return Basis(mean, modes()[:, :R], values, 4.0, 3.0, "particle_axis", closure=fitted().closure)
+    return Basis(
+        mean, modes()[:, :R], values, 4.0, 3.0, "particle_axis", closure=fitted(request.param).closure
+    )
 
 
 def test_decoding_adds_the_closures_modes(basis) -> None:
@@ -100,15 +123,15 @@ def test_the_file_keeps_it_to_the_bit(basis, tmp_path) -> None:
     assert torch.equal(basis.to("cpu").inverse(latent), basis.inverse(latent))
 
 
-@pytest.mark.parametrize("name", ["modes", "mean", "scale", "centres", "weights", "offset"])
 @pytest.mark.parametrize("change", [lambda x: x[:-1], lambda x: x * torch.nan, lambda x: x.sum(), None])
-def test_damaged_arrays_are_refused(basis, name, change) -> None:
-    state = basis.state()
-    value = state.pop(f"closure_{name}")
-    if change:
-        state[f"closure_{name}"] = change(value)
-    with pytest.raises(UserError):
-        Basis.from_state(state)
+def test_damaged_arrays_are_refused(basis, change) -> None:
+    for name, value in basis.closure.state().items():
+        state = basis.state()
+        del state[f"closure_{name}"]
+        if change:
+            state[f"closure_{name}"] = change(value)
+        with pytest.raises(UserError):
+            Basis.from_state(state)
 
 
 def test_a_closure_of_other_modes_is_refused(basis) -> None:
@@ -116,15 +139,20 @@ def test_a_closure_of_other_modes_is_refused(basis) -> None:
         replace(basis.sliced(1), closure=basis.closure)
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return reduce_dataset(make_dataset(tmp_path_factory.mktemp("data"), frames=30), CLOSED, progress=False)
+@pytest.fixture(scope="module", params=KINDS)
+def data(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    return reduce_dataset(
+        make_dataset(folder, frames=30), REDUCTION | {"closure": request.param}, progress=False
+    )
 
 
 def test_a_dataset_says_what_its_closure_gains(data, caplog) -> None:
+    kind = data.closure.kind
     with caplog.at_level("INFO"):
-        again = reduce_dataset(make_dataset(data.folder.parents[1], frames=30), CLOSED, progress=False)
-    assert "closure: modes 5 to 6 follow from the first 4 with an RMSE of" in caplog.text
+        dataset = make_dataset(data.folder.parents[1], frames=30)
+        again = reduce_dataset(dataset, REDUCTION | {"closure": kind}, progress=False)
+    assert f"{kind} closure: modes 5 to 6 follow from the first 4 with an RMSE of" in caplog.text
     assert "2 validation runs" in caplog.text
     assert again.closure.num_modes == 2 and again.of_modes(4).closure is again.closure
     assert again.of_modes(3).closure is None and again.of_modes(3).num_modes == 3
@@ -134,7 +162,11 @@ def test_a_dataset_says_what_its_closure_gains(data, caplog) -> None:
 @pytest.mark.parametrize("change", [{"closure_modes": 4}, {"num_modes": 6}])
 def test_a_closure_without_modes_is_refused(data, change) -> None:
     with pytest.raises(UserError, match=r"no modes to add .* raise reduction\.closure_modes"):
-        reduce_dataset(make_dataset(data.folder.parents[1], frames=30), CLOSED | change, progress=False)
+        reduce_dataset(
+            make_dataset(data.folder.parents[1], frames=30),
+            REDUCTION | {"closure": data.closure.kind} | change,
+            progress=False,
+        )
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +196,7 @@ def test_only_decoding_is_changed(data, checkpoint, tmp_path) -> None:
 
 
 def test_a_training_with_another_closure_is_another_training(data, checkpoint) -> None:
-    with pytest.raises(UserError, match="closure_modes is 6 there and None here"):
+    with pytest.raises(UserError, match=f"closure is '{data.closure.kind} to 6 modes' there and None here"):
         train(
             replace(data, closure=None), num_modes=4, model=POLYNOMIAL, training=FIT, output=checkpoint.parent
         )
