@@ -100,6 +100,8 @@ class ReductionSettings(Group):
     choose: Literal["position", "energy", "displacement_energy"] = setting("position", "by what auto chooses")
     tolerance: float = setting(3.0, "with choose=position: largest RMSE", "mm", gt=0)
     share: float = setting(0.99, "with the energies: least share of the variance", gt=0, le=1)
+    closure: Literal["none", "kernel", "quadratic"] = setting("none", "how more modes follow from those used")
+    closure_modes: int = setting(32, "modes with the closure's, at most max_modes", ge=2, le=100_000)
 
     def __post_init__(self) -> None:
         super().__post_init__()

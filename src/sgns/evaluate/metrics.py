@@ -54,6 +54,7 @@ NEGLIGIBLE_SHARE = 0.05
 class ParticleErrors:
     """Mean-square position errors of one run's particles, over axes and the frames after the history."""
 
+    # PCA⁻¹ is the decoding, a closure included
     reduction: np.ndarray  # PCA⁻¹PCA(truth) − truth [m²], shape (n,)
     network: np.ndarray  # prediction − PCA⁻¹PCA(truth) [m²], shape (n,)
 
@@ -198,7 +199,8 @@ def position_errors(
     given.
 
     With orthonormal modes the network's error needs no decoding: it is ‖Uᵀ(prediction − truth)‖² / 3n, for a
-    prediction that lies in the subspace of the basis.
+    prediction that lies in the subspace of the basis. A closure moves modes at right angles to it, so this is the error
+    of the modes that are stepped; only without a closure is the total the sum of both.
     """
     if truth.frame_count <= history:
         raise UserError(

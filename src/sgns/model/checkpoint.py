@@ -84,7 +84,7 @@ class Surrogate(nn.Module):
         self.dynamics = dynamics
         self.basis = basis
         state = basis.state()
-        for name in ("mean", "modes", "eigenvalues"):
+        for name in [name for name, value in state.items() if isinstance(value, Tensor)]:
             self.register_buffer(f"basis_{name}", state.pop(name))
         self.register_buffer("start_positions", start_positions.double())
         self.register_buffer("body_points", body_points.double())
@@ -116,7 +116,7 @@ class Surrogate(nn.Module):
         known = TrainingRange.of(runs, dynamics.num_modes, dynamics.context_keys, sees_points)
         return cls(
             dynamics,
-            reduced.basis.sliced(dynamics.num_modes),
+            reduced.of_modes(dynamics.num_modes),
             torch.as_tensor(reduced.start_positions),
             torch.as_tensor(points),
             {**card, "training_range": known.plain(), "slowest_travel": slowest_travel(runs)},
@@ -197,6 +197,7 @@ def load_surrogate(path: str | Path) -> Surrogate:
         kind: type[Dynamics] = resolve_name(DYNAMICS[card["model"]["kind"]])
         dynamics = kind.from_card(card, _below("dynamics.", state))
         tensors = {name: state[f"basis_{name}"] for name in ("mean", "modes", "eigenvalues")}
+        tensors |= _below("basis_", state)  # those of a closure
         basis = Basis.from_state(card["basis"] | tensors, where=str(path))
         surrogate = Surrogate(dynamics, basis, state["start_positions"], state["body_points"], card)
         surrogate.load_state_dict(state)

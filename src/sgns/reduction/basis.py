@@ -22,6 +22,7 @@ from sgns.config import UserError
 from sgns.data.files import one_line, parse_json
 from sgns.data.hdf5 import BROKEN, new_hdf5, open_hdf5, own_attribute, own_dataset
 from sgns.data.run import Run, frame_chunks
+from sgns.reduction.closure import Closure
 
 CENTRINGS = ("scalar", "particle", "particle_axis")
 """What is subtracted before modes are found: one number, a mean per particle, one per particle and axis."""
@@ -30,6 +31,7 @@ _FORMAT_VERSION = 1
 _ARRAYS = ("mean", "modes", "eigenvalues")
 _NUMBERS = ("total_variance", "displacement_variance", "residual_variance")
 _WORDS = ("centring", "arrangement_hash")
+_CLOSURE = "closure_"  # begins the names of its arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,7 @@ class Basis:
         fitted_on: Names of the runs the basis was fitted on.
         residual_variance: Variance outside the modes [m^2]; stored because `total_variance` minus the
             eigenvalues cancels when the layout dwarfs the motion. None: computed by that difference.
+        closure: What follows from the coordinates along further modes; None: nothing.
     """
 
     __repr__ = short_repr
@@ -60,6 +63,7 @@ class Basis:
     arrangement_hash: str = ""
     fitted_on: list[str] = field(default_factory=list)
     residual_variance: float | None = None
+    closure: Closure | None = None
 
     def __post_init__(self) -> None:
         check_centring(self.centring)
@@ -68,6 +72,11 @@ class Basis:
             raise UserError(
                 f"basis arrays do not belong together: mean {shapes[0]}, modes {shapes[1]}, eigenvalues "
                 f"{shapes[2]}; expected (n, 3), (n, r) and (r,)"
+            )
+        if (one := self.closure) and (len(one.modes), len(one.mean)) != self.modes.shape:
+            raise UserError(
+                f"the closure is of {len(one.mean)} modes of {len(one.modes)} particles, the basis has "
+                f"{self.num_modes} of {self.num_particles}"
             )
         if self.residual_variance is None:
             rest = max(self.total_variance - float(self.eigenvalues.sum()), 0.0)
@@ -93,20 +102,23 @@ class Basis:
         return ((x - self.mean).transpose(-1, -2) @ self.modes).transpose(-1, -2).contiguous()
 
     def inverse(self, latent: Tensor | np.ndarray) -> Tensor:
-        """Particle positions [m] of reduced positions [m]: (..., r, 3) -> (..., n, 3) float64.
+        """Particle positions [m] of reduced positions [m], the closure's part included: (..., r, 3) -> (..., n, 3)
+        float64.
 
         Raises:
             UserError: If the mode count differs from the basis.
         """
         z = self._input(latent, "reduced positions", self.num_modes)
-        return (z.transpose(-1, -2) @ self.modes.T).transpose(-1, -2).contiguous().add_(self.mean)
+        soil = (z.transpose(-1, -2) @ self.modes.T).transpose(-1, -2).contiguous().add_(self.mean)
+        return soil if self.closure is None else soil.add_(self.closure.displacement(z))
 
     def to(self, device: str | torch.device) -> Basis:
         """The same basis with its arrays on a torch device."""
-        return replace(self, **{key: getattr(self, key).to(device) for key in _ARRAYS})
+        closure = self.closure and self.closure.to(device)
+        return replace(self, **{key: getattr(self, key).to(device) for key in _ARRAYS}, closure=closure)
 
     def sliced(self, r: int) -> Basis:
-        """The basis of the first `r` modes, with the same mean and total variance."""
+        """The basis of the first `r` modes, with the same mean and total variance; a closure is of all of them."""
         if not 1 <= r <= self.num_modes:
             raise UserError(
                 f"cannot keep {r} modes; the basis has {self.num_modes}; allowed: 1 to {self.num_modes}"
@@ -116,6 +128,7 @@ class Basis:
             modes=self.modes[:, :r].clone(),
             eigenvalues=self.eigenvalues[:r].clone(),
             residual_variance=float(self._residual()[r]),
+            closure=self.closure if r == self.num_modes else None,
         )
 
     def energy(self, r: int | None = None) -> float | Tensor:
@@ -140,6 +153,8 @@ class Basis:
     def state(self) -> dict[str, Any]:
         """Tensors and plain Python values, fit for a checkpoint that loads under `weights_only`."""
         values = {key: getattr(self, key) for key in (*_ARRAYS, *_NUMBERS, *_WORDS)}
+        closure = {} if self.closure is None else self.closure.state()
+        values |= {f"{_CLOSURE}{name}": value for name, value in closure.items()}
         return {"format_version": _FORMAT_VERSION, **values, "fitted_on": list(self.fitted_on)}
 
     @classmethod
@@ -158,11 +173,14 @@ class Basis:
             values: dict[str, Any] = {k: torch.as_tensor(state[k]).to(torch.float64) for k in _ARRAYS}
             values |= {k: float(state[k]) for k in _NUMBERS} | {k: str(state[k]) for k in _WORDS}
             values["fitted_on"] = [str(name) for name in state["fitted_on"]]
+            closure = {k.removeprefix(_CLOSURE): state[k] for k in state if k.startswith(_CLOSURE)}
+            values["closure"] = Closure(**closure) if closure else None
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise UserError(
                 f"{where}: not a basis ({error!r:.300}); fit it again with `sgns reduce`"
             ) from error
-        if not all(bool(torch.as_tensor(values[k]).isfinite().all()) for k in (*_ARRAYS, *_NUMBERS)):
+        numbers = [values[key] for key in (*_ARRAYS, *_NUMBERS)] + list(closure.values())
+        if not all(bool(torch.as_tensor(value).isfinite().all()) for value in numbers):
             raise UserError(
                 f"{where}: the basis holds values that are not finite; fit it again with `sgns reduce`"
             )
@@ -211,7 +229,8 @@ class Basis:
                 keys = ("format_version", *_NUMBERS, *_WORDS)
                 state = {key: own_attribute(file, key) for key in keys if key in file.attrs}
                 state["fitted_on"] = parse_json(own_dataset(file, "fitted_on")[()])
-                state.update((key, torch.from_numpy(own_dataset(file, key)[()])) for key in _ARRAYS)
+                arrays = [*_ARRAYS, *(key for key in file if key.startswith(_CLOSURE))]
+                state.update((key, torch.from_numpy(own_dataset(file, key)[()])) for key in arrays)
         except (*BROKEN, AttributeError) as error:
             raise UserError(
                 f"{path}: not a readable basis, truncated or damaged ({one_line(error)}); fit again with `sgns reduce`"

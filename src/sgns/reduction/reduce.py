@@ -24,6 +24,7 @@ from sgns.data.hdf5 import BROKEN, new_hdf5, open_hdf5, own_attribute, own_datas
 from sgns.data.run import Run, frame_chunks
 from sgns.numbers import counted, require_shapes
 from sgns.reduction.basis import Basis, ReductionCurves, reconstruction_curve, reduction_curves
+from sgns.reduction.closure import Closure, fit_closure
 from sgns.reduction.pca import IncrementalPCA, checked_device
 from sgns.settings import ReductionSettings
 
@@ -168,6 +169,11 @@ class ReducedDataset:
     frame_rate: float  # [Hz]
     start_positions: np.ndarray  # common start of the soil [m], shape (n, 3), float64
     _runs: Mapping[str, Sequence[ReducedRun]] = field(repr=False)
+    closure: Closure | None = None  # of the first `num_modes` modes
+
+    def of_modes(self, r: int) -> Basis:
+        """The basis of the first r modes, with the closure if it is of that many."""
+        return replace(self.basis.sliced(r), closure=self.closure if r == self.num_modes else None)
 
     def runs(self, split: str) -> list[ReducedRun]:
         """The runs of "train", "validation" or "test"."""
@@ -216,7 +222,8 @@ def reduce_dataset(
     with Run(paths["train"][0]) as run:
         start = run.positions(slice(0, 1))[0].astype(np.float64)
     runs = {split: [reduced[path] for path in paths[split]] for split in SPLITS}
-    return ReducedDataset(basis, num_modes, folder, frame_rate, start, runs)
+    closure = fitted_closure(basis, num_modes, settings, runs)
+    return ReducedDataset(basis, num_modes, folder, frame_rate, start, runs, closure)
 
 
 def check_one_bed(paths: Sequence[Path]) -> tuple[dict[Path, str], float]:
@@ -253,6 +260,33 @@ def modes_to_use(basis: Basis, settings: Mapping[str, Any], validation: Sequence
             f"{basis.num_modes} modes; ask for at most {basis.num_modes}"
         )
     return asked
+
+
+def fitted_closure(
+    basis: Basis, r: int, settings: Mapping[str, Any], runs: Mapping[str, Sequence[ReducedRun]]
+) -> Closure | None:
+    """That of the first r modes as `reduction.closure` says, with a line on what it gains."""
+    if settings["closure"] == "none":
+        return None
+    last = min(settings["closure_modes"], basis.num_modes)
+    if last <= r:
+        raise UserError(
+            f"reduction.closure={settings['closure']} has no modes to add to the {r} that are stepped, of "
+            f"{last} in all; raise reduction.closure_modes and reduction.max_modes, or lower reduction.num_modes"
+        )
+    train, validation = ([run.latent for run in runs[split]] for split in ("train", "validation"))
+    closure, without, error = fit_closure(settings["closure"], basis.modes[:, :last], r, train, validation)
+    log.info(
+        "%s closure: modes %d to %d follow from the first %d with an RMSE of %.3g mm on %s; without it %.3g mm",
+        settings["closure"],
+        r + 1,
+        last,
+        r,
+        1e3 * error,
+        counted(len(validation), "validation run") if validation else "every third training run",
+        1e3 * without,
+    )
+    return closure
 
 
 def cache_key(training_content: Sequence[str], settings: Mapping[str, Any]) -> str:

@@ -61,6 +61,11 @@ def main(cfg: DictConfig) -> float:
         pass  # who cannot have it shall not wait for the reduction to hear so
     title = plain["dataset"]["name"]
     if cfg.dataset.get("format") == "published":
+        if cfg.reduction.closure != "none":
+            raise UserError(
+                f"reduction.closure is {cfg.reduction.closure}, but published runs have no particles to decode; use "
+                "reduction.closure=none"
+            )
         reduced = published_dataset(plain["dataset"], cfg.reduction.num_modes)
     elif cfg.dataset.get("format") == "reduced":
         reduced = packed_dataset(plain["dataset"], cfg.reduction.num_modes, cfg.reduction.centring)
@@ -136,12 +141,14 @@ def train(
     if not validation_runs:
         log.warning("the validation split is empty; %s", fit.stand_ins_do)
         validation_runs = reduced.runs("train")[fit.stand_ins]
+    closure = reduced.of_modes(num_modes).closure
     asked = {
         "num_modes": num_modes,
         "model": settings.to_dict(),
         "training": {k: v for k, v in how.to_dict().items() if k not in _NO_MATTER},
         "seed": seed,
         "basis": reduced.folder.name,
+        **({"closure": f"{closure.kind} to {num_modes + closure.num_modes} modes"} if closure else {}),
         "validation_runs": [run.name for run in validation_runs],
         "start_from": None if start_from is None else str(start_from),
         **(provenance or {}),

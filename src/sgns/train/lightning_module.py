@@ -162,7 +162,12 @@ def fit_network(task: Task) -> Fitted:
     )
     context = surrogate.dynamics.context_keys
     rollouts = ValidationRollouts(
-        task.validation_runs, task.num_modes, model.history, model.body_nodes, context, task.reduced.basis
+        task.validation_runs,
+        task.num_modes,
+        model.history,
+        model.body_nodes,
+        context,
+        task.reduced.of_modes(task.num_modes),
     )
     module = SurrogateTraining(surrogate, settings)
     last = output / "last.ckpt" if task.resumed else None

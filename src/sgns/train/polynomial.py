@@ -295,7 +295,7 @@ def fit_polynomial(task: Task) -> Fitted:
         task.model,
         task.settings,
         task.seed,
-        task.reduced.basis,
+        task.reduced.of_modes(task.num_modes),
     )
     seconds = elapsed(began, time.perf_counter())
     surrogate = Surrogate.of(best.dynamics, task.reduced, task.card)

@@ -1,8 +1,8 @@
 """How well dynamics follow the validation runs, all at once: what every kind of model is chosen by.
 
 The error of the positions counts in full space, as in the report: with orthonormal modes it is that in the subspace
-plus what the modes leave out, which no training changes. So within a training both choose the same checkpoint; between
-numbers of modes only the total is fair.
+plus what the modes leave out, which no training changes; a closure's error follows from that in the subspace. So within
+a training both choose the same checkpoint; between numbers of modes only the total is fair.
 
 Letters: B runs, T frames of the longest run, d history positions, r modes.
 """
@@ -25,6 +25,7 @@ from sgns.train.windows import filled, require_finite
 
 if TYPE_CHECKING:
     from sgns.reduction.basis import Basis
+    from sgns.reduction.closure import Closure
     from sgns.reduction.reduce import ReducedRun
 
 
@@ -117,6 +118,7 @@ class ValidationRollouts:
         # Of the positions and of their way since the history's end, what the modes do not see (see `squares`) [m^2].
         self.unseen, self.unseen_way = 0.0, 0.0
         self.coordinates = math.nan  # 3 n
+        self.closure: Closure | None = None
         paths = [run.path for run in runs if run.path is not None]
         packed = [(run.latent[:, num_modes:], run.unseen) for run in runs if run.unseen is not None]
         if basis is not None and len(runs) in (len(paths), len(packed)):
@@ -130,6 +132,9 @@ class ValidationRollouts:
                 self.squares(stacked(part)[..., None, None].sqrt()) for part in parts
             )
             self.coordinates = 3.0 * basis.num_particles
+            if closure := basis.closure:
+                end = num_modes + closure.num_modes
+                self.closure, self.beyond = closure, stacked([run.latent[:, num_modes:end] for run in runs])
         # The same runs preceded by copies of frame 0: a bed at rest.
         self.padding = history - 1
         self.body_at_rest = BodyTrack(
@@ -151,13 +156,14 @@ class ValidationRollouts:
                 self.squares(part - self.latent) for part in (given[:, -1:], latent, at_rest)
             )
             all_frozen = frozen + self.unseen_way
+            error_of_all, at_rest_of_all = error + self.missed(latent), error_at_rest + self.missed(at_rest)
             entries = len(self.names) * self.coordinates
             mean_force = dynamics.force.mean.to(self.force).expand_as(self.force)
             return RolloutScore(
-                1 - (error + self.unseen) / all_frozen,
-                1 - (error_at_rest + self.unseen) / all_frozen,
+                1 - error_of_all / all_frozen,
+                1 - at_rest_of_all / all_frozen,
                 1 - error / frozen,
-                ((error + self.unseen) / entries) ** 0.5,
+                (error_of_all / entries) ** 0.5,
                 (all_frozen / entries) ** 0.5,
                 self.force_error(force),
                 self.force_error(mean_force),
@@ -172,6 +178,13 @@ class ValidationRollouts:
         pairs = [(force[..., axis], self.force[..., axis]) for axis in range(3)] + [(latent, self.latent)]
         counted = self.counted.numpy()
         return [fitted_band(each.numpy()[:, counted], truth.numpy()[counted]) for each, truth in pairs]
+
+    def missed(self, latent: Tensor) -> float:
+        """As `squares`, what the modes do not see and the closure of these latent positions does not get right."""
+        if self.closure is None:
+            return self.unseen
+        error = self.squares(self.closure.coordinates(latent) - self.beyond)
+        return self.unseen - self.squares(self.beyond) + error
 
     def squares(self, error: Tensor) -> float:
         """Sum over runs of the mean square over a run's counted frames; infinite where a rollout is not finite."""

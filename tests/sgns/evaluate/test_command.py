@@ -21,6 +21,7 @@ from sgns.evaluate import report as report_module
 from sgns.evaluate.command import full_basis, single_thread, training_means
 from sgns.evaluate.figures import png
 from sgns.evaluate.report import render_report, write_report
+from sgns.reduction.closure import Closure
 from sgns.rollout import write_rollout
 from sgns_testing.pictures import SMALLEST_TEXT
 from sgns_testing.runs import make_run
@@ -128,6 +129,12 @@ def test_perfect_network_is_limited_by_the_reduction_alone(dataset, basis, tmp_p
     ):
         assert words in caplog.text
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    r, n = basis.num_modes, basis.num_particles
+    shapes = (n, 1), (r, 3), (1,), (1, 3), (1, 3), (1, 3 * r)
+    closed = replace(result, basis=replace(basis, closure=Closure(*map(torch.ones, shapes))))
+    with caplog.at_level("INFO"):
+        evaluate_module.log_summary(closed, tmp_path / "report.html")
+    assert "the true modes and the closure leave a soil error of" in caplog.text
 
 
 def test_frozen_network_has_no_skill(dataset, tmp_path, caplog):
