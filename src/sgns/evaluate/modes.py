@@ -145,7 +145,7 @@ def packed_split(
     simulator: Simulator, settings: Mapping[str, Any], split: str, checkpoint: Path
 ) -> list[ReducedRun]:
     """The runs of a packed dataset that the simulator was trained on a part of."""
-    reduced = packed_dataset(settings, simulator.num_modes)
+    reduced = packed_dataset(Path(settings["path"]), {"num_modes": simulator.num_modes})
     mine, theirs = simulator.basis.modes, reduced.basis.sliced(simulator.num_modes).modes
     if mine.shape != theirs.shape or not torch.allclose(mine, theirs, atol=1e-6):
         raise UserError(

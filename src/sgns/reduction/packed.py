@@ -26,7 +26,8 @@ from sgns.config import UserError
 from sgns.data.dataset import SPLITS
 from sgns.data.files import one_line, parse_json, read_arrays, write_arrays
 from sgns.reduction.basis import Basis, left_out
-from sgns.reduction.reduce import ReducedDataset, ReducedRun
+from sgns.reduction.reduce import ReducedDataset, ReducedRun, fitted_closure
+from sgns.settings import ReductionSettings
 
 PRECISION = 1e-5
 """RMS distance along an axis by which the rounding of the modes' coordinates moves a particle [m]."""
@@ -35,7 +36,6 @@ MOST_BYTES = 2_800_000
 
 _FORMAT = "sgns-packed-dataset-1"
 _SERIES = {"latent": "<u4", "pose": "<f4", "force": "<f2", "torque": "<f2", "unseen": "<f4", "points": "<f4"}
-_VARIANCES = ("total_variance", "displacement_variance", "residual_variance")
 _WRONG = "no part of a reduced dataset, or damaged"
 
 
@@ -62,16 +62,19 @@ def pack(reduced: ReducedDataset, folder: Path) -> str:
         "split": {name: [run.name for run in reduced.runs(name)] for name in SPLITS},
         "centring": basis.centring,
         "arrangement_hash": basis.arrangement_hash,
+        "total_variance": basis.total_variance,
+        "displacement_variance": basis.displacement_variance,
+        "residual_variance": basis.residual_variance,
     }
     arrays = {
-        "about": _text(about | {name: getattr(basis, name) for name in _VARIANCES}),
+        "about": _text(about),
         "mean": basis.mean.numpy().astype("f4"),
         "start": reduced.start_positions.astype("f4"),
         "modes": basis.modes.numpy().astype("f2"),
         "eigenvalues": basis.eigenvalues.numpy(),
     }
     write_arrays(folder / "basis.npz", arrays)
-    soil, force = _loss(reduced, packed_dataset({"path": str(folder)}, basis.num_modes))
+    soil, force = _loss(reduced, packed_dataset(folder, {"num_modes": basis.num_modes}))
     total = sum(path.stat().st_size for path in folder.iterdir())
     return (
         f"{len(runs)} reduced runs of {basis.num_modes} modes in {folder}: {total / 1e6:.3g} MB; this moves "
@@ -144,20 +147,18 @@ def _loss(true: ReducedDataset, packed: ReducedDataset) -> tuple[float, float]:
 # --- Reading --------------------------------------------------------------------------------------------
 
 
-def packed_dataset(
-    settings: Mapping[str, Any], num_modes: int | str, centring: str | None = None
-) -> ReducedDataset:
-    """The reduced dataset in the folder `settings["path"]`.
+def packed_dataset(folder: Path, reduction: Mapping[str, Any]) -> ReducedDataset:
+    """The reduced dataset in a folder.
 
     Args:
-        settings: The `dataset` group.
-        num_modes: r, the first of its modes.
-        centring: The one that is asked for; None: that of the files.
+        folder: Of the files.
+        reduction: Values of `conf/reduction`; a centring that is not given is that of the files.
 
     Raises:
         UserError: There is none, it is damaged, or it has fewer modes or another centring.
     """
-    folder = Path(settings["path"])
+    settings = ReductionSettings.from_dict(dict(reduction)).to_dict()
+    num_modes, centring = settings["num_modes"], reduction.get("centring")
     if not (folder / "basis.npz").is_file():
         raise UserError(
             f"no reduced dataset in {folder}: basis.npz is missing; they come with the repository, in its folder "
@@ -190,7 +191,9 @@ def packed_dataset(
             centring=str(about["centring"]),
             arrangement_hash=str(about["arrangement_hash"]),
             fitted_on=[str(name) for name in about["split"]["train"]],
-            **{name: float(about[name]) for name in _VARIANCES},
+            total_variance=float(about["total_variance"]),
+            displacement_variance=float(about["displacement_variance"]),
+            residual_variance=float(about["residual_variance"]),
         )
     except (KeyError, ValueError, TypeError, RuntimeError, AttributeError) as error:
         if isinstance(error, UserError):
@@ -205,7 +208,10 @@ def packed_dataset(
         raise UserError(
             f"reduction.centring is {centring}; the modes in {folder} are of centring {basis.centring}"
         )
-    return ReducedDataset(basis, num_modes, folder, float(about["frame_rate"]), start.numpy(), chosen)
+    closure = fitted_closure(basis, num_modes, settings, chosen)
+    return ReducedDataset(
+        basis, num_modes, folder, float(about["frame_rate"]), start.numpy(), chosen, closure
+    )
 
 
 def _about(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def main(cfg: DictConfig) -> float:
             )
         reduced = published_dataset(plain["dataset"], cfg.reduction.num_modes)
     elif cfg.dataset.get("format") == "reduced":
-        reduced = packed_dataset(plain["dataset"], cfg.reduction.num_modes, cfg.reduction.centring)
+        reduced = packed_dataset(Path(plain["dataset"]["path"]), plain["reduction"])
     else:
         dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
         reduced, title = reduce_dataset(dataset, cfg.reduction, device=cfg.device), dataset.title

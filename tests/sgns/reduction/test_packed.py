@@ -32,7 +32,7 @@ def folder(true, tmp_path_factory) -> Path:
 
 
 def test_what_is_packed_comes_back(true, folder) -> None:
-    found = packed_dataset({"path": str(folder)}, 4)
+    found = packed_dataset(folder, {"num_modes": 4})
     assert found.num_modes == 4 and found.frame_rate == true.frame_rate
     assert found.basis.fitted_on == true.basis.fitted_on
     np.testing.assert_allclose(found.start_positions, true.start_positions, atol=1e-7)
@@ -50,9 +50,9 @@ def test_what_is_packed_comes_back(true, folder) -> None:
 def test_large_ones_are_several_files_and_may_be_packed_again(true, folder, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(packed, "MOST_BYTES", (folder / "runs_00.npz").stat().st_size // 3)
     again = tmp_path / "again"
-    pack(packed_dataset({"path": str(folder)}, 1), again)
+    pack(packed_dataset(folder, {"num_modes": 1}), again)
     assert len(list(again.glob("runs_*.npz"))) > 2
-    one, other = (packed_dataset({"path": str(place)}, 1) for place in (folder, again))
+    one, other = (packed_dataset(place, {"num_modes": 1}) for place in (folder, again))
     for a, b in zip(one.runs("train"), other.runs("train"), strict=True):
         np.testing.assert_allclose(a.latent, b.latent, atol=1e-3)
 
@@ -61,7 +61,7 @@ def test_training_scores_as_with_the_runs(true, folder, tmp_path) -> None:
     """Skill and errors are those of all particles, although the files have none."""
     how = {"model": MODEL, "training": BRIEF, "num_modes": 4}
     train(true, output=tmp_path / "runs", **how)
-    train(packed_dataset({"path": str(folder)}, 4), output=tmp_path / "packed", **how)
+    train(packed_dataset(folder, {"num_modes": 4}), output=tmp_path / "packed", **how)
     one, other = (read_summary(tmp_path / name) for name in ("runs", "packed"))
     for key in ("skill", "position_rmse", "force_nrmse"):
         assert other[key] == pytest.approx(one[key], rel=0.02)
@@ -88,13 +88,13 @@ def test_commands_from_packing_to_a_table(tmp_path) -> None:
 
 def test_wrong_requests(folder, true, tmp_path) -> None:
     with pytest.raises(UserError, match=r"allowed are 1 to 6"):
-        packed_dataset({"path": str(folder)}, 7)
+        packed_dataset(folder, {"num_modes": 7, "max_modes": 7})
     with pytest.raises(UserError, match=r"allowed are 1 to 6"):
-        packed_dataset({"path": str(folder)}, "auto")
+        packed_dataset(folder, {"num_modes": "auto"})
     with pytest.raises(UserError, match="of centring particle_axis"):
-        packed_dataset({"path": str(folder)}, 2, "scalar")
+        packed_dataset(folder, {"num_modes": 2, "centring": "scalar"})
     with pytest.raises(UserError, match=r"basis\.npz is missing"):
-        packed_dataset({"path": str(tmp_path)}, 2)
+        packed_dataset(tmp_path, {"num_modes": 2})
     with pytest.raises(UserError, match="is not empty"):
         pack(true, folder)
 
@@ -114,6 +114,6 @@ def test_damaged_files_are_refused_in_one_line(folder, tmp_path, name) -> None:
                 content = bytes(changed[: len(changed) // 2] if number == 0 else changed)
             (place / file).write_bytes(content)
         try:
-            packed_dataset({"path": str(place)}, 4)
+            packed_dataset(place, {"num_modes": 4})
         except UserError as error:
             assert "\n" not in str(error)
