@@ -17,9 +17,9 @@ from sgns import Run, Simulator
 from sgns.data.dataset import Dataset
 
 folder = Path("outputs/examples")
-coarse = "scene.bed.spacing=0.04 scene.bed.size=[0.8,0.6,0.16] scene.blade.thickness=0.084 scene.duration=1.5"
+coarse = "scene.bed.spacing=0.04 scene.bed.size=[0.8,0.6,0.16] scene.blade.thickness=0.084 scene.duration=1.0"
 fast = "training.noises=[0.3] training.penalties=[0.01]"  # one choice of each, not the best of fifteen
-dataset = f"dataset=quick dataset.path={folder}/data dataset.runs=10"
+dataset = f"dataset=quick dataset.path={folder}/data dataset.runs=8"
 for command in (
     f"simulate {dataset} {coarse}",
     f"train {dataset} model=polynomial reduction.num_modes=4 {fast} output={folder}/learned",

@@ -67,7 +67,7 @@ def test_no_two_items_of_a_launch_meet_but_in_atomic_sums():
     found = {}
     for atomic in (True, False):
         with on_stand_in(Checked(atomic=atomic)) as checked:
-            *_, frame = Solver(small_cut(1.0 / 240.0)).frames()
+            *_, frame = Solver(small_cut(1.0 / 480.0)).frames()
         assert abs(frame.force[0]) > 0.1
         found[atomic] = {report.kernel: report for report in checked.reports()}
     assert len(found[True]) == len(found[False]) == 7

@@ -185,7 +185,8 @@ def test_walls_that_are_thinner_than_the_grid_are_told():
     assert buried(height=0.2).warnings() == []
 
 
-@pytest.mark.parametrize("thickness", [0.001, pytest.param(0.002, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("thickness", [0.001, 0.002])
 def test_thin_walls_hold_soil(thickness):
     """At 1 m/s and 8 particles per cell, which leaks without."""
     assert measure(thickness, 8.0, 1.0, thickened=False)["through_inside"] > 0.02
