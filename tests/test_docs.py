@@ -75,7 +75,7 @@ def parse(command: str) -> tuple[str, list[str]]:
         overrides.append("run=run.h5")
     plain = []
     for override, text in zip(OverridesParser.create().parse_overrides(overrides), overrides, strict=True):
-        if text.startswith("hydra/"):  # a launcher that is a package of its own
+        if text.startswith(("hydra/", "hydra.launcher.")):  # a launcher that is a package of its own
             continue
         if override.is_sweep_override():
             text = f"{override.key_or_group}={next(override.sweep_string_iterator())}"

@@ -235,6 +235,26 @@ class TrainingSettings(Group):
         "auto", "go on from last.ckpt in `output`; false: start anew and overwrite"
     )
     threads: int | None = _threads()
+    devices: int = setting(
+        1, "processes on each machine, each with its own device, started by torchrun or srun", ge=1, le=1024
+    )
+    nodes: int = setting(1, "machines", ge=1, le=100_000)
+    strategy: Literal["auto", "ddp", "ddp_find_unused_parameters_true"] = setting(
+        "auto", "Lightning's, of several processes"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.windows // self.members % self.processes:
+            raise UserError(
+                f"training.devices times training.nodes is {self.processes}, and each takes the same share of the "
+                f"{self.windows // self.members} windows of a step: choose a training.batch_size that this divides"
+            )
+
+    @property
+    def processes(self) -> int:
+        """That train together."""
+        return self.devices * self.nodes
 
     @property
     def windows(self) -> int:
@@ -413,7 +433,7 @@ class Reduce(_Command):
 class Train(_Command):
     """`sgns train`."""
 
-    checkpoint: str | None = setting(None, "file.ckpt to start from; null: none")
+    checkpoint: str | None = setting(None, "file.ckpt to start from, or a name that ships; null: none")
     output: str = setting("", "folder for checkpoints and TensorBoard logs; one that exists is continued")
     seed: int = _seed("of weights, noise and order of the samples")
     device: str = _device()
@@ -427,7 +447,7 @@ def _spread() -> bool:
 class Rollout(_Command):
     """`sgns rollout`."""
 
-    checkpoint: str = setting("", "file.ckpt of `sgns train`")
+    checkpoint: str = setting("", "file.ckpt of `sgns train`, or the name of one that ships")
     num_modes: int | None = _num_modes()
     rate_independent: bool = setting(True, "under a slow tool soil follows its way")
     spread: bool = _spread()
@@ -441,7 +461,7 @@ class Rollout(_Command):
 class Evaluate(_Command):
     """`sgns evaluate`."""
 
-    checkpoint: str = setting("", "file.ckpt of `sgns train`")
+    checkpoint: str = setting("", "file.ckpt of `sgns train`, or the name of one that ships")
     num_modes: int | None = _num_modes()
     spread: bool = _spread()
     split: Literal["train", "validation", "test"] = setting("test", "which runs")

@@ -39,6 +39,7 @@ from sgns.numbers import (
     is_whole,
     real_array,
 )
+from sgns.pretrained import shipped
 from sgns.reduction.basis import Basis
 
 # Every step it is looked at whether the tool's pose and its change are far outside the training range; the rest, such
@@ -286,6 +287,15 @@ class Simulator:
     ) -> Simulator:
         """From a checkpoint written by `sgns train`, or UserError; the other arguments as of the class."""
         return cls(load_surrogate(path), device, num_modes, rate_independent, spread)
+
+    @classmethod
+    def pretrained(cls, name: str, **options: Any) -> Simulator:
+        """One that ships with the package; options are those of `load`.
+
+        Raises:
+            UserError: None of that name ships; the line names those that do.
+        """
+        return cls.load(shipped(name), **options)
 
     @property
     def scene(self) -> dict[str, Any]:

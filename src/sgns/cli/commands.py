@@ -125,6 +125,12 @@ class _Stopped(BaseException):
     """
 
 
+class _Failed(NamedTuple):
+    """What a job in another process returns that a person can repair."""
+
+    line: str
+
+
 def main() -> int:
     """Run the command named in `sys.argv`; returns the exit status."""
     open_closed_streams()
@@ -175,7 +181,7 @@ def _run(arguments: list[str]) -> int:
         return 2
 
 
-def run_command(cfg: DictConfig) -> float | None:
+def run_command(cfg: DictConfig) -> float | _Failed | None:
     """Hydra's task: run one job; its value is the command's main metric, for sweepers to optimise."""
     from hydra.core.hydra_config import HydraConfig
 
@@ -204,9 +210,12 @@ def run_command(cfg: DictConfig) -> float | None:
         if (line := _line_of(error)) is None:
             raise
         _drop_empty_output(hydra_cfg)
-        if not hydra_cfg.launcher._target_.endswith("BasicLauncher"):
-            raise  # this is another process; the line is made in the first one
         _show_traceback()
+        if not hydra_cfg.launcher._target_.endswith("BasicLauncher"):
+            # This is another process; the first one says the line. Other sweepers look at errors themselves.
+            if hydra_cfg.sweeper._target_.endswith("BasicSweeper"):
+                return _Failed(line)
+            raise
         raise _Stopped(label + line, 2) from None
 
 
@@ -248,9 +257,23 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
             )
             # Other sweepers than Hydra's keep tables of their own.
             if jobs := [job for batch in done or () for job in batch] if sweep else []:
-                from sgns.cli.help import end_sweep
+                _end_sweep(jobs, command)
 
-                end_sweep(jobs, COMMANDS[command].value)
+
+def _end_sweep(jobs: Sequence[Any], command: str) -> None:
+    """The table of the jobs; other launchers than Hydra's own go on when one fails, which is said then.
+
+    Raises:
+        UserError: It names the first job that failed.
+    """
+    from sgns.cli.help import end_sweep
+
+    failed = {n: job for n, job in enumerate(jobs) if isinstance(job.return_value, _Failed)}
+    if complete := [job for n, job in enumerate(jobs) if n not in failed]:
+        end_sweep(complete, COMMANDS[command].value)
+    for number, job in failed.items():
+        kept = f"; {len(failed)} of {len(jobs)} jobs failed, the others are kept" if complete else ""
+        raise UserError(f"{_label(number, job.overrides)}{job.return_value.line}{kept}")
 
 
 _MOST_CHECKED = 200

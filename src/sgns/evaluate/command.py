@@ -52,6 +52,7 @@ from sgns.evaluate.results import (
 )
 from sgns.model.features import is_wheel
 from sgns.numbers import counted, elapsed, error_hint, error_words
+from sgns.pretrained import checkpoint_file
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout
 from sgns.settings import ModelSettings, model_settings
@@ -317,7 +318,7 @@ def log_summary(evaluation: Evaluation, report: Path) -> None:
 def main(cfg: DictConfig) -> float:
     """The `sgns evaluate` command; returns the position skill against frozen over all runs of the split."""
     new_rollouts = [cfg.new_rollouts] if isinstance(cfg.new_rollouts, str) else cfg.new_rollouts or []
-    checkpoint, output = Path(cfg.checkpoint), Path(cfg.output)
+    checkpoint, output = checkpoint_file(cfg.checkpoint), Path(cfg.output)
     form = cfg.dataset.get("format")
     simulator = Simulator.load(checkpoint, cfg.device, cfg.num_modes, spread=cfg.spread)
     if form is None:

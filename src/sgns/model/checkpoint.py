@@ -20,6 +20,7 @@ from sgns.data.run_file import require_mesh_was_read
 from sgns.model.dynamics import Dynamics
 from sgns.model.features import slowest_travel
 from sgns.model.training_range import TrainingRange
+from sgns.pretrained import checkpoint_file, is_name, names_in_words
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset
 
@@ -142,17 +143,18 @@ def write_checkpoint(content: dict[str, Any], path: Path) -> None:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint's content, with its card under "hyper_parameters".
+    """A checkpoint's content, with its card under "hyper_parameters"; the path may be the name of one that ships.
 
     Raises:
         UserError: Missing, truncated, or not a checkpoint of this project, or of a newer one.
     """
-    path = Path(path)
+    ships = f"; {names_in_words()}" if is_name(path) else ""
+    path = checkpoint_file(path)
     if (inside := path / "best.ckpt").is_file():
         raise UserError(f"{path} is a folder; use checkpoint={inside}")
     if not path.is_file():
         raise UserError(
-            f"no checkpoint at {path}; train one with: sgns train output=<folder>, then use "
+            f"no checkpoint at {path}{ships}; train one with: sgns train output=<folder>, then use "
             "<folder>/best.ckpt"
         )
     try:

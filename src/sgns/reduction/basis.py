@@ -186,7 +186,8 @@ class Basis:
             )
         basis = cls(**values)
         deviation = orthonormality_error(basis.modes)
-        if deviation > 1e-6:
+        # Of modes kept in half precision, as shipped checkpoints do, the last digit.
+        if deviation > (1e-3 if getattr(state["modes"], "dtype", None) == torch.float16 else 1e-6):
             raise UserError(
                 f"{where}: modes are not orthonormal (off by {deviation:.1e}); fit again with `sgns reduce`"
             )

@@ -140,6 +140,54 @@ class IncrementalPCA:
             x = x[len(taken) :]
         return self
 
+    def merge(self, other: IncrementalPCA) -> IncrementalPCA:
+        """Take in the frames of another stream, such as those of another machine; returns this object.
+
+        Streams can be pickled. The other one stays as it is. While neither had to drop directions, the result is that
+        of one stream over all frames, but for rounding, whatever the order. Beyond that each stream has dropped its own
+        weakest directions: frames, mean and total variance stay exact, and what was dropped adds up in the
+        `residual_variance` of the basis, so `residual_mse` stays an upper bound.
+
+        Raises:
+            UserError: The other stream has other particles, or tracks another number of directions.
+        """
+        if other._tracked != self._tracked:
+            raise UserError(
+                f"the other stream tracks {other._tracked} directions and this one {self._tracked}; give both the same "
+                "num_modes and oversampling"
+            )
+        if other.frame_count == 0:
+            return self
+        theirs, reference = other._absorbed(), other._reference.to(self.device)
+        if self.frame_count == 0:
+            self._begin(reference.T)
+        if reference.shape != self._reference.shape:
+            raise UserError(
+                f"the other stream has {reference.shape[1]} particles and this one {self._reference.shape[1]}; one "
+                "basis serves one particle arrangement"
+            )
+        mine = self._absorbed()
+        count = mine.frames + theirs.frames
+        move = theirs.mean.to(self.device) + (reference - self._reference) - mine.mean
+        rows = theirs.sketch.to(self.device)
+        if mine.frames:  # the means differ, see the class
+            rows = torch.cat([math.sqrt(mine.frames * theirs.frames / count) * move, rows])
+        scatter = (
+            mine.scatter + theirs.scatter + mine.frames * theirs.frames / count * float(move.square().sum())
+        )
+        known = mine._replace(
+            frames=count,
+            mean=mine.mean + move * (theirs.frames / count),
+            scatter=scatter,
+            dropped=mine.dropped + theirs.dropped,
+        )
+        self._rooms = [torch.empty_like(self._rooms[0]) for _ in range(2)]
+        self._moments, weakest = _merged(known, rows, self._rooms[0])
+        self._weakest = max(weakest, self._weakest, other._weakest)
+        self._input_noise += other._input_noise
+        self.frame_count, self._queued = count, 0
+        return self
+
     def _begin(self, frame: Tensor) -> None:
         """The reference and all memory of the stream, from the first frame (n, 3)."""
         self._reference = frame.to(self.device, torch.float64).T.contiguous()

@@ -166,6 +166,9 @@ class Workers:
             physics |= {"device": device, "precision": campaign.precision}
             file = campaign.file(name)
             self._jobs.append(_Job(name, number, scene.to_dict(), scene.meshes, file, physics))
+        if multiprocessing.get_start_method(allow_none=True) == "loky":
+            # In a worker of joblib's, whose way to start processes a child of ours would not know.
+            multiprocessing.set_start_method("spawn", force=True)
         context = multiprocessing.get_context("spawn")
         # Of every run: frames done, those of them that an attempt before had made, and whether it has ended. Each entry
         # has one writer, so there is no lock.

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
+    from lightning.fabric.plugins.environments import ClusterEnvironment
     from lightning.pytorch.loggers import TensorBoardLogger
 
     from sgns.model.checkpoint import Surrogate
@@ -33,6 +34,7 @@ class Task(NamedTuple):
     resumed: bool  # whether `last.ckpt` is there to go on from
     card: dict[str, Any]  # plain values for the checkpoint
     logger: TensorBoardLogger  # for what is to be seen on the way
+    environment: ClusterEnvironment  # which of the training's processes this is
 
 
 class Fitted(NamedTuple):

@@ -14,6 +14,7 @@ import shlex
 import shutil
 import signal
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from lightning.fabric.plugins.environments import (
+    ClusterEnvironment,
+    LightningEnvironment,
+    SLURMEnvironment,
+    TorchElasticEnvironment,
+)
 from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import OmegaConf
 
@@ -42,7 +49,7 @@ log = logging.getLogger(__name__)
 
 
 # Settings that change speed or reporting, not the result.
-_NO_MATTER = ("threads", "log_every", "resume")
+_NO_MATTER = ("threads", "log_every", "resume", "devices", "nodes", "strategy")
 FITS = {"network": "sgns.train.lightning_module:NETWORK", "polynomial": "sgns.train.polynomial:POLYNOMIAL"}
 """How to fit a model, by `model.kind`; loaded as `sgns.model.checkpoint.DYNAMICS` is."""
 
@@ -56,9 +63,12 @@ def main(cfg: DictConfig) -> float:
     settings = training_settings(plain["model"], plain["training"])
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)  # for the reduction, too
-    output = Path(cfg.output)
-    with only_here(output / "best.ckpt"):
-        pass  # who cannot have it shall not wait for the reduction to hear so
+    output, first = Path(cfg.output), environment_of(settings).global_rank() == 0
+    if first:
+        with only_here(output / "best.ckpt"):
+            pass  # who cannot have it shall not wait for the reduction to hear so
+    else:
+        logging.getLogger("sgns").setLevel(logging.ERROR)  # the first process speaks for all
     title = plain["dataset"]["name"]
     if cfg.dataset.get("format") == "published":
         if cfg.reduction.closure != "none":
@@ -83,10 +93,39 @@ def main(cfg: DictConfig) -> float:
         start_from=cfg.checkpoint,
         provenance={"preset": plain["preset"]["name"], "dataset": title},
     )
-    if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.RUN:  # a sweep ends with a table
+    # A sweep ends with a table.
+    if first and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.RUN:
         for line in next_commands(output / "best.ckpt", reduced, HydraConfig.get().overrides.task):
             log.info("%s", line)
     return skill
+
+
+def environment_of(how: Any) -> ClusterEnvironment:
+    """Which of its processes this one is, of a training with these settings.
+
+    Raises:
+        UserError: There are to be several, and there are not as many.
+    """
+    processes = getattr(how, "processes", 1)
+    if processes == 1:
+        # Whatever a cluster's job says of its tasks: Lightning would look for the others, requeue the job itself, and
+        # log nothing in any but the first.
+        alone = LightningEnvironment()
+        alone.set_global_rank(0)
+        return alone
+    found: ClusterEnvironment | None = None
+    if TorchElasticEnvironment.detect():
+        found = TorchElasticEnvironment()
+    elif SLURMEnvironment.detect():
+        found = SLURMEnvironment(auto_requeue=False)
+    there = 1 if found is None else found.world_size()
+    if found is None or there != processes:
+        raise UserError(
+            f"training.devices={how.devices} training.nodes={how.nodes} need {processes} processes, and "
+            f"{'this is one' if there == 1 else f'there are {there}'}: start them with torchrun or srun, as in "
+            f"docs/guides/cluster.md#one-training-several-processes"
+        )
+    return found
 
 
 def next_commands(checkpoint: Path, reduced: ReducedDataset, given: Sequence[str]) -> list[str]:
@@ -137,6 +176,8 @@ def train(
     if how.threads is not None:
         torch.set_num_threads(how.threads)
     fit: Fit = resolve_name(FITS[settings.kind])
+    environment = environment_of(how)
+    first = environment.global_rank() == 0  # it alone writes
     validation_runs = reduced.runs("validation")
     if not validation_runs:
         log.warning("the validation split is empty; %s", fit.stand_ins_do)
@@ -159,8 +200,8 @@ def train(
         "scene": reduced.runs("train")[0].scene,
         "package_version": sgns.__version__,
     }
-    with only_here(output / "best.ckpt"):
-        resumed = what_is_there(output, asked, how.resume)
+    with only_here(output / "best.ckpt") if first else nullcontext():
+        resumed = what_is_there(output, asked, how.resume) if first or how.resume else ""
         if resumed == "complete":
             summary = read_summary(output)
             log.info("%s is complete; training.resume=false trains anew", output)
@@ -184,16 +225,19 @@ def train(
                     resumed=resumed == "partial",
                     card=card,
                     logger=logger,
+                    environment=environment,
                 )
             )
         except KeyboardInterrupt as stop:
             if (output / "last.ckpt").exists():
                 raise
             every = getattr(how, "validate_every", None)  # polynomials write one at their end
-            first = f"; the first checkpoint comes after {every} steps" if every else ""
+            then = f"; the first checkpoint comes after {every} steps" if every else ""
             number = stop.number if isinstance(stop, Interrupted) else signal.SIGINT
-            raise Interrupted(number, f"nothing of the training is kept yet{first}") from None
+            raise Interrupted(number, f"nothing of the training is kept yet{then}") from None
         score = fitted.score
+        if not first:
+            return score.skill
         metrics = {
             key: getattr(score, key) for key in ("skill", "skill_at_rest", "skill_in_subspace", "force_nrmse")
         }

@@ -20,7 +20,6 @@ import lightning as L
 import numpy as np
 import torch
 from lightning.pytorch.plugins import TorchCheckpointIO
-from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from tqdm import tqdm
@@ -108,7 +107,12 @@ class SurrogateTraining(L.LightningModule):
         losses = self.losses(batch)
         weight = self.settings.loss
         loss = sum((getattr(weight, name) * value for name, value in losses.items()), torch.zeros(()))
-        total = float(loss.detach())
+        told = {name: value.detach().clone() for name, value in (losses | {"total": loss}).items()}
+        if self.settings.processes > 1:
+            for value in told.values():
+                torch.distributed.all_reduce(value)
+                value /= self.settings.processes
+        total = float(told["total"])
         if self.first_loss is None:
             self.first_loss = total
         cure = (
@@ -116,14 +120,14 @@ class SurrogateTraining(L.LightningModule):
             f"{self.settings.learning_rate:g}) or training.gradient_clip (now {self.settings.gradient_clip})"
         )
         if not math.isfinite(total):
-            worst = next((name for name, value in losses.items() if not bool(torch.isfinite(value))), "loss")
+            worst = next((name for name, value in told.items() if not bool(torch.isfinite(value))), "loss")
             raise UserError(f"the {worst} loss is {total} at step {self.global_step}; {cure}")
         if total > _DIVERGED * self.first_loss > 0:
             raise UserError(
                 f"the training diverges: the loss is {total:.3g} at step {self.global_step} and was "
                 f"{self.first_loss:.3g} in the first; {cure}"
             )
-        self.log_dict({f"loss/{name}": value.detach() for name, value in (losses | {"total": loss}).items()})
+        self.log_dict({f"loss/{name}": value for name, value in told.items()})
         return loss
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
@@ -171,7 +175,13 @@ def fit_network(task: Task) -> Fitted:
     )
     module = SurrogateTraining(surrogate, settings)
     last = output / "last.ckpt" if task.resumed else None
-    bar = tqdm(total=settings.max_steps, desc="training", unit="step", leave=False, disable=None)
+    rank = task.environment.global_rank()
+    if settings.processes > 1:  # of the windows of each member
+        each = torch.arange(settings.windows).unflatten(0, (settings.members, settings.processes, -1))
+        data.share = each[:, rank].flatten()
+    bar = tqdm(
+        total=settings.max_steps, desc="training", unit="step", leave=False, disable=True if rank else None
+    )
     with bar, quiet_lightning():
         validation = RolloutValidation(surrogate, rollouts, output, settings)
         trainer = make_trainer(task, [validation, StepProgress(bar)])
@@ -226,7 +236,9 @@ def prepared(
                 f"training.members is {settings.members} and {start_from} has {other.members}; use as many, or "
                 "checkpoint=null"
             )
-        if not torch.equal(given.basis.modes, reduced.basis.modes[:, :num_modes]):
+        modes = reduced.basis.modes[:, :num_modes]
+        # Shipped ones have fewer digits.
+        if float((given.basis.modes - modes).abs().max()) > 1e-3 * float(modes.abs().max()):
             raise UserError(
                 f"{start_from} belongs to another basis; use the dataset it was trained on, or "
                 "checkpoint=null"
@@ -301,19 +313,17 @@ class WholeCheckpoints(TorchCheckpointIO):
 
 
 def make_trainer(task: Task, callbacks: list[L.Callback]) -> L.Trainer:
-    """Lightning's trainer: by steps, one device, no validation loop of its own (see `RolloutValidation`)."""
+    """Lightning's trainer: by steps, no validation loop of its own (see `RolloutValidation`)."""
     settings, device, clip = task.settings, task.device, task.settings.gradient_clip
     if device not in ("cpu", "cuda"):
         raise UserError(f"device is {device!r}; allowed: cpu, cuda")
     if device == "cuda" and not torch.cuda.is_available():
         raise UserError("device is cuda but torch finds no CUDA device; use device=cpu")
-    # One process, whatever a cluster's job says of its tasks: Lightning would look for the others, requeue the job
-    # itself, and log nothing in any but the first.
-    alone = LightningEnvironment()
-    alone.set_global_rank(0)
     return L.Trainer(
         accelerator="gpu" if device == "cuda" else "cpu",
-        devices=1,
+        devices=settings.devices,
+        num_nodes=settings.nodes,
+        strategy=settings.strategy if settings.processes > 1 else "auto",
         max_steps=settings.max_steps,
         max_epochs=-1,
         logger=task.logger,
@@ -325,7 +335,7 @@ def make_trainer(task: Task, callbacks: list[L.Callback]) -> L.Trainer:
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        plugins=[WholeCheckpoints(), alone],
+        plugins=[WholeCheckpoints(), task.environment],
     )
 
 

@@ -303,8 +303,15 @@ class RolloutValidation(L.Callback):
             self._mark = (self._mark[0], self._mark[1] + elapsed(paused, time.perf_counter()))
 
     def validate(self, trainer: L.Trainer, step: int) -> None:
-        """Measure, log, save."""
+        """Measure, log, save; of several processes the first measures and writes, and all have to take part."""
         self.require_finite_weights(step)
+        better = self.measured(trainer, step) if trainer.is_global_zero else False
+        if trainer.strategy.broadcast(better):
+            trainer.save_checkpoint(self.output / "best.ckpt")
+        trainer.save_checkpoint(self.output / "last.ckpt")
+
+    def measured(self, trainer: L.Trainer, step: int) -> bool:
+        """Roll out and log; says whether these weights are the best so far."""
         trainer.lightning_module.eval()
         score = self.rollouts.measure(self.surrogate.dynamics)
         if score.band is not None:
@@ -325,10 +332,9 @@ class RolloutValidation(L.Callback):
         loss = float(trainer.callback_metrics["loss/total"])
         steps = self.settings.max_steps
         log.info("step %d of %d: loss %.3g; on validation runs: %s", step, steps, loss, score.words())
-        if score.skill > self.best or not (self.output / "best.ckpt").exists():
+        if better := score.skill > self.best or not (self.output / "best.ckpt").exists():
             self.best = score.skill
-            trainer.save_checkpoint(self.output / "best.ckpt")
-        trainer.save_checkpoint(self.output / "last.ckpt")
+        return better
 
     def require_finite_weights(self, step: int) -> None:
         """For before a checkpoint is written: the one of before is worth more than one that is not finite."""

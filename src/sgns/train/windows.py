@@ -135,9 +135,9 @@ class TrainingWindows:
         context = self.context[self.of_run[targets]]
         return Batch(latent, noise[0], body, noise[1], self.force[last], self.torque[last], context)
 
-    def batch(self, step: int, size: int, noise: NoiseScales) -> Batch:
+    def batch(self, step: int, size: int, noise: NoiseScales, share: Tensor | None = None) -> Batch:
         """The batch of an optimisation step from 0: a function of (seed, step) and nothing else, so that resuming
-        changes nothing."""
+        changes nothing; of its windows those with the numbers `share`, if that is given."""
         chance = generator(self.seed, step, _SAMPLING)
         sizes = torch.tensor([float(len(group)) for group in self.groups])
         group = self.groups[int(torch.multinomial(sizes, 1, generator=chance))]
@@ -148,6 +148,8 @@ class TrainingWindows:
         body_offsets = random_walk(
             noise.body.expand(nodes, 3), shape, generator(self.seed, step, _BODY_NOISE)
         )
+        if share is not None:
+            targets, offsets, body_offsets = targets[share], offsets[share], body_offsets[share]
         return self.windows(targets, (offsets, body_offsets))
 
 
@@ -204,16 +206,19 @@ class WindowLoader:
     Everything is in memory and a batch is a few tensor look-ups, so there are no worker processes.
     """
 
-    def __init__(self, windows: TrainingWindows, batch_size: int, noise: NoiseScales) -> None:
+    def __init__(
+        self, windows: TrainingWindows, batch_size: int, noise: NoiseScales, share: Tensor | None = None
+    ) -> None:
         self.training_windows = windows
         self.batch_size = batch_size
         self.noise = noise
+        self.share = share
         self.trainer: L.Trainer | None = None
 
     def __iter__(self) -> Iterator[Batch]:
         first = 0 if self.trainer is None else self.trainer.global_step
         for step in itertools.count(first):
-            yield self.training_windows.batch(step, self.batch_size, self.noise)
+            yield self.training_windows.batch(step, self.batch_size, self.noise, self.share)
 
 
 # --- Scales of all quantities, from the training windows, and of the noise that is added to them --------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import subprocess
-import sys
 from pathlib import Path
 
 import joblib
@@ -223,13 +222,3 @@ def test_settings_are_shown(kind, resolve, hostile) -> None:
     said = done.stdout
     assert ("num_modes:" in said) == (kind != "hydra") and ("hydra:" in said) == (kind != "job")
     assert ("${" in said) == (not resolve)
-
-
-def test_the_launcher_for_several_processes(hostile) -> None:
-    pytest.importorskip(
-        "hydra_plugins.hydra_joblib_launcher", reason="hydra-joblib-launcher is not installed"
-    )
-    launcher = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
-    command = [sys.executable, "-m", "sgns", "advise", *launcher, "time=0.01,0.1"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
-    assert done.returncode == 0, done.stderr

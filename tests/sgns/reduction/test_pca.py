@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -285,3 +287,54 @@ def test_wrong_settings_are_named():
         pca.basis("mean")
     with pytest.raises(UserError, match="num_modes is 5; this stream tracked 4"):
         pca.basis(num_modes=5)
+
+
+@pytest.mark.parametrize("centring", CENTRINGS)
+@pytest.mark.parametrize("cut", [0, 1, 77, 150])
+def test_streams_of_two_shares_merge_to_that_of_all_frames(centring, cut):
+    # No more directions than are tracked, 12 + 16, and a far reference frame.
+    x = soil(150, 60, rank=12, offset=5.0)
+    shares = [
+        pickle.loads(pickle.dumps(fit(part, 12))) for part in (x[:cut], x[cut:])
+    ]  # as from other machines
+    merged = shares[0].merge(shares[1])
+    whole = fit(x, 12)
+    assert merged.frame_count == 150 and merged.rank(centring) == whole.rank(centring)
+    a, b = (pca.basis(centring, 10) for pca in (merged, whole))
+    np.testing.assert_allclose(a.mean, b.mean, atol=1e-12)
+    np.testing.assert_allclose(a.eigenvalues, b.eigenvalues, rtol=1e-9)
+    np.testing.assert_allclose(a.modes, b.modes, atol=1e-6)
+    for one, other in (
+        (a.total_variance, b.total_variance),
+        (a.displacement_variance, b.displacement_variance),
+    ):
+        assert one == pytest.approx(other, rel=1e-12)
+    assert askew(a.modes) < 1e-12
+
+
+def test_a_merged_stream_goes_on_and_the_other_one_stays():
+    x = soil(150, 60, rank=12)
+    other = fit(x[40:90], 12)
+    before = other.basis(num_modes=10).modes
+    going_on = fit(x[:40], 12).merge(other).partial_fit(x[90:])
+    assert torch.equal(other.basis(num_modes=10).modes, before) and other.frame_count == 50
+    whole = fit(x, 12).basis(num_modes=10)
+    np.testing.assert_allclose(going_on.basis(num_modes=10).eigenvalues, whole.eigenvalues, rtol=1e-9)
+    assert IncrementalPCA(12).merge(IncrementalPCA(12)).frame_count == 0
+
+
+def test_merged_streams_that_dropped_directions_keep_totals_and_bounds():
+    x = soil(600, 150, decay=0.9, seed=3)
+    values, modes = exact(x, "particle_axis")
+    basis = fit(x[:250], 8).merge(fit(x[250:], 8)).basis()
+    assert largest_angle(basis.modes, modes[:, :8]) < 0.05
+    assert basis.total_variance == pytest.approx(values.sum(), rel=1e-12)
+    error = np.mean((basis.inverse(basis.transform(x)).numpy() - x) ** 2)
+    assert error <= basis.residual_mse(8) <= 1.02 * error
+
+
+def test_streams_that_do_not_belong_together_are_not_merged():
+    with pytest.raises(UserError, match="has 20 particles and this one 30; one basis"):
+        fit(soil(5, 30), 4).merge(fit(soil(5, 20), 4))
+    with pytest.raises(UserError, match="tracks 20 directions and this one 21"):
+        IncrementalPCA(5).merge(IncrementalPCA(4))

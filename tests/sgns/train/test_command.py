@@ -35,7 +35,7 @@ from sgns.train import validation
 from sgns.train.command import main, train
 from sgns.train.validation import ValidationRollouts
 from sgns.train.windows import Batch
-from sgns_testing.commands import TRAIN, environment
+from sgns_testing.commands import TRAIN, call, environment
 from sgns_testing.tiny import BRIEF, MODEL, REDUCTION, TRAINING, make_dataset
 
 
@@ -503,3 +503,60 @@ def test_fewer_modes_of_several_members(data, tmp_path) -> None:
             Simulator.load(tmp_path / "best.ckpt", num_modes=2, spread=spread).rollout(path).latent.shape[1]
             == 2
         )
+
+
+@pytest.mark.timeout(300)  # processes that load torch
+@pytest.mark.parametrize("members", [1, pytest.param(2, marks=pytest.mark.long)])
+def test_two_processes_train_as_one_does(members, empty_folder) -> None:
+    make_dataset(empty_folder / "data")
+    words = [
+        *TRAIN,
+        "dataset.path=data",
+        "training.max_steps=6",
+        "training.validate_every=3",
+        "training.log_every=1",
+    ]
+    words += ["training.batch_size=8", f"training.members={members}"]
+    both = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node=2",
+        "-m",
+        "sgns",
+        "train",
+    ]
+    done = subprocess.run(
+        [*both, *words, "training.devices=2", "output=two"],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        env=environment(),
+    )
+    assert done.returncode == 0, done.stderr
+    assert (
+        done.stdout.count("next: sgns evaluate") == done.stdout.count("step 6 of 6") == 1
+    )  # one of them speaks
+    one = call("train", *words, "output=one")
+    assert one.returncode == 0, one.stderr
+    curves = []
+    for name in ("one", "two"):
+        events = EventAccumulator(f"{name}/tensorboard").Reload()
+        curves.append([event.value for event in events.Scalars("loss/total")])
+    assert len(curves[0]) == 6
+    np.testing.assert_allclose(curves[1], curves[0], rtol=1e-4)
+    a, b = (content(f"{name}/last.ckpt")["state_dict"] for name in ("one", "two"))
+    for name, value in a.items():
+        torch.testing.assert_close(b[name], value, rtol=1e-3, atol=1e-5)
+    # How many processes there were does not make it another training.
+    assert "is complete" in call("train", *words, "output=two").stdout
+
+
+def test_processes_that_are_not_there_are_told(data, tmp_path) -> None:
+    with pytest.raises(
+        UserError, match=r"devices=2 training.nodes=3 need 6 processes, and this is one: start"
+    ):
+        run(data, tmp_path, devices=2, nodes=3, batch_size=6)
+    with pytest.raises(UserError, match=r"takes the same share of the 8 windows of a step"):
+        run(data, tmp_path, devices=3)
