@@ -227,7 +227,7 @@ def table() -> str:
 if __name__ == "__main__":
     try:
         target = ship(sys.argv[1], Path(sys.argv[2]))
-        print(f"{target} and its card; for docs/start.md:\n\n{table()}")
+        print(f"{target} and its card; for docs/learning.md:\n\n{table()}")
     except (UserError, IndexError) as error:
         sys.exit(
             f"sgns.pretrained.ship: {error if isinstance(error, UserError) else 'give NAME and EVALUATION'}"

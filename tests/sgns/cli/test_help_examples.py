@@ -19,6 +19,8 @@ from sgns.simulate.run import simulate_scene
 from sgns.simulate.scene import scene_from_config
 from sgns_testing.commands import SMALL, TRAIN, call, composed, refused, sgns, small_dataset
 
+REDUCED = Path(__file__).parents[3] / "reduced"
+
 UNDRAWN = [word for word in SMALL if not word.startswith("scene.speed=")]  # the datasets draw it
 # Settings that make an example small; they stand after its own.
 FEW_STEPS = [word for word in TRAIN if not word.startswith("reduction.")]
@@ -70,6 +72,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def needed(folder: Path, here: Path, example: str) -> None:
     """Give `here` what the example reads, and nothing that it makes."""
     shutil.copytree(folder / "data", here / "data")
+    if "dataset=quick_reduced" in example:
+        shutil.copytree(REDUCED, here / "reduced")
     for name in re.findall(r"=(outputs/\w+)/best\.ckpt|(run[.\w]*\.h5)", example):
         if "output=" + "".join(name) not in example:
             source, place = folder / "".join(name), here / "".join(name)
@@ -93,6 +97,8 @@ def test_examples_of_the_help_run(example: str, folder: Path, empty_folder: Path
         smaller += FITTED_QUICKLY if "model=polynomial" in words else FEW_STEPS
     if command in ("train", "reduce") and "num_modes" not in few:
         smaller += ["reduction.num_modes=3"]
+    if "dataset=quick_reduced" in words:
+        smaller = [word for word in smaller if not word.startswith("dataset.path=")]
     if any(word.startswith("continue_from=") for word in words):
         smaller = []
     done = call(command, *words, *smaller)

@@ -43,6 +43,7 @@ def test_shares_of_a_campaign(launcher: list[str], empty_folder: Path) -> None:
     assert "as a table: multirun/simulate/" in done.stdout
 
 
+@pytest.mark.long
 def test_trainings_of_which_one_fails_and_evaluations(empty_folder: Path) -> None:
     small_dataset(Path("data/quick"))
     datasets = "dataset.path=data/none,data/quick"

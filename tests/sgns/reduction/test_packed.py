@@ -72,7 +72,7 @@ def test_commands_from_packing_to_a_table(tmp_path) -> None:
     few = ["reduction.num_modes=4", "reduction.max_modes=6"]
     done = sgns(tmp_path, "reduce", "dataset.path=data", *few, "pack=small", "output=out")
     assert "7 reduced runs of 6 modes in small" in done.stdout
-    small = ["dataset=paper_excavation_reduced", "dataset.path=small"]
+    small = ["dataset=quick_reduced", "dataset.path=small"]
     brief = ["training.max_steps=2", "training.validate_every=2", "model.context=[]"]
     sgns(tmp_path, "train", *small, *few, *brief, "output=net")
     done = sgns(tmp_path, "evaluate", *small, "checkpoint=net/best.ckpt", "output=report")

@@ -375,7 +375,8 @@ sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGUSR1, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
 def test_in_an_allocation_of_several_tasks_it_is_one_process_that_a_signal_ends_as_ctrl_c(
     tmp_path, number
 ) -> None:
@@ -505,8 +506,9 @@ def test_fewer_modes_of_several_members(data, tmp_path) -> None:
         )
 
 
+@pytest.mark.long
 @pytest.mark.timeout(300)  # processes that load torch
-@pytest.mark.parametrize("members", [1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.parametrize("members", [1, 2])
 def test_two_processes_train_as_one_does(members, empty_folder) -> None:
     make_dataset(empty_folder / "data")
     words = [
