@@ -75,15 +75,23 @@ def scored(simulator: Simulator, run: ReducedRun, mean_force: np.ndarray) -> Sco
     elapsed = np.arange(len(truth))[:, None, None] - (d - 1)
     network = mean_square(rollout.latent)
     unknown = np.full(len(network), np.nan)
-    reduction, here, way = unknown, np.zeros(1), np.zeros(1)
+    reduction, missed, way = unknown, np.zeros(1), np.zeros(1)
     if run.unseen is not None:
-        here, way = (part[d:] / size for part in outside(run.latent[:, simulator.num_modes :], run.unseen))
-        reduction = here
+        missed, way = (part[d:] / size for part in outside(run.latent[:, simulator.num_modes :], run.unseen))
+        reduction = missed
+        if closure := simulator.basis.closure:
+            beyond = run.latent[:, simulator.num_modes :][:, : closure.num_modes]
+
+            def gained(latent: np.ndarray) -> np.ndarray:
+                found = closure.coordinates(torch.from_numpy(latent)).numpy()
+                return (np.square(beyond) - np.square(found - beyond))[d:].sum(axis=(1, 2)) / size
+
+            missed, reduction = missed - gained(rollout.latent), missed - gained(truth)
     errors = PositionErrors(
         time=run.time[d:],
         reduction=reduction,
         network=network,
-        total=network + here,
+        total=network + missed,
         frozen=mean_square(truth[d - 1][None]) + way,
         # What moves outside the modes has hardly begun to when the history ends.
         constant_velocity=mean_square(truth[d - 1] + elapsed * (truth[d - 1] - truth[d - 2])) + way,

@@ -3,7 +3,7 @@
     <folder>/basis.npz        the basis, the bed at the start, and which runs are for what
     <folder>/runs_00.npz ...  the reduced runs, so many in a file that it stays small
 
-Coordinates along the modes are rounded to one step for all of them, such that the decoded soil moves by 0.01 mm (RMS,
+Coordinates along the modes are rounded to one step for all of them, such that the decoded soil moves by 0.002 mm (RMS,
 the limit `PRECISION`), and kept as second differences in time: small whole numbers, which pack well. The rest is in
 single or half precision; what that costs is printed when it is written.
 
@@ -29,7 +29,7 @@ from sgns.reduction.basis import Basis, left_out
 from sgns.reduction.reduce import ReducedDataset, ReducedRun, fitted_closure
 from sgns.settings import ReductionSettings
 
-PRECISION = 1e-5
+PRECISION = 2e-6
 """RMS distance along an axis by which the rounding of the modes' coordinates moves a particle [m]."""
 MOST_BYTES = 2_800_000
 """Of a file of runs, about."""

@@ -10,13 +10,17 @@ import pytest
 
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
+from sgns.data.run import Run
+from sgns.evaluate.command import roll_out
+from sgns.evaluate.modes import scored
 from sgns.model.checkpoint import read_summary
 from sgns.reduction import packed
 from sgns.reduction.packed import PRECISION, pack, packed_dataset
-from sgns.reduction.reduce import ReducedDataset
+from sgns.reduction.reduce import ReducedDataset, reduce_dataset
+from sgns.simulator import Simulator
 from sgns.train.command import train
 from sgns_testing.commands import refusal, sgns
-from sgns_testing.tiny import BRIEF, MODEL, reduced
+from sgns_testing.tiny import BRIEF, MODEL, REDUCTION, make_dataset, reduced
 
 
 @pytest.fixture(scope="module")
@@ -117,3 +121,23 @@ def test_damaged_files_are_refused_in_one_line(folder, tmp_path, name) -> None:
             packed_dataset(place, {"num_modes": 4})
         except UserError as error:
             assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize("closure", ["none", "kernel"])
+def test_errors_are_those_of_all_particles(tmp_path, closure, monkeypatch) -> None:
+    """Up to rounding, which an untrained network may enlarge."""
+    monkeypatch.setattr(packed, "PRECISION", 1e-9)
+    dataset = make_dataset(tmp_path / "data")
+    how = REDUCTION | {"num_modes": 2, "closure": closure, "closure_modes": 4}
+    pack(reduce_dataset(dataset, how, progress=False), tmp_path / "packed")
+    small = packed_dataset(tmp_path / "packed", how)
+    train(small, num_modes=2, model=MODEL, training=BRIEF, output=tmp_path / "net")
+    simulator = Simulator.load(tmp_path / "net" / "best.ckpt")
+    [run] = small.runs("test")
+    found = scored(simulator, run, np.zeros(3)).mse
+    with Run(dataset.runs("test")[0]) as truth:
+        positions = truth.positions()[simulator.history :]
+        latents = {"total": roll_out(simulator, truth).latent, "reduction": run.latent[:, :2]}
+    for name, latent in latents.items():
+        error = simulator.basis.inverse(latent[simulator.history :]).numpy() - positions
+        assert found[name] == pytest.approx(np.square(error).mean(), rel=1e-2)
