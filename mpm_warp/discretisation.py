@@ -71,7 +71,8 @@ def lay_grid(
     behind = [round(0.5 * (c - s / h), 6) for s, c in zip(bed.size[:2], cells, strict=True)]
     grid.beyond_walls = vec3(*(1.0 / _part_in_bin(distance) for distance in (*behind, 0.0)))
     grid.speed_limit = h / time_step
-    grid.dilation = DILATION if bed.particles_per_cell < ENOUGH else 0.0
+    # Where particles keep their own volume changes, as in published scenes, their volume is not corrected either.
+    grid.dilation = DILATION * scene.volume_averaging if bed.particles_per_cell < ENOUGH else 0.0
     return grid, ghosts
 
 

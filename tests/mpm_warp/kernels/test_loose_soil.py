@@ -173,3 +173,10 @@ def test_few_crowded_particles_dilate_as_they_are_sheared(per_cell, stretch, fal
     inner = np.all(np.abs(last.position - [0.16, 0.16, -0.09]) < [0.07, 0.07, 0.04], axis=1)
     ln_j = solver.particles.log_volume.numpy()[inner]
     np.testing.assert_allclose(np.median(ln_j), -fall * time, atol=3e-5)
+
+
+def test_particles_that_keep_their_own_volume_do_not_dilate():
+    """As in published scenes."""
+    bed = Stretched((0.32, 0.32, 0.16), 0.02, 1.0, headroom=0.3)
+    dilations = [float(Solver(Sheared(bed=bed, volume_averaging=share)).grid.dilation) for share in (0.0, 1.0)]
+    assert dilations == [0.0, 2.0]
