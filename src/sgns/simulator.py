@@ -95,6 +95,12 @@ class State:
         return soil_surface(self.soil(), self._scene)
 
 
+def require_index(name: str, index: Any, count: int) -> None:
+    """Refuse what is no index of so many."""
+    if not is_whole(index) or not -count <= index < count:
+        raise UserError(f"{name} is {index!r}; there are {counted(count, name)}: 0 to {count - 1}")
+
+
 @dataclass(frozen=True, eq=False)
 class Rollout:
     """A whole tool path.
@@ -119,6 +125,8 @@ class Rollout:
     poses: np.ndarray
     body_points: np.ndarray
     wall_time_s: float
+    _basis: Basis = field(repr=False)
+    _scene: Mapping[str, Any] = field(repr=False)
     _excess: Callable[[], Excess | None] = field(repr=False)
     force_spread: np.ndarray | None = None
     latent_spread: np.ndarray | None = None
@@ -133,6 +141,15 @@ class Rollout:
     def outside(self) -> float:
         """The largest of all frames, as `State.outside`."""
         return np.nan if self.excess is None else self.excess.largest
+
+    def soil(self, frame: int = -1) -> np.ndarray:
+        """Positions of all particles at a frame, the last one by default [m], shape (n, 3); decoded when asked for."""
+        require_index("frame", frame, len(self.latent))
+        return self._basis.inverse(self.latent[frame]).numpy()
+
+    def surface(self, frame: int = -1) -> Surface:
+        """The soil's surface there, as `State.surface`."""
+        return soil_surface(self.soil(frame), self._scene)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +181,7 @@ class Rollouts:
         """Positions of all particles on a path at a frame, the last one by default [m], shape (n, 3); decoded when
         asked for."""
         for name, index, count in zip(("path", "frame"), (path, frame), self.latent.shape, strict=False):
-            if not is_whole(index) or not -count <= index < count:
-                raise UserError(f"{name} is {index!r}; there are {counted(count, name)}: 0 to {count - 1}")
+            require_index(name, index, count)
         return self._basis.inverse(self.latent[path, frame]).numpy()
 
     def surface(self, path: int, frame: int = -1) -> Surface:
@@ -496,7 +512,8 @@ class Simulator:
         states, force, torque, poses, world, *spread = parts
         self._look(0, poses[None], points, context)
         excess = partial(self._surrogate.training_range.excess, poses, points, states, context)
-        return Rollout(states, force, torque, poses, world, wall_time, excess, *spread)
+        of = self.basis, self.scene
+        return Rollout(states, force, torque, poses, world, wall_time, *of, excess, *spread)
 
     def _followed(self, poses: np.ndarray, *arguments: Any) -> tuple[Any, ...]:
         """What `Dynamics.follow` finds, the mean of all members, then the spread of force and modes."""

@@ -75,7 +75,16 @@ class FakeSimulator:
         if latent_history is not None:
             latent[: self.history] = np.asarray(latent_history)
         loads = self.force_factor * force, self.force_factor * torque
-        return Rollout(latent, *loads, poses, in_world_frame(poses, body_points), 0.01, lambda: None)
+        return Rollout(
+            latent,
+            *loads,
+            poses,
+            in_world_frame(poses, body_points),
+            0.01,
+            self.basis,
+            self.scene,
+            lambda: None,
+        )
 
 
 def fitted(paths: list[Path], modes: int) -> Basis:

@@ -234,7 +234,7 @@ def test_many_paths_say_how_far_each_is_outside(trained, kind) -> None:
         np.testing.assert_array_equal(many.outside > 0.5, [False, True, False, True, False])
 
 
-def test_soil_and_surface_of_many_paths(trained) -> None:
+def test_soil_and_surface_of_paths(trained) -> None:
     simulator, path = trained.simulator("pose"), trained.run.pose
     many = simulator.rollouts(np.stack([path[:6], path[4:10]]))
     first, *_, last = stepped(simulator, path[4:10])
@@ -243,6 +243,12 @@ def test_soil_and_surface_of_many_paths(trained) -> None:
     np.testing.assert_array_equal(soil, many.soil(-1, frame=5))
     np.testing.assert_array_equal(many.surface(1).z, soil_surface(soil, simulator.scene).z)
     np.testing.assert_array_equal(many.soil(0, 0), first.soil())
+    one = simulator.rollout(path[4:10])
+    np.testing.assert_allclose(one.soil(), last.soil(), rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(one.surface().z, soil_surface(one.soil(), simulator.scene).z)
+    np.testing.assert_array_equal(one.soil(0), first.soil())
+    with pytest.raises(UserError, match=r"frame is 6; there are 6 frames: 0 to 5"):
+        one.soil(6)
     with pytest.raises(UserError, match=r"path is 2; there are 2 paths: 0 to 1"):
         many.soil(2)
     with pytest.raises(UserError, match=r"frame is 0.5; there are 6 frames: 0 to 5"):

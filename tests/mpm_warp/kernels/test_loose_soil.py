@@ -178,5 +178,7 @@ def test_few_crowded_particles_dilate_as_they_are_sheared(per_cell, stretch, fal
 def test_particles_that_keep_their_own_volume_do_not_dilate():
     """As in published scenes."""
     bed = Stretched((0.32, 0.32, 0.16), 0.02, 1.0, headroom=0.3)
-    dilations = [float(Solver(Sheared(bed=bed, volume_averaging=share)).grid.dilation) for share in (0.0, 1.0)]
+    dilations = [
+        float(Solver(Sheared(bed=bed, volume_averaging=share)).grid.dilation) for share in (0.0, 1.0)
+    ]
     assert dilations == [0.0, 2.0]
