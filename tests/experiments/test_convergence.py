@@ -16,6 +16,7 @@ def run():
     return module
 
 
+@pytest.mark.long
 def test_a_cut_with_an_edge_meets_the_earth_moving_equation(run):
     """In plane strain with mu_s = sin(phi), four cells deep; a square end carries ten times the vertical force."""
     equation = run.theory()[0]

@@ -197,7 +197,9 @@ def test_the_steps_that_a_light_mesh_needs() -> None:
     assert step(hollow) < 0.7 * step(mesh_box())
 
 
-@pytest.mark.parametrize("tool", [Sphere(diameter=0.05), Box(size=(0.06, 0.06, 0.04))])
+@pytest.mark.parametrize(
+    "tool", [pytest.param(Sphere(diameter=0.05), marks=pytest.mark.long), Box(size=(0.06, 0.06, 0.04))]
+)
 def test_a_body_at_rest_weighs_on_the_soil_what_it_weighs(tool) -> None:
     one = free(tool, position=(0.08, 0.08, tool.half_size[2]))
     solver = Solver(scene(one, duration=0.4))

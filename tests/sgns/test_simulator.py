@@ -372,9 +372,8 @@ def test_a_copy_is_pickled_without_what_is_computed_again(trained) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
-@pytest.mark.parametrize(
-    "method", [m for m in ("fork", "spawn") if m in multiprocessing.get_all_start_methods()]
-)
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork")
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.long)])
 def test_other_processes_answer_the_same(trained, method) -> None:
     path = trained.run.pose
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context(method)) as pool:

@@ -130,7 +130,11 @@ def test_what_no_run_can_have_is_refused_before_anything_is_written(tmp_path):
 SHORT = ["scene=quick_wheel", "scene.settle=0.05", "scene.duration=0.1", "output=run.h5"]
 
 
-@pytest.mark.parametrize("name", options_of("scene"))
+RANDOM = "published_excavation"  # whose bed takes seconds
+SCENES = [pytest.param(n, marks=pytest.mark.long) if n == RANDOM else n for n in options_of("scene")]
+
+
+@pytest.mark.parametrize("name", SCENES)
 def test_no_scene_that_ships_warns_of_itself(name):
     path = ["scene.path=[[0,0.3,0.3,0.2,0,0,0,1],[2,0.4,0.3,0.0,0,0,0,1]]"] if name == "body" else []
     found = Preview.of(scene_from_config(composed(f"scene={name}", *path)))

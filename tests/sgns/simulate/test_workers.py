@@ -80,6 +80,7 @@ def test_campaign_is_resumed(tmp_path, caplog):
     assert sorted(f.name for f in files[0].parent.iterdir()) == sorted(f.name for f in files)
 
 
+@pytest.mark.long
 def test_runs_that_take_turns_are_the_runs_made_one_by_one(tmp_path, caplog):
     one, two = campaign(tmp_path / "one", runs=5), campaign(tmp_path / "two", runs=5)
     simulate_campaign(one, device="cpu", workers=1)
@@ -243,11 +244,9 @@ def workers_of(pid: int) -> list[int]:
     return [int(child) for child in children if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
-@pytest.mark.parametrize(
-    "number",
-    [signal.SIGKILL, *(pytest.param(one, marks=pytest.mark.long) for one in (signal.SIGTERM, signal.SIGINT))],
-)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_the_workers_of_an_ended_campaign_keep_what_they_have_and_end(tmp_path, number):
     script = tmp_path / "make.py"
     script.write_text(MAKE)
