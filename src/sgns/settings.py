@@ -60,6 +60,18 @@ class DatasetSettings(Group):
             raise UserError(
                 f"dataset.split is {list(self.split)}; it needs three shares (train, validation, test) that sum to 1"
             )
+        grids = self.draw if isinstance(self.draw, list) else [] if self.draw is None else [self.draw]
+        for grid in grids:
+            if not grid:
+                raise UserError(
+                    f"dataset.draw holds {grid!r}; it must be a grid, key: [values], or a list of such grids"
+                )
+            for key, values in grid.items():
+                # A single text may be a pattern of files.
+                if not isinstance(values, (list, str)) or not values:
+                    raise UserError(
+                        f"dataset.draw.{key} is {values!r}; it must be a list of at least one value"
+                    )
 
 
 @settings
@@ -607,9 +619,8 @@ def training_settings(model: Mapping[str, Any], training: Mapping[str, Any]) -> 
     return MODELS[model_settings(model).kind][1].from_dict(training)
 
 
-_FORMATS: dict[Any, type[Group]] = {"reduced": PackedSettings, None: DatasetSettings}
-
-
 def dataset_settings(dataset: Mapping[str, Any]) -> Group:
     """The settings in the values of `conf/dataset`, checked; errors as `model_settings`."""
-    return _FORMATS.get(dataset.get("format"), PublishedSettings).from_dict(dataset)
+    if "format" not in dataset:
+        return DatasetSettings.from_dict(dataset)
+    return (PackedSettings if dataset["format"] == "reduced" else PublishedSettings).from_dict(dataset)

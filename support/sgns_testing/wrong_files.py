@@ -15,7 +15,7 @@ import torch
 import trimesh
 import yaml
 
-from sgns_testing.commands import SHORT, SMALL, TRAIN, call, small_dataset
+from sgns_testing.commands import REDUCED, SHORT, SMALL, TRAIN, call, small_dataset
 from sgns_testing.meshes import box_corners, box_triangles, write_obj, write_stl, write_text_stl
 from sgns_testing.published import record
 
@@ -58,6 +58,7 @@ _DRAW = ("dataset.draw.path=[../good/path.csv]", "+dataset.draw.gravity=[1.62,3.
 CAMPAIGN = ("dataset=own", "dataset.path=data", *_DRAW, *SHORT[:4], ON_PATH[-1])
 LEARN = (*DATA, *TRAIN)
 FIT = (*LEARN[:3], "model=polynomial", "training=polynomial")
+PACKED = ("dataset=quick_reduced", "dataset.path=../good/packed", *TRAIN)
 PUBLISHED = ("dataset=published", "dataset.path=../good/published", *TRAIN[1:])
 
 
@@ -66,6 +67,9 @@ def good_files(folder: Path) -> None:
     folder.mkdir(parents=True)
     small_dataset(folder / "data")
     done = call("train", f"dataset.path={folder / 'data'}", *TRAIN, f"output={folder / 'out'}")
+    assert done.returncode == 0, done.stderr
+    packed = (f"pack={folder / 'packed'}", f"output={folder / 'reduced'}")
+    done = call("reduce", f"dataset.path={folder / 'data'}", *REDUCED, *packed)
     assert done.returncode == 0, done.stderr
     done = call("rollout", f"checkpoint={folder / 'out' / 'best.ckpt'}", f"output={folder / 'run.h5'}")
     assert done.returncode == 0, done.stderr

@@ -40,6 +40,7 @@ from sgns_testing.wrong_files import (
     JUDGE,
     LEARN,
     ON_PATH,
+    PACKED,
     PUBLISHED,
     READ,
     RUN,
@@ -144,6 +145,7 @@ def _groups() -> Iterator[tuple[str, tuple[str, ...], str, Any]]:
     }
     for name, cls in typed.COMMANDS.items():
         yield name, own.get(name, ()), "", cls
+    yield "train", PACKED, "dataset.", typed.PackedSettings
 
 
 def _setting_of(cls: Any, name: str) -> Setting:
@@ -173,7 +175,7 @@ def _wrong_values(known: Setting, hint: Any) -> tuple[list[str], list[str]]:
             known.gt == 0
         )  # where 0 is right it is, too
         if int in kinds and float not in kinds:
-            sizes += ["10.5", "1e17", "-1000000000000000000000"]
+            sizes += ["10.5", "1e19", "-1000000000000000000000"]
         if list in origins or tuple in origins:
             types += ["[]", "5"]
             sizes = [f"[{', '.join([size] * (3 if float in kinds else 2))}]" for size in sizes]

@@ -490,6 +490,9 @@ def _line_of(error: Exception) -> str | None:
     taken_out = [argument for argument in sys.argv if argument.startswith("~")]
     if taken_out and isinstance(error, (AttributeError, KeyError)):
         return f"{' '.join(taken_out)}: what is taken out here is needed; leave this out"
+    circle = [argument for argument in sys.argv if "${" in argument]
+    if circle and "Recursive interpolation" in str(error):
+        return f"{' '.join(circle)}: this refers to itself; give a value"
     from sgns.cli.help import describe
 
     line = describe(error)

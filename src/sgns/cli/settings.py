@@ -344,7 +344,10 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
         raise UserError(
             "dataset.name is missing; choose a dataset, as in dataset=quick, or give this one a name"
         )
-    own.from_dict({one.name: plain[one.name] for one in fields(own) if one.name in plain})
+    checked = own.from_dict({one.name: plain[one.name] for one in fields(own) if one.name in plain})
+    for key, value in vars(checked).items():
+        if type(value) is int and type(plain.get(key)) is float:  # 1e6 is a whole number to people
+            OmegaConf.update(cfg, key, value)
     if plain.get("dataset") is not None:
         typed.dataset_settings(plain["dataset"])
     if "reduction" in plain:

@@ -365,10 +365,6 @@ def _combinations(draw: Any) -> list[tuple[int, dict[str, Any]]]:
     """Number of the grid and combination, for every combination of one grid (key → values) or of several."""
     combinations = []
     for number, grid in enumerate(draw if isinstance(draw, list) else [draw]):
-        if not isinstance(grid, Mapping) or not grid:
-            raise UserError(
-                f"dataset.draw holds {grid!r}; it must be a grid, key: [values], or a list of such grids"
-            )
         drawn = {str(key).removeprefix("scene."): _drawn(key, values) for key, values in grid.items()}
         products = itertools.product(*drawn.values())
         combinations += [(number, dict(zip(drawn, values, strict=True))) for values in products]
@@ -380,7 +376,7 @@ def _drawn(key: Any, values: Any) -> list[Any]:
     of_files = str(key).removeprefix("scene.") in _FILES
     if of_files and isinstance(values, str):
         values = [values]
-    if not isinstance(values, list) or not values:
+    if isinstance(values, str):
         raise UserError(f"dataset.draw.{key} is {values!r}; it must be a list of at least one value")
     if not of_files:
         return values

@@ -21,7 +21,8 @@ from sgns.cli.commands import COMMANDS
 from sgns.cli.help import groups_of, options_of
 from sgns.cli.settings import sweep_jobs
 from sgns.config import UserError
-from sgns_testing.commands import call, composed, python
+from sgns_testing.commands import SHORT, call, composed, python, refusal
+from sgns_testing.commands import sgns as run_sgns
 from sgns_testing.runs import make_run
 
 
@@ -480,3 +481,21 @@ def test_a_home_folder_in_quotes_is_the_home_folder(
     assert f"- {empty_folder}/home/a.h5\n- b~.h5\n" in shown
     done = call("train", 'output="~/first"', "training.max_steps=-1")
     assert done.returncode == 2 and not (empty_folder / "~").exists()
+
+
+def test_a_whole_number_may_have_an_exponent(tmp_path) -> None:
+    assert run_sgns(tmp_path, "simulate", *SHORT, "seed=1e3", "output=run.h5").returncode == 0
+    with Run(tmp_path / "run.h5") as run:
+        assert run.seed == 1000
+
+
+def test_a_value_that_refers_to_itself_is_named(tmp_path) -> None:
+    line = refusal(tmp_path, "simulate", "scene.speed=${scene.speed}")
+    assert line == "sgns simulate: scene.speed=${scene.speed}: this refers to itself; give a value\n"
+
+
+def test_wrong_values_of_a_dataset_are_named(tmp_path) -> None:
+    assert "format" in refusal(tmp_path, "train", "dataset.format=[[1, 2], [3]]")
+    assert "dataset.draw.a is 1; it must be a list" in refusal(
+        tmp_path, "evaluate", "checkpoint=x.ckpt", "dataset.draw={a: 1}"
+    )
