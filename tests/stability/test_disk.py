@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import torch
 from kills import broken, same
 
 from sgns.data.dataset import Dataset
@@ -278,6 +279,12 @@ def placed(name: str, here: Path, undisturbed: Undisturbed) -> list[str]:
     needed = [one for one in ("network", "polynomial") if f"{{{one}}}" in " ".join(COMMANDS[name])]
     places = {"here": here} | {one: undisturbed(one) for one in needed}
     return [argument.format(**places) if "/" in argument else argument for argument in COMMANDS[name]]
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    """Whatever tests of other files have left: results are compared to the bit."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sgns.data.dataset import Dataset
-from sgns_testing.commands import SMALL, TRAIN, call, environment, small_dataset
+from sgns_testing.commands import SMALL, TRAIN, environment, small_dataset
 
 pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="hydra-joblib-launcher is not installed")
 pytest.importorskip(
@@ -27,7 +27,8 @@ POLYNOMIAL = ["model=polynomial", "training.noises=[0.1]", "training.penalties=[
 
 
 def in_its_own_process(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """A command; joblib's workers would go on in the folder of the test before."""
+    """A command. Joblib's workers would go on in the folder of the test before, and submitit's would look for modules
+    that other tests have made."""
     command = [sys.executable, "-m", "sgns", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=200, env=environment())
 
@@ -36,7 +37,7 @@ def in_its_own_process(*arguments: str) -> subprocess.CompletedProcess[str]:
     "launcher", [SUBMITIT, pytest.param(JOBLIB, marks=pytest.mark.long)], ids=lambda one: one[1]
 )
 def test_shares_of_a_campaign(launcher: list[str], empty_folder: Path) -> None:
-    done = (in_its_own_process if launcher == JOBLIB else call)("simulate", *launcher, *CAMPAIGN)
+    done = in_its_own_process("simulate", *launcher, *CAMPAIGN)
     assert done.returncode == 0, done.stderr
     dataset = Dataset.open(Path("made"))
     assert sum(len(dataset.runs(split)) for split in ("train", "validation", "test")) == 3
@@ -53,6 +54,6 @@ def test_trainings_of_which_one_fails_and_evaluations(empty_folder: Path) -> Non
     assert done.stderr.endswith("; 1 of 2 jobs failed, the others are kept\n")
     (_, line) = Path("out/sweep.csv").read_text().splitlines()
     assert "out/1/best.ckpt" in line
-    done = call("evaluate", *SUBMITIT, "checkpoint=out/1/best.ckpt", "output=report")
+    done = in_its_own_process("evaluate", *SUBMITIT, "checkpoint=out/1/best.ckpt", "output=report")
     assert done.returncode == 0, done.stderr
     assert Path("report/0/report.html").is_file()
