@@ -16,12 +16,6 @@ from .scene import Scene
 from .state import SceneError
 from .tool_geometry import mesh_asymmetry
 
-DILATION = 2.0
-"""Volume strain per shear, over the ln of the density, of crowded particles (`Grid.dilation`). Chosen by one cut:
-0.5, 1 and 4 leave −3.3, −2.2 and −0.1 % of volume where 2 leaves −0.7 %."""
-ENOUGH = 2.0
-"""Particles per cell from which on they hardly crowd."""
-
 # --- Where the grid lies: its nodes, walls and ghost layers for a scene ---------------------------------
 
 
@@ -71,8 +65,6 @@ def lay_grid(
     behind = [round(0.5 * (c - s / h), 6) for s, c in zip(bed.size[:2], cells, strict=True)]
     grid.beyond_walls = vec3(*(1.0 / _part_in_bin(distance) for distance in (*behind, 0.0)))
     grid.speed_limit = h / time_step
-    # Where particles keep their own volume changes, as in published scenes, their volume is not corrected either.
-    grid.dilation = DILATION * scene.volume_averaging if bed.particles_per_cell < ENOUGH else 0.0
     return grid, ghosts
 
 

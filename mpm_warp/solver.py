@@ -298,7 +298,7 @@ class Solver:
             if field is not None and field.shape == (padded, 4):
                 self._cooperative_field.assign(field)
         self._top_speed, self._fault = own(zeros(real, 1)), own(zeros(int, 4))
-        self._keep, self.grid.substep = zeros(real, 2), zeros(int, 1)
+        self._keep, self.grid.substep = zeros(real, 1), zeros(int, 1)
         periodic = (axis for axis, kind in enumerate(scene.bed.walls.conditions) if kind == "periodic")
         self._turns = {axis: zeros(int, n) for axis in periodic}
         for axis, turns in self._turns.items():
@@ -430,8 +430,7 @@ class Solver:
                 raise self._stopped(index, substep, fastest, self._limits.too_fast(top))
             steps = min(left, steps_to_remap(self.scene, self.time_step, max(body_speed, top)))
             left -= steps
-            span = steps * self.time_step
-            self._keep.assign(np.array([math.exp(-span / self.scene.memory_time), span]))
+            self._keep.fill_(math.exp(-steps * self.time_step / self.scene.memory_time))
             yield Job(self._steps, steps)
         self._check(index)
 

@@ -295,18 +295,10 @@ FAR = 0.1
 
 @cache
 def loose_soil(real: type) -> SimpleNamespace:
-    """Warp functions in precision `real` that correct ln J by the density on the grid. Of particles whose ln J is above
-    their bond, which bear no stress:
+    """Warp functions in precision `real` for particles whose ln J is above their bond, which bear no stress:
 
     - `apart(above)`: 0 for dense soil to 1 for soil that is loose for good, by ln J above its bond,
     - `volume(ln_j, base, f, nodes, grid)`: its ln J.
-
-    Of the others:
-
-    - `dilation(gradient, density, ln_j, grid)`: how fast ln J is to fall where particles crowd [1/s], by the velocity
-      gradient and the density around over that of an undisturbed bed. Few particles per cell crowd where soil flows
-      without their ln J changing. Like sand above its critical density such soil expands as it is sheared: the fall of
-      ln J gives it a pressure, to which it gives way. Soil at rest stays as it is.
 
     `base` is the lowest of its 27 nodes, `f` its offset from there [cells], and the fourth number of `nodes` is the
     density over that of an undisturbed bed. With a dense node among them the particle is at a surface, or next to a
@@ -316,8 +308,7 @@ def loose_soil(real: type) -> SimpleNamespace:
     not, which would grow from bounce to bounce.
     """
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    mat33, Grid = wp.types.matrix((3, 3), real), grid_struct(real)
-    weights = splines(real).weights
+    Grid, weights = grid_struct(real), splines(real).weights
 
     @wp.func
     def ramp(x: real, low: real, high: real):
@@ -369,11 +360,4 @@ def loose_soil(real: type) -> SimpleNamespace:
         own = ramp(densest, real(LOOSE), real(DENSE))
         return own * near_dense - (real(1.0) - own) * wp.log(mean)
 
-    @wp.func
-    def dilation(gradient: mat33, density: real, ln_j: real, grid: Grid):
-        excess = wp.min(wp.log(wp.max(density, real(1.0))) + ln_j, real(0.5))
-        shear = real(0.5) * (gradient + wp.transpose(gradient))
-        shear = shear - wp.diag(vec3(wp.trace(shear) / real(3.0)))
-        return grid.dilation * wp.max(excess, real(0.0)) * wp.sqrt(real(2.0) * wp.ddot(shear, shear))
-
-    return SimpleNamespace(apart=apart, volume=volume, dilation=dilation)
+    return SimpleNamespace(apart=apart, volume=volume)

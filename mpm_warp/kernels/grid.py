@@ -39,7 +39,6 @@ def grid_struct(real: type) -> type:
         density_per_mass: real  # of a node: soil's density there over that of an undisturbed bed [1/kg]
         beyond_walls: vec3  # whole around a node on an x wall, a y wall, the floor over its part in the bin
         speed_limit: real  # one cell per step [m/s]
-        dilation: real  # of crowded soil: volume strain per shear and ln of its density; 0: none
 
     return Grid
 

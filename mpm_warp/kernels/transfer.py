@@ -48,7 +48,7 @@ def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, ato
     push = contact(real, contact_law or ContactLaw(), atomic)
     update, kirchhoff, can_tear = law.update, law.kirchhoff, effects.can_tear
     fading = fluidity(real).fading
-    apart, loose_volume, dilation = loose_soil(real).apart, loose_soil(real).volume, loose_soil(real).dilation
+    apart, loose_volume = loose_soil(real).apart, loose_soil(real).volume
     spline = splines(real)
     base_and_offset, weights, moments = spline.base_and_offset, spline.weights, spline.moments
     lanes = row_operations(real, gpu=atomic)
@@ -260,7 +260,7 @@ def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, ato
     @fused_kernel
     def from_grid(p: int, particles: Particles, grid: Grid, before: vec4s, keep: reals):
         # The particle's own velocity changes by what changed on the grid; of the part that the grid does not resolve
-        # the first number of `keep` is the share that is left; the second is the time since the last remap.
+        # the share `keep` is left.
         base, f = base_and_offset(particles.home[p], grid)
         wx = weights(f[0])
         wy = weights(f[1])
@@ -276,10 +276,6 @@ def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, ato
         if wp.static(effects.separation):
             if ln_j > bond_of(p, particles):
                 particles.log_volume[p] = loose_volume(ln_j, base, f, before, grid)
-            elif grid.dilation > real(0.0):
-                particles.log_volume[p] = ln_j - keep[1] * dilation(
-                    particles.velocity_gradient[p], smooth[3], ln_j, grid
-                )
         v = particles.velocity[p]
         particles.velocity[p] = u + keep[0] * (v - vec3(smooth[0], smooth[1], smooth[2]))
 

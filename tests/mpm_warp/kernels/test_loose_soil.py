@@ -147,38 +147,3 @@ def test_grains_that_fell_one_by_one_lie_as_dense_as_a_bed():
     bed = Rain(size, 0.02, particles_per_cell=4, headroom=3.0, initial_stress="none", walls=walls)
     *_, last = Solver(Scattered(bed=bed, duration=2.0)).frames()
     assert np.median(last.position[:, 2] + 0.08) == pytest.approx(0.04, rel=0.06)
-
-
-@dataclass(frozen=True)
-class Sheared(Scene):
-    """Soil without gravity that shears at 1/s everywhere."""
-
-    kind: str = "sheared"
-
-    def initial_velocities(self) -> np.ndarray:
-        height = self.filled[0][:, 2]
-        return np.stack([height - height.mean(), 0.0 * height, 0.0 * height], axis=1)
-
-
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize(
-    ("per_cell", "stretch", "fall"), [(1.0, 0.9, -6.0 * np.log(0.9)), (1.0, 1.0, 0.0), (4.0, 0.9, 0.0)]
-)
-def test_few_crowded_particles_dilate_as_they_are_sheared(per_cell, stretch, fall, precision):
-    """ln J falls by twice the shear and the ln of their density; where they do not crowd, or are many, it does not."""
-    size, time = (0.32, 0.32, 0.16), 0.002
-    bed = Stretched(size, 0.02, per_cell, headroom=0.3, initial_stress="none", stretch=stretch)
-    solver = Solver(Sheared(bed=bed, gravity=0.0, duration=time, frame_rate=1.0 / time), precision=precision)
-    *_, last = solver.frames()
-    inner = np.all(np.abs(last.position - [0.16, 0.16, -0.09]) < [0.07, 0.07, 0.04], axis=1)
-    ln_j = solver.particles.log_volume.numpy()[inner]
-    np.testing.assert_allclose(np.median(ln_j), -fall * time, atol=3e-5)
-
-
-def test_particles_that_keep_their_own_volume_do_not_dilate():
-    """As in published scenes."""
-    bed = Stretched((0.32, 0.32, 0.16), 0.02, 1.0, headroom=0.3)
-    dilations = [
-        float(Solver(Sheared(bed=bed, volume_averaging=share)).grid.dilation) for share in (0.0, 1.0)
-    ]
-    assert dilations == [0.0, 2.0]
