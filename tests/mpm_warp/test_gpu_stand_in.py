@@ -63,6 +63,7 @@ def test_what_is_wrong_is_found(kernel, parts, conflicts, outside):
     assert bool(report.first) == bool(conflicts + outside)
 
 
+@pytest.mark.long
 def test_no_two_items_of_a_launch_meet_but_in_atomic_sums():
     found = {}
     for atomic in (True, False):

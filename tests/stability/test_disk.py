@@ -66,6 +66,7 @@ def test_simulate(tmp_path, empty_folder) -> None:
     assert files(tmp_path) == {"run.h5": b"earlier"}
 
 
+@pytest.mark.long
 def test_a_campaign(tmp_path, empty_folder) -> None:
     arguments = ["simulate", f"dataset.path={tmp_path / 'a'}", *CAMPAIGN]
     assert "3 of 3 runs could not be made" in limited(20_000, *arguments)
@@ -85,6 +86,7 @@ def test_reduce_and_train(tmp_path, limit, empty_folder) -> None:
     assert not [path for path in tmp_path.rglob("*") if path.name.endswith(".partial")]
 
 
+@pytest.mark.long
 def test_a_training_whose_disk_fills_up_goes_on_when_there_is_space(tmp_path, monkeypatch) -> None:
     data = reduced(tmp_path / "data")
 
@@ -132,6 +134,7 @@ UNWRITABLE = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="permissions differ")
 def test_folders_that_may_not_be_written(tmp_path) -> None:
     make_dataset(tmp_path / "data")

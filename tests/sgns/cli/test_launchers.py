@@ -33,9 +33,8 @@ def in_its_own_process(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=200, env=environment())
 
 
-@pytest.mark.parametrize(
-    "launcher", [SUBMITIT, pytest.param(JOBLIB, marks=pytest.mark.long)], ids=lambda one: one[1]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("launcher", [SUBMITIT, JOBLIB], ids=lambda one: one[1])
 def test_shares_of_a_campaign(launcher: list[str], empty_folder: Path) -> None:
     done = in_its_own_process("simulate", *launcher, *CAMPAIGN)
     assert done.returncode == 0, done.stderr

@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 from sgns_testing.commands import environment
 
 TRY = """
@@ -17,6 +19,7 @@ for one in run_cases(quick[::len(quick) // 6], pathlib.Path(sys.argv[1])):
 """
 
 
+@pytest.mark.long
 def test_wrong_inputs_are_refused_in_one_line(tmp_path) -> None:
     """In a process that has no threads yet: it forks."""
     done = subprocess.run(
