@@ -117,6 +117,11 @@ class Basis:
         closure = self.closure and self.closure.to(device)
         return replace(self, **{key: getattr(self, key).to(device) for key in _ARRAYS}, closure=closure)
 
+    def same_modes(self, modes: Tensor) -> bool:
+        """Whether these are its modes (n, r), up to those that are kept with fewer digits."""
+        mine = self.modes
+        return mine.shape == modes.shape and bool((mine - modes).abs().max() <= 1e-3 * mine.abs().max())
+
     def sliced(self, r: int) -> Basis:
         """The basis of the first `r` modes, with the same mean and total variance; a closure is of all of them."""
         if not 1 <= r <= self.num_modes:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,13 +49,13 @@ def pack(reduced: ReducedDataset, folder: Path) -> str:
         raise UserError(f"{folder} is not empty; name another folder, or remove what is there")
     basis = reduced.basis
     step = PRECISION * math.sqrt(12.0 * basis.num_particles / basis.num_modes)
-    runs = [run for split in SPLITS for run in reduced.runs(split)]
-    size = _write(folder / "runs_00.npz", runs, reduced, step)
+    runs = [_with_unseen(run, basis) for split in SPLITS for run in reduced.runs(split)]
+    size = _write(folder / "runs_00.npz", runs, step)
     parts = math.ceil(size / MOST_BYTES)
     if parts > 1:
         for part in range(parts):
             share = runs[part * len(runs) // parts : (part + 1) * len(runs) // parts]
-            _write(folder / f"runs_{part:02d}.npz", share, reduced, step)
+            _write(folder / f"runs_{part:02d}.npz", share, step)
     about = {
         "format": _FORMAT,
         "frame_rate": reduced.frame_rate,
@@ -82,7 +83,16 @@ def pack(reduced: ReducedDataset, folder: Path) -> str:
     )
 
 
-def _write(path: Path, runs: Sequence[ReducedRun], reduced: ReducedDataset, step: float) -> int:
+def _with_unseen(run: ReducedRun, basis: Basis) -> ReducedRun:
+    """The run with what all modes do not see of it; its file is read for that."""
+    if run.path is not None:
+        return replace(run, unseen=np.stack(left_out(run.path, basis, 0), axis=-1))
+    if run.unseen is None:
+        raise UserError(f"{run.name} has no particles: it cannot be packed")
+    return run
+
+
+def _write(path: Path, runs: Sequence[ReducedRun], step: float) -> int:
     """Write some runs, one after the other in every array; returns the size of the file."""
     columns: dict[str, list[np.ndarray]] = {name: [] for name in _SERIES}
     for run in runs:
@@ -91,12 +101,9 @@ def _write(path: Path, runs: Sequence[ReducedRun], reduced: ReducedDataset, step
         unsigned = np.where(small < 0, -2 * small - 1, 2 * small)  # small ones have no bits above
         if unsigned.max() >= 2**32:
             raise UserError(f"{run.name} moves too far to be packed")
-        unseen = run.unseen if run.path is None else np.stack(left_out(run.path, reduced.basis, 0), axis=-1)
-        if unseen is None:
-            raise UserError(f"{run.name} has no particles: it cannot be packed")
         columns["latent"].append(unsigned.transpose(1, 2, 0).astype("u4").ravel())
         columns["pose"].append(run.pose.astype("f4").ravel())
-        columns["unseen"].append(unseen.astype("f4").ravel())
+        columns["unseen"].append(np.asarray(run.unseen, "f4").ravel())
         columns["points"].append(in_body_frame(run.pose[0], run.body_points[0]).astype("f4").ravel())
         for name in ("force", "torque"):
             columns[name].append((getattr(run, name) / _scale(run, name)).astype("f2").ravel())

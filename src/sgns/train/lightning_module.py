@@ -236,9 +236,7 @@ def prepared(
                 f"training.members is {settings.members} and {start_from} has {other.members}; use as many, or "
                 "checkpoint=null"
             )
-        modes = reduced.basis.modes[:, :num_modes]
-        # Shipped ones have fewer digits.
-        if float((given.basis.modes - modes).abs().max()) > 1e-3 * float(modes.abs().max()):
+        if not given.basis.same_modes(reduced.basis.modes[:, :num_modes]):
             raise UserError(
                 f"{start_from} belongs to another basis; use the dataset it was trained on, or "
                 "checkpoint=null"
