@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import NamedTuple
@@ -159,3 +160,18 @@ def test_what_ships_rolls_out(name: str, empty_folder: Path, monkeypatch: pytest
     monkeypatch.setattr(pretrained, "FOLDER", Path(pretrained.__file__).parent)
     done = call("rollout", f"checkpoint={name}", "scene.duration=0.5", "output=new.h5")
     assert done.returncode == 0, done.stderr
+
+
+def test_what_ships_is_as_good_as_its_card_says(empty_folder: Path) -> None:
+    """On the packed test runs of the dataset that it was trained on."""
+    file = ROOT / "src" / "sgns" / "pretrained" / "excavation.ckpt"
+    words = [
+        "dataset=quick_reduced",
+        f"dataset.path={ROOT / 'reduced' / 'quick'}",
+        f"checkpoint={file}",
+        "output=report",
+    ]
+    assert call("evaluate", *words).returncode == 0
+    total = json.loads(Path("report/metrics.json").read_text())["aggregate"]
+    assert total["rmse_total_mm"] == pytest.approx(2.03, abs=0.02)
+    assert total["force_nrmse"] == pytest.approx(0.171, abs=0.002)
