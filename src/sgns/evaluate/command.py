@@ -56,7 +56,8 @@ from sgns.pretrained import checkpoint_file
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout
 from sgns.settings import ModelSettings, model_settings
-from sgns.simulator import Rollout, Simulator
+from sgns.simulator import Simulator
+from sgns.state import Rollout
 
 log = logging.getLogger(__name__)
 
