@@ -22,7 +22,7 @@ from torch import Tensor
 
 from mpm_warp.poses import in_world_frame
 from sgns.config import UserError
-from sgns.model.checkpoint import Surrogate, load_surrogate
+from sgns.model.checkpoint import Surrogate, load_surrogate, pretrained_file
 from sgns.model.dynamics import Step, Stepper, together
 from sgns.model.features import ToolMotion, context_of, markers
 from sgns.model.training_range import FAR, Excess
@@ -35,7 +35,6 @@ from sgns.numbers import (
     is_whole,
     real_array,
 )
-from sgns.pretrained import shipped
 from sgns.state import Rollout, Rollouts, State
 
 # Every step it is looked at whether the tool's pose and its change are far outside the training range; the rest, such
@@ -167,7 +166,7 @@ class Simulator:
         Raises:
             UserError: None of that name ships; the line names those that do.
         """
-        return cls.load(shipped(name), **options)
+        return cls.load(pretrained_file(name), **options)
 
     @property
     def scene(self) -> dict[str, Any]:

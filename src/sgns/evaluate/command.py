@@ -50,9 +50,9 @@ from sgns.evaluate.results import (
     seen_before,
     write_tables,
 )
+from sgns.model.checkpoint import checkpoint_file
 from sgns.model.features import is_wheel
 from sgns.numbers import counted, elapsed, error_hint, error_words
-from sgns.pretrained import checkpoint_file
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout
 from sgns.settings import ModelSettings, model_settings
