@@ -22,8 +22,8 @@ from omegaconf import DictConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
-from mpm_warp.mesh_files import open_file
 from mpm_warp.poses import in_body_frame
+from mpm_warp.settings import open_file
 from sgns.config import UserError
 from sgns.data.check import scene_problems
 from sgns.data.dataset import Dataset
