@@ -12,9 +12,9 @@ import warp as wp
 from .bed import PADDING
 from .bodies import MeshBody
 from .kernels.grid import grid_struct, mirror_layers, periodic_layers
+from .kernels.signed_distance import mesh_asymmetry
 from .scene import Scene
 from .state import SceneError
-from .tool_geometry import mesh_asymmetry
 
 # --- Where the grid lies: its nodes, walls and ghost layers for a scene ---------------------------------
 

@@ -18,9 +18,8 @@ from .poses import (
     rotation_vectors,
     sampled_poses,
 )
-from .settings import Settings, setting, settings, short
+from .settings import Settings, odd_size, place_unit, setting, settings, short
 from .state import SceneError
-from .tool_geometry import odd_size, place_unit
 
 CUT_LENGTH = 0.4
 """Horizontal travel of the published cuts [m]."""

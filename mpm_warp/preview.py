@@ -15,8 +15,7 @@ from .poses import rotation_matrices, rotation_vectors
 from .rigid_body import longest_step
 from .scene import Companion, Scene
 from .scenes import Wheel
-from .settings import likely_radians
-from .tool_geometry import Odd, odd_size, odd_times, place_unit
+from .settings import Odd, likely_radians, odd_size, odd_times, place_unit
 
 _NOTICED = 0.25
 """Depth of a tool's lowest point at the start that is told of [grid spacings]."""

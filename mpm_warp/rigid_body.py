@@ -29,13 +29,12 @@ from .kernels.contact import (
     free_step,
 )
 from .kernels.grid import adding_up
-from .kernels.signed_distance import shape_data
+from .kernels.signed_distance import shape_data, thickening
 from .launch import Launch, Threads
 from .poses import in_world_frame, rotation_matrices, rotation_vectors, sampled_poses
 from .scene import MOST_COURANT, Companion, Scene
 from .settings import short
 from .state import SceneError, SolverStopped
-from .tool_geometry import thickening
 
 if TYPE_CHECKING:
     from .effects import Effects

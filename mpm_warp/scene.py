@@ -14,15 +14,15 @@ import numpy as np
 
 from .bed import Bed, digest
 from .bodies import Axle, Cylinder, MeshBody, Tool
+from .kernels.signed_distance import HOLDS, distances, thickening, thin_walls
 from .material import Material
 from .motions import Moved, Other, as_path
 from .poses import (
     in_body_frame,
     rotation_matrices,
 )
-from .settings import Settings, build, setting, settings, short
+from .settings import Settings, build, odd_size, setting, settings, short
 from .state import SceneError, Soil
-from .tool_geometry import HOLDS, distances, odd_size, thickening, thin_walls
 
 MOST_FRAMES = 1_000_000
 MOST_COURANT = 0.8

@@ -11,13 +11,13 @@ import numpy as np
 
 from .bed import Bed, Walls, digest
 from .bodies import Axle, Box, Cylinder, MeshBody, Plate, Tool
+from .kernels.signed_distance import thin_walls
 from .material import Material
 from .motions import Passes, along_and_across, as_loads, curved, ramp, sinkage, tip_poses
 from .poses import about_y, about_z_y
 from .scene import Scene
-from .settings import same, setting, settings
+from .settings import odd_size, same, setting, settings
 from .state import SceneError
-from .tool_geometry import odd_size, thin_walls
 
 _PATH = "rows t [s], x, y, z [m], qx, qy, qz, qw of the body's centre of mass, or of tool.origin"
 _SHARE = ", a share of the bin's length"

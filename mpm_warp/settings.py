@@ -1,19 +1,25 @@
 """What a setting is: its type, unit, range, default and one line of help stand in one place, its dataclass.
 
 The checks, what they say, and the help of a class come from there. Pydantic checks each value; relations between values
-are checked by the classes themselves.
+are checked by the classes themselves. Here are also the units that numbers were likely given in, and how a file that a
+person names is read.
 """
 
 from __future__ import annotations
 
 import inspect
+import os
+import stat
 from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cache
+from pathlib import Path
 from types import UnionType
 from typing import (
+    TYPE_CHECKING,
     Annotated,
     Any,
+    BinaryIO,
     ClassVar,
     Literal,
     NamedTuple,
@@ -29,6 +35,9 @@ from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationE
 from typing_extensions import Self, dataclass_transform  # in `typing` from Python 3.11
 
 from .state import SceneError
+
+if TYPE_CHECKING:
+    from .bodies import Tool
 
 T = TypeVar("T")
 _CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True)
@@ -359,3 +368,122 @@ def short(value: Any) -> str:
 
 
 _PLAIN = (list.__repr__, tuple.__repr__, dict.__repr__)
+
+
+# --- Units: the one that a path or a tool was likely given in, where its numbers cannot be metres and seconds
+
+
+_LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
+_SHORT = {"millimetres": "mm", "centimetres": "cm", "inches": "in"}
+_TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+_LONG = 50.0
+"""What is so many times longer or shorter than what it belongs to, is odd."""
+_CLOCK = 1e8
+"""Seconds since 1970 in the year 1973."""
+
+
+class Odd(NamedTuple):
+    """What is odd about numbers, and whether nobody can mean it."""
+
+    words: str
+    sure: bool = False
+
+
+def odd_size(body: Tool, size: tuple[float, float, float], open_sides: bool) -> Odd | None:
+    """What is odd about a tool in a bin of `size` [m]; None if nothing is. With `open_sides` it may be wider than the
+    bin. One up to ten times as long as the bin may have a long handle."""
+    kept = [0, 2] if open_sides else [0, 1, 2]
+    side, room = float(np.ptp(body.outline(), axis=0)[kept].max()), max(size[axis] for axis in kept)
+    if room / _LONG <= side <= room:
+        return None
+    way = "longer than" if side > room else "less than 1/50 of"
+    found = f"the tool is {side:.3g} m long, {way} the bin ({room:g} m)"
+    taken = next((name for name, short in _SHORT.items() if short == getattr(body, "unit", "m")), "metres")
+    metres = _LENGTHS.get(taken, 1.0)
+    likely = _likely(_LENGTHS, lambda scale: room / _LONG <= scale / metres * side <= room)
+    if likely:
+        words = (
+            f"{found}: its numbers look like {likely} and are taken as {taken} (of a mesh: scene.tool.unit)"
+        )
+        return Odd(words, side > 10.0 * room)
+    if room / _LONG <= 1e3 * side <= room:
+        return Odd(
+            f"{found}: it was made a thousand times too small (of a mesh: scene.tool.unit, scale)", True
+        )
+    return Odd(f"{found}; lengths are in metres", side > 10.0 * room)
+
+
+def place_unit(places: np.ndarray, size: tuple[float, float, float]) -> str:
+    """The unit that positions (k, 3) of a path look like in a bin of `size` [m]; empty where it may be metres."""
+    middle = np.array([0.5 * size[0], 0.5 * size[1], 0.0])
+    room = np.array([size[0], size[1], max(size)])
+
+    def fits(scale: float) -> bool:
+        near = scale * places
+        return bool((np.abs(near - middle) <= room).all()) and np.abs(near).max() >= 0.1 * max(size)
+
+    return "" if (np.abs(places - middle) <= room).all() else _likely(_LENGTHS, fits)
+
+
+def odd_times(times: np.ndarray, duration: float) -> Odd | None:
+    """What is odd about the times of a path's rows in a run of `duration` [s]; None if nothing is."""
+    first, last = float(times[0]), float(times[-1])
+    found = f"the path's times are {first:.10g} to {last:.10g}, the run's 0 to {duration:.4g} s"
+    likely = _likely(_TIMES, lambda scale: 0.1 <= scale * last / duration <= 10.0)
+    unit = f"; they look like {likely} and are taken as seconds" if likely else ""
+    if len(times) < 2:
+        return None
+    if first >= _CLOCK:
+        return Odd(
+            f"{found}: they look like those of a clock; subtract the first from all (in seconds)", True
+        )
+    if first >= duration or last <= 0.0:
+        return Odd(f"{found}: the tool does not move{unit}", bool(likely))
+    if last - first > _LONG * duration:
+        used = 100.0 * (duration - first) / (last - first)
+        return Odd(f"{found}: only the first {used:.2g} % is used{unit}", bool(likely))
+    if _LONG * (last - first) < duration:
+        return Odd(f"{found}: the tool rests for nearly all of it; are the times in seconds?")
+    return None
+
+
+def _likely(units: dict[str, float], fits: Callable[[float], bool]) -> str:
+    return " or ".join(unit for unit, scale in units.items() if fits(scale))
+
+
+# --- Files that a person names: read whole, but never without bound ---------------------------------------
+
+MOST_BYTES = 1 << 30
+"""Of a file that is read whole."""
+
+
+def open_file(path: Path, most: int = MOST_BYTES) -> BinaryIO:
+    """A file, open for reading.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is larger than `most` bytes, or a pipe or device, which may never end.
+    """
+    # Without this flag opening a pipe waits for somebody to write to it.
+    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0)))
+    status = os.fstat(file.fileno())
+    if stat.S_ISREG(status.st_mode) and status.st_size <= most:
+        return file
+    file.close()
+    if stat.S_ISREG(status.st_mode):
+        raise ValueError(f"it is larger than {most / 1e6:.0f} MB")
+    raise ValueError("it is not a file but a pipe or device")
+
+
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+    """Content of a file; errors as `open_file`."""
+    with open_file(path, most) as file:
+        content = file.read(most + 1)  # some files of the system say that they are empty, and never end
+    if len(content) > most:
+        raise ValueError(f"it is larger than {most / 1e6:.0f} MB")
+    return content
+
+
+def read_text(path: Path, most: int = MOST_BYTES) -> str:
+    """Content of a text file in UTF-8, with or without a byte order mark; errors as `read_bytes`."""
+    return read_bytes(path, most).decode("utf-8-sig")

@@ -15,9 +15,8 @@ import warp as wp
 from .discretisation import half, initial_particles, lay_grid, require_symmetry
 from .effects import Effects
 from .kernels.contact import body_struct, node_contact
-from .kernels.fluidity import soil_parameters
+from .kernels.fluidity import nonlocal_launches, soil_parameters, wall_sink
 from .kernels.grid import GhostNodes, adding_up, ghost_kernels, grid_step, particle_struct
-from .kernels.nonlocal_fluidity import nonlocal_launches, wall_sink
 from .kernels.transfer import transfer
 from .launch import Executor, Job, Launch, Program, SideBySide, Threads, find_device, run_concurrently
 from .limits import PhysicalLimits, require_memory, steps_to_remap, substeps_per_frame, top_body_speed
@@ -270,7 +269,7 @@ class Solver:
             soil = {name: values[self._half.kept] for name, values in soil.items()}
         self._soil = soil_parameters(real, scene.material, max(scene.bed.size))
         n, node_count = len(soil["position"]), self.grid.nx * self.grid.ny * self.grid.nz
-        padded = node_count + 1  # see kernels/node_rows.py
+        padded = node_count + 1  # see kernels/grid.py
         struct: Any = particle_struct(real)
         given: dict[str, int | np.ndarray] = {
             "home": n,

@@ -24,8 +24,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from .fluidity import fluidity, soil_struct
-from .grid import grid_struct
-from .node_rows import splines
+from .grid import grid_struct, splines
 
 if TYPE_CHECKING:
     from ..effects import Effects

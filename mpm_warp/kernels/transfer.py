@@ -20,8 +20,7 @@ from ..launch import SceneKernel
 from .constitutive import constitutive, loose_soil
 from .contact import ContactLaw, body_struct, contact
 from .fluidity import fluidity, soil_struct
-from .grid import grid_struct, particle_struct
-from .node_rows import row_operations, splines
+from .grid import grid_struct, particle_struct, row_operations, splines
 
 if TYPE_CHECKING:
     from ..effects import Effects
@@ -203,7 +202,7 @@ def transfer(real: type, effects: "Effects", contact_law: ContactLaw | None, ato
     # A kernel of its own: in one with the transfer the C++ compiler makes both slower.
     @fused_kernel
     def material(p: int, particles: Particles, grid: Grid, soil: Soil):
-        # What `update` means by its last number; the excess is what cooperative flow adds (nonlocal_fluidity.py).
+        # What `update` means by its last number; the excess is what cooperative flow adds (fluidity.py).
         g = real(0.0)
         if wp.static(effects.nonlocality):
             g = particles.excess[p]

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from mpm_warp import Scene
-    from sgns.simulator import Rollout, Simulator
+    from sgns.simulator import Simulator
+    from sgns.state import Rollout
 
 
 log = logging.getLogger(__name__)

@@ -11,9 +11,8 @@ import copy
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,171 +21,27 @@ import torch
 from torch import Tensor
 
 from mpm_warp.poses import in_world_frame
-from mpm_warp.settings import short_repr
 from sgns.config import UserError
-from sgns.data.surface import Surface, soil_surface
-from sgns.model.checkpoint import Surrogate, load_surrogate
+from sgns.model.checkpoint import Surrogate, load_surrogate, pretrained_file
 from sgns.model.dynamics import Step, Stepper, together
 from sgns.model.features import ToolMotion, context_of, markers
 from sgns.model.training_range import FAR, Excess
 from sgns.numbers import (
     check_pose,
     check_poses,
-    counted,
     elapsed,
     finite_array,
     first_pose,
     is_whole,
     real_array,
 )
-from sgns.pretrained import shipped
-from sgns.reduction.basis import Basis
+from sgns.state import Rollout, Rollouts, State
 
 # Every step it is looked at whether the tool's pose and its change are far outside the training range; the rest, such
 # as its lowest point, takes longer and is looked at every so many steps.
 _LOOK_EVERY = 30
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
 _SETTLING = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """The bed and the tool at one frame.
-
-    Attributes:
-        frame: 0 at the reset.
-        latent: Modes [m], shape (r, 3).
-        force: By the soil on the tool over the last frame [N], world frame, shape (3,); zero at the reset.
-        torque: About the tool's centre of mass [N m], shape (3,).
-        pose: Tool's centre of mass [m] and quaternion x, y, z, w, shape (7,).
-        force_spread: With `spread`, half the width of the band around the force that is to hold 90 % [N], shape (3,);
-            else None.
-        latent_spread: Likewise of the modes [m], shape (r, 3).
-    """
-
-    def __repr__(self) -> str:
-        return f"{short_repr(self)[:-1]}, outside={self.outside:.3g})"
-
-    frame: int
-    latent: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
-    pose: np.ndarray
-    _basis: Basis = field(repr=False)
-    _scene: Mapping[str, Any] = field(repr=False)
-    _excess: Callable[[], Excess | None] = field(repr=False)
-    force_spread: np.ndarray | None = None
-    latent_spread: np.ndarray | None = None
-
-    @property
-    def outside(self) -> float:
-        """How far this frame is from all that the training runs covered [1]: the distance of the worst of the tool's
-        pose and motion, the soil's modes and their velocity, and the context from its training range, in widths of
-        that range. 0: inside every range; above 0.05 the answer is a guess; NaN: the tool is nowhere yet."""
-        found = self._excess()
-        return np.nan if found is None else float(found.amount[-1])
-
-    def soil(self) -> np.ndarray:
-        """Positions of all particles [m], shape (n, 3); decoded when asked for."""
-        return self._basis.inverse(self.latent).numpy()
-
-    def surface(self) -> Surface:
-        """The soil's surface: x (nx,), y (ny,) and heights z (nx, ny) [m]; as `Run.surface`."""
-        return soil_surface(self.soil(), self._scene)
-
-
-def require_index(name: str, index: Any, count: int) -> None:
-    """Refuse what is no index of so many."""
-    if not is_whole(index) or not -count <= index < count:
-        raise UserError(f"{name} is {index!r}; there are {counted(count, name)}: 0 to {count - 1}")
-
-
-@dataclass(frozen=True, eq=False)
-class Rollout:
-    """A whole tool path.
-
-    Attributes:
-        latent: Modes [m], shape (T, r, 3), float64.
-        force: By the soil on the tool [N], shape (T, 3).
-        torque: About its centre of mass [N m], shape (T, 3).
-        poses: Of the tool, shape (T, 7); predicted where the tool is free.
-        body_points: World frame [m], shape (T, M, 3).
-        wall_time_s: Time of all steps, force included, decoding not [s].
-        force_spread: As of `State`, shape (T, 3), or None.
-        latent_spread: Shape (T, r, 3), or None.
-    """
-
-    def __repr__(self) -> str:
-        return f"{short_repr(self)[:-1]}, outside={self.outside:.3g})"
-
-    latent: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
-    poses: np.ndarray
-    body_points: np.ndarray
-    wall_time_s: float
-    _basis: Basis = field(repr=False)
-    _scene: Mapping[str, Any] = field(repr=False)
-    _excess: Callable[[], Excess | None] = field(repr=False)
-    force_spread: np.ndarray | None = None
-    latent_spread: np.ndarray | None = None
-
-    @cached_property
-    def excess(self) -> Excess | None:
-        """How far every frame is outside the training runs' range, see `State.outside`, and in what; None: a
-        predicted tool is nowhere."""
-        return self._excess()
-
-    @property
-    def outside(self) -> float:
-        """The largest of all frames, as `State.outside`."""
-        return np.nan if self.excess is None else self.excess.largest
-
-    def soil(self, frame: int = -1) -> np.ndarray:
-        """Positions of all particles at a frame, the last one by default [m], shape (n, 3); decoded when asked for."""
-        require_index("frame", frame, len(self.latent))
-        return self._basis.inverse(self.latent[frame]).numpy()
-
-    def surface(self, frame: int = -1) -> Surface:
-        """The soil's surface there, as `State.surface`."""
-        return soil_surface(self.soil(frame), self._scene)
-
-
-@dataclass(frozen=True, eq=False)
-class Rollouts:
-    """Many tool paths: as of `Rollout`, with B before every shape; `wall_time_s` is that of all of them."""
-
-    __repr__ = short_repr
-
-    latent: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
-    poses: np.ndarray
-    wall_time_s: float
-    _basis: Basis = field(repr=False)
-    _scene: Mapping[str, Any] = field(repr=False)
-    _excess: Callable[..., Excess | None] = field(repr=False)
-    force_spread: np.ndarray | None = None
-    latent_spread: np.ndarray | None = None
-
-    @cached_property
-    def outside(self) -> np.ndarray:
-        """Of every path the largest of all frames, as `Rollout.outside`, shape (B,); computed when asked for."""
-        each = [
-            self._excess(path, latent=latent) for path, latent in zip(self.poses, self.latent, strict=True)
-        ]
-        return np.array([np.nan if found is None else found.largest for found in each])
-
-    def soil(self, path: int, frame: int = -1) -> np.ndarray:
-        """Positions of all particles on a path at a frame, the last one by default [m], shape (n, 3); decoded when
-        asked for."""
-        for name, index, count in zip(("path", "frame"), (path, frame), self.latent.shape, strict=False):
-            require_index(name, index, count)
-        return self._basis.inverse(self.latent[path, frame]).numpy()
-
-    def surface(self, path: int, frame: int = -1) -> Surface:
-        """The soil's surface there, as `State.surface`."""
-        return soil_surface(self.soil(path, frame), self._scene)
 
 
 class _Place(NamedTuple):
@@ -311,7 +166,7 @@ class Simulator:
         Raises:
             UserError: None of that name ships; the line names those that do.
         """
-        return cls.load(shipped(name), **options)
+        return cls.load(pretrained_file(name), **options)
 
     @property
     def scene(self) -> dict[str, Any]:

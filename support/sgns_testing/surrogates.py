@@ -12,7 +12,7 @@ from sgns.evaluate.metrics import VectorErrors
 from sgns.evaluate.results import Scores
 from sgns.reduction.basis import Basis
 from sgns.reduction.pca import IncrementalPCA
-from sgns.simulator import Rollout
+from sgns.state import Rollout
 from sgns_testing.runs import make_run
 
 

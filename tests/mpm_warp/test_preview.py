@@ -147,7 +147,9 @@ def test_what_is_refused_for_its_unit_names_it(make, words):
 def test_walls_are_measured_once(monkeypatch):
     """Rays through a mesh of many triangles take a while, and several ask."""
     asked = []
-    monkeypatch.setattr("mpm_warp.tool_geometry.wall_kernel", lambda: asked.append(1) or wall_kernel())
+    monkeypatch.setattr(
+        "mpm_warp.kernels.signed_distance.wall_kernel", lambda: asked.append(1) or wall_kernel()
+    )
     fine = Bed(size=(0.8, 0.6, 0.15), spacing=0.02, particles_per_cell=8.0)
     scene = body(ROWS - [0, 0, 0, 0.12], tool=mesh(0.4), bed=fine)  # it starts in the soil
     assert any("thinnest part is 20 mm" in line for line in Preview.of(scene).warnings)

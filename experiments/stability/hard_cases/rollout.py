@@ -17,7 +17,8 @@ from sgns.data.run import Run
 from sgns.model.training_range import NOTEWORTHY
 from sgns.reduction.reduce import ReducedDataset, ReducedRun
 from sgns.rollout import write_rollout
-from sgns.simulator import Rollout, Simulator
+from sgns.simulator import Simulator
+from sgns.state import Rollout
 
 from .measures import unsaid
 from .networks import new_folder, quick_data, quick_network, simulator_of, synthetic_data, synthetic_network

@@ -20,7 +20,8 @@ from uuid import uuid4
 import numpy as np
 from filelock import FileLock, Timeout
 
-from mpm_warp import mesh_files
+from mpm_warp.settings import open_file, read_bytes
+from mpm_warp.settings import read_text as text_of
 from sgns.config import UserError
 
 try:
@@ -158,7 +159,7 @@ def _lock_file(path: Path) -> Path:
 
 def _holder(hidden: Path) -> str:
     """Who has a lock, in words."""
-    with suppress(OSError, ValueError), mesh_files.open_file(hidden) as file:
+    with suppress(OSError, ValueError), open_file(hidden) as file:
         pid, host = file.read(1000).decode("ascii").split()
         return f"process {int(pid)}" + (f" on {host}" if host != socket.gethostname() else "")
     return "another process"
@@ -236,7 +237,7 @@ def remove_abandoned(path: Path) -> None:
         if not (found.name.startswith(start) and found.name.endswith(_SUFFIX)):
             continue
         if _file_type(found) == stat.S_IFREG:  # others are none of ours; opening a pipe may never end
-            with suppress(OSError, ValueError), mesh_files.open_file(found, ANY_SIZE) as file:
+            with suppress(OSError, ValueError), open_file(found, ANY_SIZE) as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 found.unlink()
                 log.info("removed %s, left by a process that was killed", found)
@@ -290,13 +291,13 @@ ANY_SIZE = 1 << 62
 def read_text(path: Path, wrong: str, advice: str, most: int = _MOST_BYTES) -> str:
     """Content of a text file in UTF-8, of at most so many bytes."""
     with _readable(path, wrong, advice):
-        return mesh_files.read_text(path, most)
+        return text_of(path, most)
 
 
 def read_json(path: Path, wrong: str, advice: str) -> Any:
     """Data of a JSON file."""
     with _readable(path, wrong, advice):
-        return parse_json(mesh_files.read_text(path, _MOST_BYTES))
+        return parse_json(text_of(path, _MOST_BYTES))
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -314,7 +315,7 @@ def parse_json(text: str | bytes) -> Any:
 def read_table(path: Path, wrong: str, advice: str) -> list[dict[str, str]]:
     """Lines of a CSV file by the names in its first line."""
     with _readable(path, wrong, advice):
-        lines = csv.reader(io.StringIO(mesh_files.read_text(path, _MOST_OF_TABLE), newline=""))
+        lines = csv.reader(io.StringIO(text_of(path, _MOST_OF_TABLE), newline=""))
         columns = next(lines, [])
         if len(set(columns)) < len(columns) or not columns:
             raise ValueError("its first line does not name columns, each once")
@@ -331,7 +332,7 @@ def read_table(path: Path, wrong: str, advice: str) -> list[dict[str, str]]:
 def read_arrays(path: Path, wrong: str, advice: str) -> dict[str, np.ndarray]:
     """Arrays of an NPZ file by name, without Python objects; what its parts unfold to counts as its size does."""
     with _readable(path, wrong, advice):
-        packed = io.BytesIO(mesh_files.read_bytes(path, MOST_OF_ARRAYS))
+        packed = io.BytesIO(read_bytes(path, MOST_OF_ARRAYS))
         with zipfile.ZipFile(packed) as archive:
             if sum(part.file_size for part in archive.infolist()) > MOST_OF_ARRAYS:
                 raise ValueError(f"it unfolds to more than {MOST_OF_ARRAYS / 1e6:.0f} MB")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
-from mpm_warp.mesh_files import open_file
+from mpm_warp.settings import open_file
 from sgns.config import UserError
 from sgns.data.files import ANY_SIZE, HiddenFile, remove_abandoned, require_replaceable
 

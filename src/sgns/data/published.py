@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from mpm_warp.mesh_files import open_file
 from mpm_warp.poses import fitted_poses
+from mpm_warp.settings import open_file
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
 from sgns.data.files import read_json

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 
 from mpm_warp import SceneError
-from mpm_warp.mesh_files import MOST_BYTES, open_file
+from mpm_warp.settings import MOST_BYTES, open_file
 from mpm_warp.solids import checked_mesh
 from sgns import __version__
 from sgns.config import UserError

@@ -22,8 +22,8 @@ from omegaconf import DictConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
-from mpm_warp.mesh_files import open_file
 from mpm_warp.poses import in_body_frame
+from mpm_warp.settings import open_file
 from sgns.config import UserError
 from sgns.data.check import scene_problems
 from sgns.data.dataset import Dataset
@@ -50,13 +50,14 @@ from sgns.evaluate.results import (
     seen_before,
     write_tables,
 )
+from sgns.model.checkpoint import checkpoint_file
 from sgns.model.features import is_wheel
 from sgns.numbers import counted, elapsed, error_hint, error_words
-from sgns.pretrained import checkpoint_file
 from sgns.reduction.basis import Basis, reduction_curves
 from sgns.rollout import single_thread, write_rollout
 from sgns.settings import ModelSettings, model_settings
-from sgns.simulator import Rollout, Simulator
+from sgns.simulator import Simulator
+from sgns.state import Rollout
 
 log = logging.getLogger(__name__)
 

@@ -44,7 +44,8 @@ from sgns.reduction.reduce import ReducedDataset, fit_runs, reduce_dataset
 from sgns.rollout import finite_frames
 from sgns.settings import PointSettings
 from sgns.simulate.scene import asked_effects, decided
-from sgns.simulator import Rollout, Simulator
+from sgns.simulator import Simulator
+from sgns.state import Rollout
 from sgns.train.command import train
 
 log = logging.getLogger(__name__)

@@ -20,7 +20,6 @@ from sgns.data.run_file import require_mesh_was_read
 from sgns.model.dynamics import Dynamics
 from sgns.model.features import slowest_travel
 from sgns.model.training_range import TrainingRange
-from sgns.pretrained import checkpoint_file, is_name, names_in_words
 from sgns.reduction.basis import Basis
 from sgns.reduction.reduce import ReducedDataset
 
@@ -148,7 +147,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     Raises:
         UserError: Missing, truncated, or not a checkpoint of this project, or of a newer one.
     """
-    ships = f"; {names_in_words()}" if is_name(path) else ""
+    ships = f"; {_what_ships()}" if is_plain_name(path) else ""
     path = checkpoint_file(path)
     if (inside := path / "best.ckpt").is_file():
         raise UserError(f"{path} is a folder; use checkpoint={inside}")
@@ -289,6 +288,45 @@ def _require_own_values(state: dict[str, Any]) -> None:
             raise ValueError(f"{name} is not a plain tensor")
         if value.untyped_storage().nbytes() < value.numel() * value.element_size():
             raise ValueError(f"{name} claims more values than there are")
+
+
+# --- Checkpoints that ship with the package, each with its model card; `sgns.ship` makes them -----------
+
+PRETRAINED = Path(__file__).parents[1] / "pretrained"
+"""Folder of `<name>.ckpt` and `<name>.md`."""
+
+
+def pretrained_names() -> list[str]:
+    """Those that ship."""
+    return sorted(file.stem for file in PRETRAINED.glob("*.ckpt"))
+
+
+def pretrained_file(name: str) -> Path:
+    """The file of one that ships.
+
+    Raises:
+        UserError: There is none of that name.
+    """
+    if name not in pretrained_names():
+        raise UserError(f"no pretrained checkpoint is called {name!r}; {_what_ships()}")
+    return PRETRAINED / f"{name}.ckpt"
+
+
+def checkpoint_file(path: str | Path) -> Path:
+    """The file of a checkpoint: a plain name that is no file here may be one that ships."""
+    here = Path(path)
+    ships = is_plain_name(path) and not here.is_file() and here.name in pretrained_names()
+    return pretrained_file(here.name) if ships else here
+
+
+def is_plain_name(path: str | Path) -> bool:
+    """Whether a path has no folder and no ending."""
+    return Path(path).name == str(path) and not Path(path).suffix
+
+
+def _what_ships() -> str:
+    """As part of a sentence."""
+    return f"with the package ship: {', '.join(pretrained_names()) or 'none'}"
 
 
 # --- `training.json`, the numbers of a complete training, beside its checkpoint -------------------------

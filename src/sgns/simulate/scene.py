@@ -20,9 +20,8 @@ from scipy.interpolate import PchipInterpolator
 from mpm_warp import Bed, Decision, Effects, Preview, Scene, SceneError, Soil, Tolerances, effects_for
 from mpm_warp.bed import MOST_HEIGHTS
 from mpm_warp.bodies import Tool
-from mpm_warp.mesh_files import read_bytes, read_text
 from mpm_warp.poses import rotation_matrices
-from mpm_warp.settings import short
+from mpm_warp.settings import read_bytes, read_text, short
 from sgns.config import UserError, flattened
 from sgns.data.files import one_line
 from sgns.data.run import Run

@@ -9,8 +9,8 @@ import warp as wp
 from scipy.optimize import brentq
 
 from mpm_warp import Bed, Effects, Material, Scene, Solver
+from mpm_warp.kernels.fluidity import nonlocal_launches, wall_sink
 from mpm_warp.kernels.grid import GhostNodes
-from mpm_warp.kernels.nonlocal_fluidity import nonlocal_launches, wall_sink
 from mpm_warp.launch import Threads
 from sgns_testing.solvers import change
 

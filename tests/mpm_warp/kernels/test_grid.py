@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from mpm_warp.kernels.node_rows import row_operations
+from mpm_warp.kernels.grid import row_operations
 
 
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])

@@ -11,13 +11,19 @@ import numpy as np
 import pytest
 import torch
 
-from sgns import Run, Simulator, UserError, pretrained
+from sgns import Run, Simulator, UserError, ship
 from sgns.data.check import check_run
-from sgns.pretrained import ship
+from sgns.model import checkpoint
 from sgns_testing.commands import TRAIN, call, refused, sgns, small_dataset
 
 ROOT = Path(__file__).resolve().parents[2]
+SHIPPED = checkpoint.PRETRAINED
 MOST = 20_000_000  # bytes of all together
+
+
+def let_ship_from(patch: pytest.MonkeyPatch, folder: Path) -> None:
+    for module in (checkpoint, ship):
+        patch.setattr(module, "PRETRAINED", folder)
 
 
 class Work(NamedTuple):
@@ -32,7 +38,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Work:
     here, shipped = tmp_path_factory.mktemp("work"), tmp_path_factory.mktemp("pretrained")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sgns.evaluate.report.report_figures", lambda evaluation: [])
-        patch.setattr(pretrained, "FOLDER", shipped)
+        let_ship_from(patch, shipped)
         small_dataset(here / "data" / "quick")
         for words in (
             ["train", *TRAIN, "output=out"],
@@ -47,7 +53,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Work:
 
 @pytest.fixture(autouse=True)
 def _ships(work: Work, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pretrained, "FOLDER", work.shipped)
+    let_ship_from(monkeypatch, work.shipped)
 
 
 def test_it_rolls_out_by_its_name_in_an_empty_folder(work: Work, empty_folder: Path) -> None:
@@ -85,12 +91,12 @@ def test_evaluate_and_train_take_the_name(
 def test_a_file_goes_before_a_name_and_a_name_before_a_folder(work: Work, empty_folder: Path) -> None:
     Path("small").mkdir()
     shutil.copy(work.here / "out/best.ckpt", "small")
-    assert pretrained.checkpoint_file("small") == work.shipped / "small.ckpt"
-    assert pretrained.checkpoint_file("./small") == Path("small")
-    assert pretrained.checkpoint_file("small.ckpt") == Path("small.ckpt")
+    assert checkpoint.checkpoint_file("small") == work.shipped / "small.ckpt"
+    assert checkpoint.checkpoint_file("./small") == Path("small")
+    assert checkpoint.checkpoint_file("small.ckpt") == Path("small.ckpt")
     shutil.rmtree("small")
     Path("small").touch()
-    assert pretrained.checkpoint_file("small") == Path("small")
+    assert checkpoint.checkpoint_file("small") == Path("small")
 
 
 def test_unknown_names_are_refused_with_those_that_ship(empty_folder: Path) -> None:
@@ -120,7 +126,7 @@ def test_what_is_too_large_or_loses_too_much_does_not_ship(
         ship.ship("a/b", Path("report"))
     with pytest.raises(UserError, match="evaluate with sgns evaluate"):
         ship.ship("large", Path("nowhere"))
-    assert pretrained.names() == ["small"]
+    assert checkpoint.pretrained_names() == ["small"]
 
 
 def test_modes_are_stored_in_half_precision_where_nobody_feels_it(work: Work) -> None:
@@ -138,7 +144,7 @@ def test_the_card_says_what_it_is_made_of(work: Work) -> None:
         "| the tool's position (x) |",
         f"    sgns train {' '.join(TRAIN)} output=out\n",
         "    sgns evaluate checkpoint=out/best.ckpt output=report\n",
-        "    python -m sgns.pretrained.ship small report\n",
+        "    python -m sgns.ship small report\n",
         "trained with sgns ",
     ):
         assert words in card, words
@@ -151,13 +157,15 @@ def test_the_card_says_what_it_is_made_of(work: Work) -> None:
 def test_the_table_of_the_documentation_is_that_of_the_cards(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     assert f"\n\n{ship.table()}\n\n" in (ROOT / "docs/learning.md").read_text(encoding="utf-8")
-    sizes = [(pretrained.FOLDER / f"{name}.ckpt").stat().st_size for name in pretrained.names()]
+    sizes = [
+        (checkpoint.PRETRAINED / f"{name}.ckpt").stat().st_size for name in checkpoint.pretrained_names()
+    ]
     assert all(size <= ship.MOST_BYTES for size in sizes) and sum(sizes) <= MOST
 
 
-@pytest.mark.parametrize("name", pretrained.names())
+@pytest.mark.parametrize("name", checkpoint.pretrained_names())
 def test_what_ships_rolls_out(name: str, empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pretrained, "FOLDER", Path(pretrained.__file__).parent)
+    let_ship_from(monkeypatch, SHIPPED)
     done = call("rollout", f"checkpoint={name}", "scene.duration=0.5", "output=new.h5")
     assert done.returncode == 0, done.stderr
 

@@ -1,4 +1,4 @@
-"""Makes a checkpoint small enough to ship, and its model card: `python -m sgns.pretrained.ship NAME EVALUATION`.
+"""Makes a checkpoint small enough to ship, and its model card: `python -m sgns.ship NAME EVALUATION`.
 
 Run it in the folder where `sgns evaluate` ran, since the evaluation says which checkpoint it is of. What a rollout does
 not need is left out; numbers are stored in single precision, modes in half precision where a rollout does not feel it.
@@ -16,11 +16,16 @@ import numpy as np
 import torch
 
 from mpm_warp.poses import in_body_frame
-from sgns import pretrained
 from sgns.config import UserError, parse_yaml
 from sgns.data.files import read_json, read_table, write_whole
 from sgns.data.run import Run
-from sgns.model.checkpoint import read_checkpoint, write_checkpoint
+from sgns.model.checkpoint import (
+    PRETRAINED,
+    is_plain_name,
+    pretrained_names,
+    read_checkpoint,
+    write_checkpoint,
+)
 from sgns.model.training_range import components
 from sgns.numbers import counted
 from sgns.simulator import Simulator
@@ -63,12 +68,12 @@ def ship(name: str, evaluation: Path) -> Path:
     Raises:
         UserError: That is not a complete evaluation, or the checkpoint is too large.
     """
-    if not pretrained.is_name(name):
+    if not is_plain_name(name):
         raise UserError(f"{name!r} is no plain name; leave out folder and ending")
     wrong = "not of a complete evaluation", "evaluate with sgns evaluate"
     made = read_json(evaluation / "metrics.json", *wrong)["made"]
     rows = read_table(evaluation / "metrics.csv", *wrong)
-    whole, target = Path(made["checkpoint"]), pretrained.FOLDER / f"{name}.ckpt"
+    whole, target = Path(made["checkpoint"]), PRETRAINED / f"{name}.ckpt"
     content = read_checkpoint(whole)
     paths = [evaluation / "rollouts" / f"{row['run']}.h5" for row in rows[:-1]]
     for modes in (torch.float16, torch.float32):
@@ -149,7 +154,7 @@ def card(
     commands = [
         training_command(Path(made["checkpoint"]).parent, settings),
         made["command"],
-        f"python -m sgns.pretrained.ship {name} {shlex.quote(str(evaluation))}",
+        f"python -m sgns.ship {name} {shlex.quote(str(evaluation))}",
     ]
     lines = [
         f"# {name}",
@@ -204,10 +209,10 @@ def markdown(head: Sequence[str], rows: Any) -> list[str]:
 def table() -> str:
     """All that ship, from their cards, as the table of the documentation."""
     rows = []
-    for name in pretrained.names():
+    for name in pretrained_names():
         cells = [
             [cell.strip() for cell in line.strip("|").split("|")]
-            for line in (pretrained.FOLDER / f"{name}.md").read_text(encoding="utf-8").splitlines()
+            for line in (PRETRAINED / f"{name}.md").read_text(encoding="utf-8").splitlines()
             if line.startswith("|")
         ]
         facts = {row[0]: row[1] for row in cells}
@@ -229,6 +234,4 @@ if __name__ == "__main__":
         target = ship(sys.argv[1], Path(sys.argv[2]))
         print(f"{target} and its card; for docs/learning.md:\n\n{table()}")
     except (UserError, IndexError) as error:
-        sys.exit(
-            f"sgns.pretrained.ship: {error if isinstance(error, UserError) else 'give NAME and EVALUATION'}"
-        )
+        sys.exit(f"sgns.ship: {error if isinstance(error, UserError) else 'give NAME and EVALUATION'}")
