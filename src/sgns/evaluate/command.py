@@ -6,15 +6,13 @@ file, and compared with the simulated one; baselines and times are measured besi
 
 from __future__ import annotations
 
-import copy
-import itertools
 import logging
 import math
 import os
-import statistics
-import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,85 +24,39 @@ from mpm_warp.poses import in_body_frame
 from mpm_warp.settings import open_file
 from sgns.config import UserError
 from sgns.data.check import scene_problems
-from sgns.data.dataset import Dataset
+from sgns.data.dataset import SPLITS, Dataset
 from sgns.data.files import only_here, require_replaceable
+from sgns.data.published import PARTICLES, fingerprint, published_runs
 from sgns.data.run import Run
 from sgns.data.surface import surface_grid
-from sgns.evaluate.costs import (
-    forget_peak,
-    network_costs,
-    peak_memory,
-    provenance,
-    solver_rates,
-)
+from sgns.evaluate.costs import network_costs, provenance, roll_out, time_network
 from sgns.evaluate.figures import VALIDATION
-from sgns.evaluate.metrics import body_errors, mean_prediction, position_errors
-from sgns.evaluate.modes import evaluate_modes
+from sgns.evaluate.metrics import PositionErrors, body_errors, mean_prediction, position_errors
 from sgns.evaluate.report import describe, forward_name, seen_warning, short_names, write_report
 from sgns.evaluate.results import (
     EvaluatedRun,
     Evaluation,
-    NetworkTiming,
+    Scores,
     aggregate,
     run_scores,
     seen_before,
+    write_csv,
+    write_json,
     write_tables,
 )
 from sgns.model.checkpoint import checkpoint_file
 from sgns.model.features import is_wheel
-from sgns.numbers import counted, elapsed, error_hint, error_words
-from sgns.reduction.basis import Basis, reduction_curves
+from sgns.numbers import counted, error_hint, error_words
+from sgns.reduction.basis import Basis, outside, reduction_curves
+from sgns.reduction.packed import packed_dataset
+from sgns.reduction.reduce import ReducedRun
 from sgns.rollout import single_thread, write_rollout
 from sgns.settings import ModelSettings, model_settings
 from sgns.simulator import Simulator
-from sgns.state import Rollout
 
 log = logging.getLogger(__name__)
 
 MOST_BYTES = 1 << 26  # of a training's log, all files together; a day of training writes a tenth of that
-
-
-def roll_out(simulator: Simulator, run: Run) -> Rollout:
-    """The network along a run's tool path, from the run's first d true frames."""
-    points = in_body_frame(run.pose[0], run.body_points[0])
-    given = simulator.basis.transform(run.positions(slice(0, simulator.history)))
-    return simulator.rollout(run.pose, points, latent_history=given, values=run.scene)
-
-
-def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTiming:
-    """Times rollouts, steps and, in turn with them, the solver along one run's tool path, after one that warms up."""
-    times: list[tuple[float, ...]] = []
-    solved: list[float] = []
-    with Run(path) as run, single_thread():
-        simulated = (run.frame_count - simulator.history) / run.frame_rate
-        solver = solver_rates(run)
-        for _ in range(repeats + 1):
-            forget_peak()
-            rollout = roll_out(simulator, run)
-            peak = peak_memory()
-            forget_peak()
-            began = time.perf_counter()
-            for latent in torch.as_tensor(rollout.latent):
-                simulator.basis.inverse(latent)
-            per_second = float(rollout.wall_time_s) / simulated
-            decoded = per_second + elapsed(began, time.perf_counter()) / simulated
-            if not times:  # before there is a solver
-                peaks = {"rollout_bytes": peak, "decoded_bytes": peak_memory()}
-            times.append((per_second, decoded, step_time(simulator, run)))
-            solved += itertools.islice(solver, 1)
-        rolled, decoded, stepped = (statistics.median(kind) for kind in zip(*times[1:], strict=True))
-        solver_time = statistics.median(solved or [math.nan])
-        return NetworkTiming(rolled, decoded, stepped, solver_time, repeats, path.stem, **peaks)
-
-
-def step_time(simulator: Simulator, run: Run) -> float:
-    """Wall seconds per simulated second of `Simulator.step` along a run's tool path, pose by pose."""
-    stepped = copy.copy(simulator)
-    stepped.reset(run.pose, values=run.scene)
-    began = time.perf_counter()
-    for pose in run.pose[1:]:
-        stepped.step(pose)
-    return elapsed(began, time.perf_counter()) * run.frame_rate / (run.frame_count - 1)
 
 
 def full_basis(dataset: Dataset, basis: Basis) -> Basis:
@@ -311,6 +263,143 @@ def log_summary(evaluation: Evaluation, report: Path) -> None:
     hint = error_hint(*errors)
     for line in [*lines, *([hint] if hint else []), f"report: {report}"]:
         log.info("%s", line)
+
+
+# --- Datasets of which only the modes are known, packed or published: a table, no pictures ----------------
+# With an orthonormal basis the mean square over all particles is ‖ΔS′‖² / 3n all the same. What the reduction leaves
+# out is known of packed runs only.
+
+
+def evaluate_modes(
+    simulator: Simulator, settings: Mapping[str, Any], split: str, output: Path, checkpoint: Path
+) -> float:
+    """Roll out, print the table, write metrics.csv and metrics.json; returns the skill against frozen."""
+    of_split = published_split if settings["format"] == "published" else packed_split
+    runs = of_split(simulator, settings, split, checkpoint)
+    require_replaceable(output / "metrics.csv", output / "metrics.json")
+    mean_force = simulator.mean_force
+    with single_thread():
+        scores = [scored(simulator, run, mean_force) for run in runs]
+    total = aggregate(scores)
+    log.info("%s", "\n".join(score_lines([*scores, total])))
+    output.mkdir(parents=True, exist_ok=True)
+    write_csv(output / "metrics.csv", [score.row() for score in (*scores, total)])
+    write_json(
+        output / "metrics.json",
+        {
+            "aggregate": total.row(),
+            "runs": [score.row() for score in scores],
+            "mean_training_force_N": mean_force,
+            "particles": _particles(simulator, runs[0]),
+            "made": provenance(simulator, checkpoint),
+        },
+    )
+    log.info("tables: %s", output)
+    return total.skill()
+
+
+def scored(simulator: Simulator, run: ReducedRun, mean_force: np.ndarray) -> Scores:
+    """Scores of one run, rolled out from its first d true frames."""
+    d = simulator.history
+    truth = run.latent[:, : simulator.num_modes]
+    rollout = simulator.rollout(
+        run.pose, in_body_frame(run.pose[0], run.body_points[0]), latent_history=truth[:d], values=run.scene
+    )
+    size = 3 * _particles(simulator, run)
+
+    def mean_square(latent: np.ndarray) -> np.ndarray:
+        return ((latent - truth)[d:] ** 2).sum(axis=(1, 2)) / size
+
+    elapsed = np.arange(len(truth))[:, None, None] - (d - 1)
+    network = mean_square(rollout.latent)
+    unknown = np.full(len(network), np.nan)
+    reduction, missed, way = unknown, np.zeros(1), np.zeros(1)
+    if run.unseen is not None:
+        missed, way = (part[d:] / size for part in outside(run.latent[:, simulator.num_modes :], run.unseen))
+        reduction = missed
+        if closure := simulator.basis.closure:
+            beyond = run.latent[:, simulator.num_modes :][:, : closure.num_modes]
+
+            def gained(latent: np.ndarray) -> np.ndarray:
+                found = closure.coordinates(torch.from_numpy(latent)).numpy()
+                return (np.square(beyond) - np.square(found - beyond))[d:].sum(axis=(1, 2)) / size
+
+            missed, reduction = missed - gained(rollout.latent), missed - gained(truth)
+    errors = PositionErrors(
+        time=run.time[d:],
+        reduction=reduction,
+        network=network,
+        total=network + missed,
+        frozen=mean_square(truth[d - 1][None]) + way,
+        # What moves outside the modes has hardly begun to when the history ends.
+        constant_velocity=mean_square(truth[d - 1] + elapsed * (truth[d - 1] - truth[d - 2])) + way,
+        surface=unknown,
+        surface_frozen=unknown,
+    )
+    simulated = SimpleNamespace(time=run.time, force=run.force, torque=run.torque, wall_time_s=0.0)
+    body = body_errors(run, rollout.poses, d)
+    return run_scores(run.name, errors, simulated, rollout, d, mean_force, np.zeros(3), body)
+
+
+def _particles(simulator: Simulator, run: ReducedRun) -> int:
+    """How many particles the modes move; of published runs the basis does not say it."""
+    return PARTICLES[run.scene["kind"]] if run.unseen is None else simulator.basis.num_particles
+
+
+def score_lines(scores: Sequence[Scores]) -> list[str]:
+    """The table as text: position errors in 1e-4 m², force errors in per cent; x is forward, z up."""
+    lines = [
+        "                      position MSE [1e-4 m2]      skill against      force MPE [%]   force NRMSE",
+        "run               network   frozen  const vel  frozen const vel      x       z     network  mean force",
+    ]
+    for score in scores:
+        mse = [1e4 * score.mse[name] for name in ("network", "frozen", "constant_velocity")]
+        lines.append(
+            f"{score.name:<16} {mse[0]:8.4f} {mse[1]:8.4f} {mse[2]:10.4f} {score.skill():7.3f} "
+            f"{score.skill('constant_velocity'):9.3f} {score.force.mpe[0]:7.1f} {score.force.mpe[2]:7.1f} "
+            f"{score.force.overall_nrmse:9.3f} {score.mean_force.overall_nrmse:11.3f}"
+        )
+    absolute = scores[-1].force.absolute_mpe
+    lines.append(f"mean |MPE|: x {absolute[0]:.1f} %, z {absolute[2]:.1f} %")
+    return lines
+
+
+def published_split(
+    simulator: Simulator, settings: Mapping[str, Any], split: str, checkpoint: Path
+) -> list[ReducedRun]:
+    """The split "train" are the published runs that the simulator was trained on, any other are the others there."""
+    trained = {name.rsplit(" ", 1)[-1] for name in simulator.basis.fitted_on or []}
+    everything = [run for found in published_runs(settings["path"]).values() for run in found]
+    kind = everything[0].scene["kind"]
+    if simulator.arrangement_hash != f"published-{kind}":
+        raise UserError(
+            f"{checkpoint} was not trained on published {kind} runs; train one: sgns train dataset=published "
+            f"dataset.path={settings['path']}"
+        )
+    runs = [run for run in everything if (fingerprint(run) in trained) == (split == "train")]
+    if not runs:
+        if split == "train":
+            raise UserError(
+                f"{checkpoint} was trained on none of the runs in {settings['path']}; use split=test"
+            )
+        log.warning("%s was trained on all of these runs: errors on new runs will be larger", checkpoint)
+        runs = everything
+    return runs
+
+
+def packed_split(
+    simulator: Simulator, settings: Mapping[str, Any], split: str, checkpoint: Path
+) -> list[ReducedRun]:
+    """The runs of a packed dataset that the simulator was trained on a part of."""
+    reduced = packed_dataset(Path(settings["path"]), {"num_modes": simulator.num_modes})
+    if not simulator.basis.same_modes(reduced.basis.modes[:, : simulator.num_modes]):
+        raise UserError(
+            f"{checkpoint} was not trained on {settings['path']}: its modes are others; train one: sgns train "
+            f"dataset={settings['name']}"
+        )
+    if not (runs := reduced.runs(split)):
+        raise UserError(f"{settings['path']} has no {split} runs; use another split: {', '.join(SPLITS)}")
+    return runs
 
 
 # --- The command ---------------------------------------------------------------------------------------

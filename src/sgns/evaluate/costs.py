@@ -1,13 +1,15 @@
-"""What a network costs besides time, and how and where that was measured."""
+"""What a network costs: time, memory and training, the solver's time beside it, and where that was measured."""
 
 from __future__ import annotations
 
+import copy
 import itertools
 import logging
 import math
 import os
 import platform
 import shlex
+import statistics
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -20,12 +22,15 @@ import torch
 
 from mpm_warp import Effects, Scene, SceneError, Solver, SolverStopped
 from mpm_warp.limits import usable_cores
+from mpm_warp.poses import in_body_frame
 from sgns import __version__
 from sgns.data.run import Run
-from sgns.evaluate.results import Costs
+from sgns.evaluate.results import Costs, NetworkTiming
 from sgns.model.checkpoint import SUMMARY, load_surrogate, read_summary
 from sgns.numbers import elapsed
+from sgns.rollout import single_thread
 from sgns.simulator import Simulator
+from sgns.state import Rollout
 
 log = logging.getLogger(__name__)
 
@@ -134,3 +139,49 @@ def solver_rates(run: Run) -> Iterator[float]:
             yield elapsed(began, time.perf_counter()) * scene.frame_rate / SOLVER_FRAMES
     except (SceneError, SolverStopped, KeyError, TypeError, StopIteration) as error:
         log.info("the solver cannot be timed on %s: %s", run.path.name, error)
+
+
+# --- Times of a network along a run, in turn with the solver -------------------------------------------
+
+
+def roll_out(simulator: Simulator, run: Run) -> Rollout:
+    """The network along a run's tool path, from the run's first d true frames."""
+    points = in_body_frame(run.pose[0], run.body_points[0])
+    given = simulator.basis.transform(run.positions(slice(0, simulator.history)))
+    return simulator.rollout(run.pose, points, latent_history=given, values=run.scene)
+
+
+def time_network(simulator: Simulator, path: Path, repeats: int) -> NetworkTiming:
+    """Times rollouts, steps and, in turn with them, the solver along one run's tool path, after one that warms up."""
+    times: list[tuple[float, ...]] = []
+    solved: list[float] = []
+    with Run(path) as run, single_thread():
+        simulated = (run.frame_count - simulator.history) / run.frame_rate
+        solver = solver_rates(run)
+        for _ in range(repeats + 1):
+            forget_peak()
+            rollout = roll_out(simulator, run)
+            peak = peak_memory()
+            forget_peak()
+            began = time.perf_counter()
+            for latent in torch.as_tensor(rollout.latent):
+                simulator.basis.inverse(latent)
+            per_second = float(rollout.wall_time_s) / simulated
+            decoded = per_second + elapsed(began, time.perf_counter()) / simulated
+            if not times:  # before there is a solver
+                peaks = {"rollout_bytes": peak, "decoded_bytes": peak_memory()}
+            times.append((per_second, decoded, step_time(simulator, run)))
+            solved += itertools.islice(solver, 1)
+        rolled, decoded, stepped = (statistics.median(kind) for kind in zip(*times[1:], strict=True))
+        solver_time = statistics.median(solved or [math.nan])
+        return NetworkTiming(rolled, decoded, stepped, solver_time, repeats, path.stem, **peaks)
+
+
+def step_time(simulator: Simulator, run: Run) -> float:
+    """Wall seconds per simulated second of `Simulator.step` along a run's tool path, pose by pose."""
+    stepped = copy.copy(simulator)
+    stepped.reset(run.pose, values=run.scene)
+    began = time.perf_counter()
+    for pose in run.pose[1:]:
+        stepped.step(pose)
+    return elapsed(began, time.perf_counter()) * run.frame_rate / (run.frame_count - 1)

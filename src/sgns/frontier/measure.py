@@ -22,8 +22,8 @@ from sgns.data.dataset import Dataset
 from sgns.data.files import file_lock
 from sgns.data.run import Run
 from sgns.data.surface import surface_grid
-from sgns.evaluate.command import roll_out, training_means
-from sgns.evaluate.costs import network_costs
+from sgns.evaluate.command import training_means
+from sgns.evaluate.costs import network_costs, roll_out
 from sgns.evaluate.metrics import body_errors, position_errors
 from sgns.evaluate.results import Scores, aggregate, run_scores
 from sgns.frontier.observation import Observation, Seen, observe

@@ -11,8 +11,8 @@ import pytest
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS
 from sgns.data.run import Run
-from sgns.evaluate.command import roll_out
-from sgns.evaluate.modes import scored
+from sgns.evaluate.command import scored
+from sgns.evaluate.costs import roll_out
 from sgns.model.checkpoint import read_summary
 from sgns.reduction import packed
 from sgns.reduction.packed import PRECISION, pack, packed_dataset

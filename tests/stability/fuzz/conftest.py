@@ -48,6 +48,7 @@ def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
         "sgns.simulate.workers.compile_kernels",
         "sgns.train.lightning_module.run_trainer",
         "sgns.train.polynomial.best_polynomial",
+        "sgns.evaluate.costs.roll_out",
         "sgns.evaluate.command.roll_out",
         "sgns.rollout.rollout_scene",
     ):
