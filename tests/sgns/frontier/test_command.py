@@ -5,7 +5,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from sgns.frontier.figures import (
+from sgns.frontier.command import (
     place_labels,
     reduction_figure,
     scene_figure,
