@@ -71,7 +71,7 @@ def parse(command: str) -> tuple[str, list[str]]:
     overrides = [word for word in rest if not word.startswith("-") and "=" in word]
     if name == "check":
         overrides.append("files=[run.h5]")
-    if name in ("plot", "render"):
+    if name in ("plot", "render", "convert"):
         overrides.append("run=run.h5")
     plain = []
     for override, text in zip(OverridesParser.create().parse_overrides(overrides), overrides, strict=True):

@@ -551,6 +551,16 @@ class Check(_Command):
     )
 
 
+@settings
+class Convert(_Command):
+    """`sgns convert`."""
+
+    run: str = setting("", "run file to convert")
+    output: str = setting("", "file to write; its ending says what for: .vtkhdf, .xyz, .csv, .npz")
+    every: int = setting(1, "one frame of so many", ge=1, le=1_000_000)
+    overwrite: bool = setting(False, "true: replace a file that is there")
+
+
 def _overwrite() -> bool:
     return setting(False, "replace a picture that is there")
 
@@ -584,6 +594,7 @@ COMMANDS: dict[str, type[Group]] = {
     "frontier": Frontier,
     "advise": Advise,
     "check": Check,
+    "convert": Convert,
     "plot": Plot,
     "render": Render,
 }

@@ -113,6 +113,7 @@ RUN_READERS: tuple[Reader, ...] = (
     ("check", (), ("bad.h5",)),
     ("plot", (), ("bad.h5", "output=a.png")),
     ("render", (), ("bad.h5", "output=a.gif")),
+    ("convert", (), ("bad.h5", "output=a.vtkhdf")),
     ("evaluate", JUDGE, ("new_rollouts=[bad.h5]",)),
 )
 DATA_READERS: tuple[Reader, ...] = (

@@ -142,6 +142,7 @@ def _groups() -> Iterator[tuple[str, tuple[str, ...], str, Any]]:
         "check": (f"files=[{RUN}]",),
         "plot": (f"run={RUN}", "output=a.png"),
         "render": (f"run={RUN}", "output=a.gif"),
+        "convert": (f"run={RUN}", "output=a.csv"),
     }
     for name, cls in typed.COMMANDS.items():
         yield name, own.get(name, ()), "", cls

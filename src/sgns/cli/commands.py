@@ -92,6 +92,13 @@ COMMANDS = {
         "sgns.advise", "name the setting that is good and fast enough", None, value="wall_s_per_step"
     ),
     "check": Command("sgns.data.check", "read run files through and list what is wrong with them", None),
+    "convert": Command(
+        "sgns.convert",
+        "write a run as a file of other programs",
+        "file",
+        ("run", "output"),
+        plain=("run", "output"),
+    ),
     "plot": Command("sgns.plot", "one picture of a run", "file", ("run",), plain=("run", "output")),
     "render": Command(
         "sgns.plot",

@@ -300,6 +300,15 @@ def sweep_jobs(overrides: Sequence[str]) -> list[list[str]]:
 # --- The settings that mean the same in every command, checked before any work is done ------------------
 
 
+_TAKES = {
+    "check": ("run files", "run.h5"),
+    "plot": ("a run file", "run.h5"),
+    "render": ("a run file", "run.h5"),
+    "convert": ("a run file and a name", "run.h5 run.vtkhdf"),
+}
+"""What commands take as plain paths, with an example."""
+
+
 def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None:
     """Refuse settings that lack a value (???), point nowhere, or are not what every command takes them for.
 
@@ -325,8 +334,8 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
     if missing:
         blanks = " ".join(f"{key}=..." for key in missing)
         what = "a value is" if len(missing) == 1 else "values are"
-        takes = {"check": "run files", "plot": "a run file", "render": "a run file"}.get(command)
-        give = blanks if takes is None else f"{takes}, as in sgns {command} run.h5"
+        takes = _TAKES.get(command)
+        give = blanks if takes is None else f"{takes[0]}, as in sgns {command} {takes[1]}"
         raise UserError(f"{what} missing for {', '.join(missing)}; give {give}; see sgns {command} --help")
     every: Any = OmegaConf.to_container(cfg, resolve=True)
     plain = {key: value for key, value in every.items() if key in keys}

@@ -34,7 +34,8 @@ from sgns.data.run_file import (
     series,
     structure_problems,
 )
-from sgns.data.writer import VIEW_ATTRIBUTES, VIEWS, ContentHash, view_arrays
+from sgns.data.views import VIEW_ATTRIBUTES, VIEWS, view_arrays
+from sgns.data.writer import ContentHash
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -82,6 +83,7 @@ def check_run(path: str | os.PathLike[str]) -> list[str]:
                 _check_others,
                 _check_mesh,
                 _check_view,
+                _check_names,
                 _check_frames,
             ]
         for check in checks:
@@ -301,6 +303,14 @@ def _check_view(file: h5py.File) -> Iterator[str]:
             yield f"dataset /VTKHDF/{name} is a copy, not a view"
         else:
             own_view(group, name)
+
+
+def _check_names(file: h5py.File) -> Iterator[str]:
+    """That the names at the root, which earlier files lack, are those of the same numbers."""
+    for name in recorded_in(file):
+        found = own_object(file, name)
+        if found is not None and found != series(file, name):
+            yield f"dataset /{name} is another one than {series(file, name).name}"
 
 
 def _check_frames(file: h5py.File) -> Iterator[str]:

@@ -210,9 +210,13 @@ class Run:
             UserError: pandas is not installed.
         """
         pd = library("pandas", "run.forces()")
+        return pd.DataFrame(self.force_columns(), index=pd.Index(self.time, name="time"))
+
+    def force_columns(self) -> dict[str, np.ndarray]:
+        """The columns of `forces`, each (T,), without pandas."""
         columns = [f"{name}{axis}" for name in "FT" for axis in AXES] + POSE
         values = np.hstack([self.force, self.torque, self.pose])
-        table = pd.DataFrame(values, index=pd.Index(self.time, name="time"), columns=columns)
+        table = dict(zip(columns, values.T, strict=True))
         scene = self.scene
         if scene.get("kind") == "wheel":
             table["pull"], table["lateral"], _ = along_and_across(scene, self.force).T

@@ -37,61 +37,9 @@ from sgns.data.run_file import (
     read_attributes,
     series,
 )
+from sgns.data.views import VIEWS, write_views
 
 log = logging.getLogger(__name__)
-
-
-# --- A view of the soil for ParaView and VTK ------------------------------------------------------------
-# The group /VTKHDF describes a point cloud that changes with time (VTKHDF 2.0, PolyData with one vertex per
-# particle). `Points` and `PointData/velocity` are HDF5 virtual datasets: they show the H5MD arrays, reshaped
-# from (T, n, 3) to (T n, 3), and hold no copy. Format: docs.vtk.org, "VTKHDF file format".
-
-VIEW_ATTRIBUTES = {
-    "Version": np.array((2, 0), dtype="<i8"),  # the first with PolyData in time; newer readers take every 2.x
-    "Type": np.bytes_("PolyData"),  # the reader wants ASCII of fixed length
-}
-VIEWS = {"position": "Points", "velocity": "PointData/velocity"}
-"""Recorded soil → the dataset of /VTKHDF that shows it."""
-
-
-def view_arrays(frames: int, particles: int) -> dict[str, np.ndarray]:
-    """Path → numbers of what is in /VTKHDF besides the soil and the times."""
-    # Sizes and cells are the same in every frame, so one part is described and every frame points at it. (One
-    # entry per frame would also be good VTKHDF, but VTK 9.3 then looks for the cells in the wrong place.)
-    arrays: dict[str, Any] = {"NumberOfPoints": [particles]}
-    for name, count in (("Vertices", particles), ("Lines", 0), ("Polygons", 0), ("Strips", 0)):
-        arrays |= {
-            f"{name}/NumberOfCells": [count],
-            f"{name}/NumberOfConnectivityIds": [count],
-            f"{name}/Offsets": np.arange(count + 1),
-            f"{name}/Connectivity": np.arange(count),
-        }
-    arrays |= {
-        "Steps/PartOffsets": np.zeros(frames),
-        "Steps/NumberOfParts": np.ones(frames),
-        "Steps/PointOffsets": np.arange(frames) * particles,
-        "Steps/CellOffsets": np.zeros((frames, 4)),
-        "Steps/ConnectivityIdOffsets": np.zeros((frames, 4)),
-        "Steps/PointDataOffsets/velocity": np.arange(frames) * particles,
-    }
-    return {path: np.asarray(values, dtype="<i8") for path, values in arrays.items()}
-
-
-def _write_view(file: h5py.File) -> None:
-    frames, particles, axes = series(file, "position").shape
-    group = file.create_group("VTKHDF")
-    for name, value in VIEW_ATTRIBUTES.items():
-        group.attrs[name] = value
-    for name, path in VIEWS.items():
-        source = series(file, name)
-        layout = h5py.VirtualLayout(shape=(frames * particles, axes), dtype=source.dtype)
-        # "." is HDF5's name for the file that holds the virtual dataset, whatever it is called later.
-        layout[...] = h5py.VirtualSource(".", source.name, shape=source.shape, dtype=source.dtype)
-        group.create_virtual_dataset(path, layout)
-    for path, values in view_arrays(frames, particles).items():
-        group[path] = values
-    group["Steps/Values"] = series(file, "position", "time")  # a hard link
-    group["Steps"].attrs["NSteps"] = np.int64(frames)
 
 
 # --- What is kept of a run that stopped, and what a run may replace -------------------------------------
@@ -385,7 +333,7 @@ class RunWriter:
                 if name != "position":  # hard links: H5MD's way to say "sampled at the same times"
                     file[f"{recorded.path}/step"] = first["step"]
                     file[f"{recorded.path}/time"] = first["time"]
-            _write_view(file)
+            write_views(file)
             _set(file, "wall_time_s", np.float64(wall_time_s))
             _set(file, "content_hash", self._hash.hexdigest())
             file.close()

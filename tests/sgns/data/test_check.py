@@ -107,6 +107,7 @@ FAULTS = [
     (replace("VTKHDF/Points", np.zeros((600, 3), "f4")), "is a copy"),
     (replace("VTKHDF/Points", np.zeros((600, 3), "f4")), "shows another position at frame 0"),
     (replace("VTKHDF/PointData/velocity", np.zeros((5, 3), "f4")), "velocity has shape"),
+    (replace("force", np.zeros((12, 3))), "dataset /force is another one than /observables/body/force/value"),
 ]
 
 
@@ -115,6 +116,12 @@ def test_a_planted_fault_is_found(problems_after, change, words):
     problems = problems_after(change)
     assert any(re.search(words, problem) for problem in problems), problems
     assert all("\n" not in problem for problem in problems)
+
+
+def test_earlier_files_without_names_at_the_root_are_good(problems_after):
+    assert (
+        problems_after(lambda file: [file.pop(name) for name in ("time", "axis", "force", "particle")]) == []
+    )
 
 
 def missing_parts(file):
