@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Draw which file imports which, of one or more trees, and count lines: python .ci/house.py out.png TITLE=TREE [...]
 
-A file stands above all that it imports. Grey lines are imports; what the commands `simulate` and `train` reach is counted.
+A file stands above all that it imports. Grey lines are imports; what the commands `simulate` and `train` reach is counted,
+and among these files the steps back: pairs of folders that import each other.
 Printed is a table of the lines of each folder of the last tree: code, docstrings, comments, blank.
 """
 
@@ -62,6 +63,12 @@ def reached(start: str, graph: dict[str, set[str]]) -> set[str]:
     return found
 
 
+def steps_back(files: set[str], graph: dict[str, set[str]], folder: dict[str, str]) -> int:
+    """Pairs of folders that import each other, of some files."""
+    ways = {(folder[name], folder[other]) for name in files for other in graph[name] & files}
+    return sum(a < b and (b, a) in ways for a, b in ways)
+
+
 def floors(graph: dict[str, set[str]]) -> dict[str, int]:
     """Of each file the longest way down through its imports."""
     found: dict[str, int] = {}
@@ -100,7 +107,9 @@ def draw(axes: plt.Axes, title: str, tree: Path) -> None:
     ways = []
     for command, candidates in COMMANDS.items():
         start = next(name for name in candidates if name in known)
-        ways.append(f"{command} reaches {len(reached(start, graph))}")
+        files = reached(start, graph)
+        back = steps_back(files, graph, {name: str(path.parent) for name, path in known.items()})
+        ways.append(f"{command} reaches {len(files)}, steps back: {back}")
     axes.set_title(f"{title}: {len(known)} files, {sum(lines.values())} lines\n{'; '.join(ways)}", fontsize=10)
     axes.set_ylabel("floor: a file stands above all that it imports")
     axes.set_xticks([column + 0.5 for column in range(len(groups))], groups, rotation=35, ha="right", fontsize=8)

@@ -27,9 +27,9 @@ import numpy as np
 import torch
 from common import training_settings, write_rows
 
-from sgns.data.published import published_dataset
 from sgns.evaluate.command import scored
 from sgns.evaluate.results import aggregate
+from sgns.reduction.published import published_dataset
 from sgns.reduction.reduce import ReducedDataset, ReducedRun
 from sgns.rollout import single_thread
 from sgns.simulator import Simulator

@@ -23,8 +23,8 @@ from omegaconf import OmegaConf
 
 from mpm_warp import Scene, Wheel
 from sgns.config import UserError
-from sgns.data.published import DIAMETERS, PublishedRun, read_published
 from sgns.data.run import Run
+from sgns.reduction.published import DIAMETERS, PublishedRun, read_published
 from sgns.simulate.campaign import Campaign
 from sgns.simulate.command import simulate_campaign
 from sgns.simulate.scene import asked_effects, scene_from_config

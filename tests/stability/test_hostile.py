@@ -32,7 +32,6 @@ from mpm_warp.mesh_files import read_mesh
 from sgns.config import UserError, parse_yaml
 from sgns.data.check import check_run
 from sgns.data.dataset import Dataset
-from sgns.data.published import read_published
 from sgns.data.run import Run
 from sgns.evaluate.command import read_log
 from sgns.evaluate.costs import network_costs
@@ -41,6 +40,7 @@ from sgns.frontier.point import read_points
 from sgns.frontier.study import Study
 from sgns.model.checkpoint import load_surrogate
 from sgns.reduction.basis import Basis
+from sgns.reduction.published import read_published
 from sgns.reduction.reduce import ReducedDataset, read_reduced, reduce_dataset
 from sgns.simulate.scene import read_path
 from sgns.train.command import train

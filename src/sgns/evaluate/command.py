@@ -26,7 +26,6 @@ from sgns.config import UserError
 from sgns.data.check import scene_problems
 from sgns.data.dataset import SPLITS, Dataset
 from sgns.data.files import only_here, require_replaceable
-from sgns.data.published import PARTICLES, fingerprint, published_runs
 from sgns.data.run import Run
 from sgns.data.surface import surface_grid
 from sgns.evaluate.costs import network_costs, provenance, roll_out, time_network
@@ -49,6 +48,7 @@ from sgns.model.features import is_wheel
 from sgns.numbers import counted, error_hint, error_words
 from sgns.reduction.basis import Basis, outside, reduction_curves
 from sgns.reduction.packed import packed_dataset
+from sgns.reduction.published import PARTICLES, fingerprint, published_runs
 from sgns.reduction.reduce import ReducedRun
 from sgns.rollout import single_thread, write_rollout
 from sgns.settings import ModelSettings, model_settings

@@ -57,7 +57,7 @@ FITS = {"network": "sgns.train.lightning_module:NETWORK", "polynomial": "sgns.tr
 def main(cfg: DictConfig) -> float:
     """The `sgns train` command; returns the skill of rollouts of the validation runs, in full space."""
     from sgns.data.dataset import Dataset
-    from sgns.data.published import published_dataset
+    from sgns.reduction.published import published_dataset
 
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     settings = training_settings(plain["model"], plain["training"])

@@ -25,10 +25,10 @@ from mpm_warp.solids import Solid, closed_mesh
 from sgns.config import parse_yaml
 from sgns.data.check import check_run
 from sgns.data.dataset import Dataset
-from sgns.data.published import published_dataset
 from sgns.data.run import Run
 from sgns.model.checkpoint import load_surrogate
 from sgns.reduction.basis import Basis
+from sgns.reduction.published import published_dataset
 from sgns.rollout import main as roll_out
 from sgns.simulate.scene import read_path
 from sgns_testing.commands import SMALL, composed

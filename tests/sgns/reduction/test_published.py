@@ -12,7 +12,7 @@ import pytest
 
 from mpm_warp import Excavation, Wheel
 from sgns.config import UserError
-from sgns.data.published import PublishedRun, fingerprint, published_dataset, read_published
+from sgns.reduction.published import PublishedRun, fingerprint, published_dataset, read_published
 from sgns_testing.commands import refusal, sgns
 from sgns_testing.published import record
 
