@@ -11,12 +11,22 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sgns.config import UserError
     from sgns.data.run import Run
+    from sgns.gradients import TorchSimulator
     from sgns.reduction.basis import Basis
     from sgns.reduction.pca import IncrementalPCA
     from sgns.simulate.scene import random_paths
     from sgns.simulator import Simulator
 
-__all__ = ["Basis", "IncrementalPCA", "Run", "Simulator", "UserError", "__version__", "random_paths"]
+__all__ = [
+    "Basis",
+    "IncrementalPCA",
+    "Run",
+    "Simulator",
+    "TorchSimulator",
+    "UserError",
+    "__version__",
+    "random_paths",
+]
 
 __version__ = "0.1.0"
 
@@ -25,6 +35,7 @@ _HOME = {
     "IncrementalPCA": "sgns.reduction",
     "Run": "sgns.data.run",
     "Simulator": "sgns.simulator",
+    "TorchSimulator": "sgns.gradients",
     "UserError": "sgns.config",
     "random_paths": "sgns.simulate.scene",
 }

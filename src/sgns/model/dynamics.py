@@ -35,10 +35,14 @@ class Standardiser(nn.Module):
     Args:
         mean: Mean of the quantity [its unit], any shape that broadcasts against the quantity.
         scale: Deviation of the quantity [its unit], same shape, positive.
+
+    Attributes:
+        shown: Type of what a network is shown.
     """
 
     mean: Tensor
     scale: Tensor
+    shown = torch.float32
 
     def __init__(self, mean: Tensor, scale: Tensor) -> None:
         super().__init__()
@@ -81,8 +85,8 @@ class Standardiser(nn.Module):
         return cls(torch.zeros(shape, dtype=torch.float64), torch.ones(shape, dtype=torch.float64))
 
     def normalise(self, value: Tensor) -> Tensor:
-        """Value in deviations from the mean [1], float32, same shape."""
-        return ((value - self.mean) / self.scale).float()
+        """Value in deviations from the mean [1], of the type `shown`, same shape."""
+        return ((value - self.mean) / self.scale).to(self.shown)
 
     def denormalise(self, value: Tensor) -> Tensor:
         """Back to the quantity's unit, float64, same shape."""
@@ -268,17 +272,9 @@ class Dynamics(nn.Module):
             given: Frames of the paths that the first positions are of: 1 for a bed at rest, or d.
             loads: Force and torque of these frames.
         """
-        count, padding, every = len(poses), self.history - given, np.arange(poses.shape[1])
+        count, padding = len(poses), self.history - given
         worlds = np.stack([in_world_frame(path, points) for path in poses])
-        # Frames that the soil takes a step into, and for each frame of the path which of them is the newest.
-        frames = [every] * count
-        if pace is not None:
-            paths = (markers(*path) for path in zip(poses, worlds, strict=True))
-            frames = [step_frames(path, given, *pace) for path in paths]
-        newest = np.stack([np.searchsorted(each, every, side="right") - 1 for each in frames])
-        # Before its first frame a bed is at rest. Side by side all take as many steps: those that are done rest.
-        longest = max(map(len, frames))
-        shown = [np.pad(each, (padding, longest - len(each)), mode="edge") for each in frames]
+        shown, newest = self.frames_of(poses, worlds, pace, given)
         tracks = [self.track(poses[i, index], worlds[i, index]) for i, index in enumerate(shown)]
         track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
         with torch.inference_mode():
@@ -296,6 +292,23 @@ class Dynamics(nn.Module):
             if self.settings.body_nodes == "pose":
                 worlds = np.stack([in_world_frame(path, points) for path in poses])
         return *parts, poses, worlds
+
+    def frames_of(
+        self, poses: np.ndarray, worlds: np.ndarray, pace: tuple[float, int] | None, given: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Frames that the soil takes a step into along paths (B, T, 7) with body points in the world frame
+        (B, T, M, 3), after the d that it begins with, shape (B, any); and for every frame of a path which of them, the
+        d but the given left out, is the newest, shape (B, T). Arguments as of `follow`."""
+        every = np.arange(poses.shape[1])
+        frames = [every] * len(poses)
+        if pace is not None:
+            paths = (markers(*path) for path in zip(poses, worlds, strict=True))
+            frames = [step_frames(path, given, *pace) for path in paths]
+        newest = [np.searchsorted(each, every, side="right") - 1 for each in frames]
+        # Before its first frame a bed is at rest. Side by side all take as many steps: those that are done rest.
+        padding, longest = self.history - given, max(map(len, frames))
+        shown = [np.pad(each, (padding, longest - len(each)), mode="edge") for each in frames]
+        return np.stack(shown), np.stack(newest)
 
     def track(self, poses: np.ndarray, points: np.ndarray) -> BodyTrack:
         """Of poses (T, 7) and body points in the world frame (T, M, 3), with B = 1."""

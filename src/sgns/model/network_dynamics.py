@@ -197,7 +197,7 @@ class LatentDynamics(Dynamics):
             motion = motion[:, :-1]
         elif self.predicts_body:
             known = torch.nn.functional.pad(1.0 - self.free, (0, motion.shape[-1] - 3), value=1.0)
-            motion = torch.cat([motion[:, :-1], motion[:, -1:] * known.float()], dim=1)
+            motion = torch.cat([motion[:, :-1], motion[:, -1:] * known.to(motion)], dim=1)
         parts = [
             self.body_orientation.normalise(body.orientation[:, -2]),
             motion.permute(0, 2, 1, 3).flatten(2),
@@ -209,7 +209,7 @@ class LatentDynamics(Dynamics):
     def _edge_positions(self, modes: Tensor, body: Tensor) -> Tensor:
         """Positions of all nodes in the unit of the edges' features, shape (B, V, 3)."""
         if self.settings.edge_scale is not None:
-            return (torch.cat([modes, body], dim=-2) / self.settings.edge_scale).float()
+            return (torch.cat([modes, body], dim=-2) / self.settings.edge_scale).to(self.position.shown)
         return torch.cat([self.position.normalise(modes), self.body_position.normalise(body)], dim=-2)
 
     def told(self, modes: int, nodes: int, batch: int, context: Tensor | None) -> Tensor:

@@ -26,12 +26,14 @@ FAR = 0.5
 # A component that varies less than the others of its quantity is given this share of their range as its own.
 _FLOOR = 0.1
 _AXES = ("x", "y", "z")
-_POSITION = "the tool's position"
-_DISPLACEMENT = "the tool's displacement per frame"
-_POINTS = "the number of the tool's points"
-_ORIENTATION = "the tool's orientation"
-_ROTATION = "the tool's rotation per frame"
-_SOIL = "the soil's state"
+POSITION = "the tool's position"
+LOWEST = "the tool's lowest point"
+DISPLACEMENT = "the tool's displacement per frame"
+POINTS = "the number of the tool's points"
+ORIENTATION = "the tool's orientation"
+ROTATION = "the tool's rotation per frame"
+SOIL = "the soil's state"
+VELOCITY = "the soil's velocity"
 
 
 class Excess(NamedTuple):
@@ -83,7 +85,7 @@ class TrainingRange:
             numbers = dict(zip(context, context_of(run.scene, context), strict=True))
             found = quantities(run.pose, run.body_points, run.latent[:, :num_modes], numbers)
             if not points:
-                del found[_POINTS]
+                del found[POINTS]
             for name, values in found.items():
                 low[name] = np.minimum(low.get(name, np.inf), values.min(axis=0))
                 high[name] = np.maximum(high.get(name, -np.inf), values.max(axis=0))
@@ -115,14 +117,14 @@ class TrainingRange:
 
     def soil(self, margin: float) -> tuple[np.ndarray, np.ndarray]:
         """Smallest and largest modes, one after another [m], so many widths of their range outside of it."""
-        low, high = (side[_SOIL] for side in (self.low, self.high))
+        low, high = (side[SOIL] for side in (self.low, self.high))
         return low - margin * widths(low, high), high + margin * widths(low, high)
 
     @cached_property
     def _box(self) -> tuple[list[float], list[float]]:
         """Smallest and largest values of the tool that are not far outside, in the order of `_of_step`."""
         low, high = np.full(15, -np.inf), np.full(15, np.inf)
-        for first, name in ((0, _POSITION), (3, _DISPLACEMENT), (6, _ROTATION), (9, _ORIENTATION)):
+        for first, name in ((0, POSITION), (3, DISPLACEMENT), (6, ROTATION), (9, ORIENTATION)):
             if name in self.low:
                 margin = FAR * widths(self.low[name], self.high[name])
                 part = slice(first, first + len(margin))
@@ -182,14 +184,14 @@ def quantities(
     first = slice(None, None, len(place) // paths)
     moved[first] = velocity[first] = 0.0
     return {
-        _POSITION: place,
-        "the tool's lowest point": heights[:, None],
-        _POINTS: np.full((len(place), 1), float(points.shape[1])),
-        _ORIENTATION: track.orientation[:, 0].numpy(),
-        _DISPLACEMENT: moved[:, :3],
-        _ROTATION: moved[:, 3:],
-        _SOIL: latent,
-        "the soil's velocity": velocity,
+        POSITION: place,
+        LOWEST: heights[:, None],
+        POINTS: np.full((len(place), 1), float(points.shape[1])),
+        ORIENTATION: track.orientation[:, 0].numpy(),
+        DISPLACEMENT: moved[:, :3],
+        ROTATION: moved[:, 3:],
+        SOIL: latent,
+        VELOCITY: velocity,
         **{key: np.full((len(place), 1), value) for key, value in context.items()},
     }
 
