@@ -28,7 +28,7 @@ from sgns.data.surface import Surface, soil_surface
 from sgns.model.checkpoint import Surrogate, load_surrogate
 from sgns.model.dynamics import Step, Stepper, together
 from sgns.model.features import ToolMotion, context_of, markers
-from sgns.model.training_range import FAR, Excess
+from sgns.model.training_range import FAR, Excess, TrainingRange
 from sgns.numbers import (
     check_pose,
     check_poses,
@@ -312,6 +312,16 @@ class Simulator:
             UserError: None of that name ships; the line names those that do.
         """
         return cls.load(shipped(name), **options)
+
+    @property
+    def pace(self) -> tuple[float, int] | None:
+        """`least` [m] and `settling` of `sgns.model.features.ToolMotion`; None: the soil follows the clock."""
+        return self._pace
+
+    @property
+    def training_range(self) -> TrainingRange:
+        """What the training runs covered."""
+        return self._surrogate.training_range
 
     @property
     def scene(self) -> dict[str, Any]:
