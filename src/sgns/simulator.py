@@ -25,7 +25,7 @@ from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate, pretrained_file
 from sgns.model.dynamics import Step, Stepper, together
 from sgns.model.features import ToolMotion, context_of, markers
-from sgns.model.training_range import FAR, Excess
+from sgns.model.training_range import FAR, Excess, TrainingRange
 from sgns.numbers import (
     check_pose,
     check_poses,
@@ -167,6 +167,16 @@ class Simulator:
             UserError: None of that name ships; the line names those that do.
         """
         return cls.load(pretrained_file(name), **options)
+
+    @property
+    def pace(self) -> tuple[float, int] | None:
+        """`least` [m] and `settling` of `sgns.model.features.ToolMotion`; None: the soil follows the clock."""
+        return self._pace
+
+    @property
+    def training_range(self) -> TrainingRange:
+        """What the training runs covered."""
+        return self._surrogate.training_range
 
     @property
     def scene(self) -> dict[str, Any]:
