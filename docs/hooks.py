@@ -62,6 +62,7 @@ def reference_page() -> str:
         typed.LossWeights,
         typed.Errors,
         typed.Limits,
+        typed.ImportNames,
     ]
     return reference([*soil, *groups, *typed.COMMANDS.values()])
 

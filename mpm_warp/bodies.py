@@ -334,7 +334,8 @@ class Sphere(Settings, Tool):
 
 # --- Closed triangle meshes from files ------------------------------------------------------------------
 
-_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+"""Name of a unit of length → how many metres it is."""
 
 
 @settings
@@ -407,7 +408,7 @@ class MeshBody(Settings, Tool):
     @cached_property
     def _solid(self) -> Solid:
         vertices, triangles, said = read_mesh(Path(self.file))
-        metres = _UNITS.get(self.unit, said or 1.0)
+        metres = UNITS.get(self.unit, said or 1.0)
         return closed_mesh(vertices * (self.scale * metres), triangles, self.file)
 
     @cached_property

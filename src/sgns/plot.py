@@ -96,7 +96,7 @@ def run_page(run: Run) -> Image.Image:
 def title_figure(run: Run) -> Figure:
     """A line with what the run is."""
     figure = new_figure(2 * PICTURE_WIDTH, 0.4)
-    who = "simulated (MPM)" if run.producer == "mpm" else "network"
+    who, _ = MADE_BY[run.producer]
     name = run.path.name if len(run.path.name) < 60 else f"{run.path.name[:57]}..."
     words = f"{name}: {run.scene.get('kind', 'scene')}, {who}, {run.particle_count} particles, {run.time[-1]:.3g} s"
     figure.text(0.012, 0.5, words, fontsize=11, va="center")
@@ -133,10 +133,18 @@ LEAST_ARM = 1e-6
 """A torque with a shorter lever of the largest force is rounding [m]."""
 
 
+MADE_BY = {
+    "mpm": ("simulated (MPM)", TRUTH),
+    "rollout": ("network", NETWORK),
+    "imported": ("imported", TRUTH),
+}
+"""Producer of a run → what pictures call it, and the colour of its forces."""
+
+
 def shown_bodies(run: Run) -> list[tuple[str, str, Any]]:
     """Of each body whose forces are drawn its name, its colour, and what `bodies` has for it."""
     own, *more = bodies(run)
-    name, colour = ("simulated (MPM)", TRUTH) if run.producer == "mpm" else ("network", NETWORK)
+    name, colour = MADE_BY[run.producer]
     further = [(f"others[{i}]", body.colour, body) for i, body in enumerate(more)]
     return further if further and not run.body_point_count else [(name, colour, own), *further]
 
@@ -220,7 +228,7 @@ def render(cfg: DictConfig) -> None:
     """Draw the run `cfg.run` into the GIF file `cfg.output`."""
     with Run(cfg.run) as run:
         path = picture_place(cfg, ".gif")
-        who = "simulated (MPM)" if run.producer == "mpm" else "network"
+        who, _ = MADE_BY[run.producer]
         speed, end = moving_picture({who: run}, path), run.time[-1]
     pace = "in real time" if speed == 1.0 else f"{speed:.2g} times as fast as real"
     log.info("%s: %.3g s of %s, %s, %.1f MB", path, end, cfg.run, pace, path.stat().st_size / 1e6)

@@ -22,6 +22,14 @@ class Group(Settings):
         return {key: values[key] for key in ("kind",) if key in values} | values  # the kind first
 
 
+def require_shares(key: str, split: tuple[float, ...]) -> None:
+    """Refuse shares that do not sum to 1."""
+    if not math.isclose(sum(split), 1, abs_tol=1e-6):
+        raise UserError(
+            f"{key} is {list(split)}; it needs three shares (train, validation, test) that sum to 1"
+        )
+
+
 # --- conf/dataset ---------------------------------------------------------------------------------------
 
 
@@ -56,10 +64,7 @@ class DatasetSettings(Group):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not math.isclose(sum(self.split), 1, abs_tol=1e-6):
-            raise UserError(
-                f"dataset.split is {list(self.split)}; it needs three shares (train, validation, test) that sum to 1"
-            )
+        require_shares("dataset.split", self.split)
         grids = self.draw if isinstance(self.draw, list) else [] if self.draw is None else [self.draw]
         for grid in grids:
             if not grid:
@@ -552,6 +557,58 @@ class Check(_Command):
 
 
 @settings
+class ImportNames(Group):
+    """What the arrays are called in the source; in HDF5 these are paths."""
+
+    group: ClassVar[str] = "names"
+    position: str = setting(
+        "position", "soil (T, n, 3); of several series of .vtu files a pattern, as soil_*.vtu"
+    )
+    velocity: str = setting("velocity", "soil (T, n, 3), if it is there")
+    id: str = setting("id", "numbers of the particles (T, n), if their order changes")
+    time: str = setting("time", "of the frames [s], (T,)")
+    pose: str = setting("pose", "of the tool (T, 7): place, quaternion")
+    force: str = setting("force", "by the soil on the tool [N], (T, 3)")
+    torque: str = setting("torque", "about the tool's place [N m], (T, 3), if it is there")
+    body_points: str = setting("body_points", "of the tool: (M, 3) in its own frame, or (T, M, 3)")
+    vertices: str = setting("vertices", "of the tool's mesh (V, 3), in its own frame")
+    triangles: str = setting("triangles", "of the tool's mesh (F, 3)")
+
+
+@settings
+class Import(_Command):
+    """`sgns import`."""
+
+    source: list[str] | str = setting(
+        list,
+        "files (.npz, .h5) or folders, each with one run; patterns in quotes",
+        words="; it must be paths, as in sgns import run.npz run.h5",
+    )
+    output: str = setting("", "run file to write (.h5), or folder of a dataset")
+    overwrite: bool = setting(False, "true: replace what is there at `output`")
+    frame_rate: float | None = setting(None, "of the source; null: as its times say", "Hz", gt=0, le=1e6)
+    unit: Literal["m", "mm", "cm", "in"] = setting("m", "of the source's lengths")
+    up: Literal["z", "y"] = setting("z", "the source's axis that points upwards")
+    quaternion: Literal["xyzw", "wxyz"] = setting("xyzw", "order of the source's quaternions")
+    origin: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0), "the source's point that becomes x = y = z = 0", words="; it needs three coordinates"
+    )
+    tool: str | None = setting(None, "mesh file of the tool, in its own frame; null: from the source")
+    names: ImportNames = setting(ImportNames, "what the arrays are called in the source")
+    split: tuple[float, float, float] = setting(
+        (0.8, 0.1, 0.1),
+        "shares of train, validation and test runs",
+        ge=0,
+        words="; it needs three shares (train, validation, test) that sum to 1",
+    )
+    seed: int = _seed("of the split")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_shares("split", self.split)
+
+
+@settings
 class Convert(_Command):
     """`sgns convert`."""
 
@@ -595,6 +652,7 @@ COMMANDS: dict[str, type[Group]] = {
     "advise": Advise,
     "check": Check,
     "convert": Convert,
+    "import": Import,
     "plot": Plot,
     "render": Render,
 }

@@ -92,6 +92,13 @@ COMMANDS = {
         "sgns.advise", "name the setting that is good and fast enough", None, value="wall_s_per_step"
     ),
     "check": Command("sgns.data.check", "read run files through and list what is wrong with them", None),
+    "import": Command(
+        "sgns.simulate.foreign",
+        "make run files of what another simulator has computed",
+        "file",
+        ("output",),
+        plain=("source", "output"),
+    ),
     "convert": Command(
         "sgns.convert",
         "write a run as a file of other programs",
@@ -406,6 +413,9 @@ def _parsed(command: str, arguments: list[str]) -> argparse.Namespace:
         parsed.settings = [setting for setting in settings if setting not in paths]
         if command == "check" and paths:
             parsed.settings.append(f"files=[{','.join(map(_quoted, paths))}]")
+        elif command == "import" and len(paths) > 1:  # a shell makes many of a pattern
+            *sources, output = map(_quoted, paths)
+            parsed.settings += [f"source=[{','.join(sources)}]", f"output={output}"]
         elif len(paths) > len(plain) > 0:
             refuse(f"{paths[len(plain)]!r} is one path too many: sgns {command} takes {' and '.join(plain)}")
         else:

@@ -131,7 +131,7 @@ def command_help(command: str) -> str:
 def key_lines(command: str) -> list[str]:
     """A line for each key of a command, and for the main keys of its groups, from their definitions."""
     from mpm_warp.settings import described  # loads Warp: a second
-    from sgns.settings import COMMANDS, MAIN_KEYS, Errors, Limits
+    from sgns.settings import COMMANDS, MAIN_KEYS, Errors, ImportNames, Limits
 
     rows = [
         (f"{group}.{name}", *rest)
@@ -139,7 +139,7 @@ def key_lines(command: str) -> list[str]:
         for name, *rest in described(cls)
         if name in names
     ]
-    groups = {"error": Errors, "limits": Limits}
+    groups = {"error": Errors, "limits": Limits, "names": ImportNames}
     for name, *rest in described(COMMANDS[command]):
         rows += (
             [(f"{name}.{part}", *more) for part, *more in described(groups[name])]

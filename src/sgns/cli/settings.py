@@ -304,6 +304,7 @@ _TAKES = {
     "check": ("run files", "run.h5"),
     "plot": ("a run file", "run.h5"),
     "render": ("a run file", "run.h5"),
+    "import": ("a source and a name", "run.npz run.h5"),
     "convert": ("a run file and a name", "run.h5 run.vtkhdf"),
 }
 """What commands take as plain paths, with an example."""

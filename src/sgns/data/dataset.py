@@ -15,6 +15,8 @@ from sgns.config import UserError, flattened, parse_yaml
 from sgns.data.files import read_text
 
 SPLITS = ("train", "validation", "test")
+IMPORTED = "imported"
+"""Name of datasets whose runs are from another simulator."""
 _MOST_BYTES = 1 << 26
 """Of dataset.yaml: thousands of scenes, or a hundred with a long path each."""
 
@@ -36,7 +38,9 @@ class Dataset:
 
     @property
     def command(self) -> str:
-        """What simulates it; what was changed in its settings is not known."""
+        """What makes it; what was changed in its settings is not known."""
+        if self.name == IMPORTED:
+            return f"sgns import ... {shlex.quote(str(self.path))}"
         place = "" if self.title == self.name else f" dataset.path={shlex.quote(str(self.path))}"
         return f"sgns simulate dataset={self.name}{place}"
 

@@ -329,13 +329,18 @@ def read_table(path: Path, wrong: str, advice: str) -> list[dict[str, str]]:
         return table
 
 
-def read_arrays(path: Path, wrong: str, advice: str) -> dict[str, np.ndarray]:
-    """Arrays of an NPZ file by name, without Python objects; what its parts unfold to counts as its size does."""
+def read_arrays(path: Path, wrong: str, advice: str, large: bool = False) -> dict[str, np.ndarray]:
+    """Arrays of an NPZ file by name, without Python objects; what its parts unfold to counts as its size does.
+
+    A `large` one may have any size, and unfold to 20 times as much.
+    """
     with _readable(path, wrong, advice):
-        packed = io.BytesIO(read_bytes(path, MOST_OF_ARRAYS))
+        size = max(path.stat().st_size, MOST_OF_ARRAYS) if large else MOST_OF_ARRAYS
+        packed = io.BytesIO(read_bytes(path, size))
+        most = max(MOST_OF_ARRAYS, 20 * packed.getbuffer().nbytes) if large else MOST_OF_ARRAYS
         with zipfile.ZipFile(packed) as archive:
-            if sum(part.file_size for part in archive.infolist()) > MOST_OF_ARRAYS:
-                raise ValueError(f"it unfolds to more than {MOST_OF_ARRAYS / 1e6:.0f} MB")
+            if sum(part.file_size for part in archive.infolist()) > most:
+                raise ValueError(f"it unfolds to more than {most / 1e6:.0f} MB")
         packed.seek(0)
         with np.load(packed, allow_pickle=False) as content:
             return dict(content)

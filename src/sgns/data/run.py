@@ -83,7 +83,7 @@ class Run:
         self.body_point_count: int = series(self._file, "body_points").shape[1]
         """M."""
         self.producer: str = found["producer"]
-        """Who made the run: "mpm" or "rollout"."""
+        """Who made the run: "mpm", "rollout" or "imported"."""
         self.seed = int(found["seed"])
         """Seed of the run."""
         self.frame_rate = float(found["frame_rate"])

@@ -31,8 +31,8 @@ FORMAT = "sgns-run"
 """Root attribute `format`: says that the file is ours."""
 FORMAT_VERSION = 1
 """Root attribute `format_version`: raised when an older program could no longer read the file."""
-PRODUCERS = ("mpm", "rollout")
-"""Who may have made a run: the material point solver, or a trained network."""
+PRODUCERS = ("mpm", "rollout", "imported")
+"""Who may have made a run: the material point solver, a trained network, or another simulator."""
 _WHOLE, _REAL = (int, np.integer), (float, np.floating)
 ATTRIBUTES: dict[str, type | tuple[type, ...]] = {
     "format": str,

@@ -81,7 +81,7 @@ def draw_force(
     line: int = 0,
 ) -> None:
     """A force [N] as an arrow between two points of the picture, and its size on a line in the corner."""
-    colour = run.colour if isinstance(run, FurtherBody) else TRUTH if run.producer == "mpm" else NETWORK
+    colour = run.colour if isinstance(run, FurtherBody) else NETWORK if run.producer == "rollout" else TRUTH
     size = float(np.linalg.norm(force))
     if not 0.0 < size < math.inf:
         return

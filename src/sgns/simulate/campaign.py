@@ -337,7 +337,7 @@ def plan(
         path=Path(asked.path),
         scenes=scenes,
         drawn=drawn,
-        split=_split(list(grids.values()), asked.split, rng),
+        split=split_runs(list(grids.values()), asked.split, rng),
         effects=effects,
         precision=precision,
         seed=seed,
@@ -391,7 +391,7 @@ def _drawn(key: Any, values: Any) -> list[Any]:
     return found
 
 
-def _split(grids: list[list[str]], shares: tuple[float, ...], rng: np.random.Generator) -> dict[str, str]:
+def split_runs(grids: list[list[str]], shares: tuple[float, ...], rng: np.random.Generator) -> dict[str, str]:
     """Each name's part, by chance within each grid, so that every part has its share of every grid."""
     part = {}
     for names in grids:
@@ -401,7 +401,7 @@ def _split(grids: list[list[str]], shares: tuple[float, ...], rng: np.random.Gen
                 "validation" if rank < validation else "test" if rank < validation + test else "train"
             )
     if len(grids) > 1 and "train" not in part.values():  # a few runs of many grids
-        return _split([[name for names in grids for name in names]], shares, rng)
+        return split_runs([[name for names in grids for name in names]], shares, rng)
     return {name: part[name] for names in grids for name in names}
 
 
