@@ -267,8 +267,12 @@ def _run_hydra(command: str, arguments: argparse.Namespace) -> None:
         elif arguments.info is not None:
             hydra.show_info(arguments.info, config_name=command, overrides=settings)
         else:
-            mode = hydra.get_mode(config_name=command, overrides=settings)
-            sweep = arguments.multirun or (mode == RunMode.MULTIRUN and not arguments.run)
+            sweep = arguments.multirun
+            # Only a user's own file, or a setting, makes a sweep without -m. To see it everything is composed, 0.2 s.
+            if not (sweep or arguments.run) and (
+                arguments.config_dir is not None or any("hydra" in one for one in settings)
+            ):
+                sweep = hydra.get_mode(config_name=command, overrides=settings) == RunMode.MULTIRUN
             require_few_jobs(settings if sweep else [])
             if sweep:
                 _check_jobs(hydra, command, settings)
