@@ -79,22 +79,23 @@ OWN = [Effects(), Effects(rate_dependence=False), Effects(separation=False)]
 @pytest.mark.parametrize(
     ("scenes", "effects", "at_once"),
     [
-        (DIFFERENT, None, 2),
-        (DIFFERENT, None, 32),
-        ([*BEDS, replace(BEDS[0], depth=0.04, rake=20.0)], Effects(symmetry=True), 32),
-        (BEDS, Effects(fluidity=True, nonlocality=True), 32),
-        (BEDS, Effects(symmetry=True, nonlocality=True, torque=False), 32),
-        (PERIODIC, None, 32),
-        ([cut(duration=0.15)] * 3, OWN, 32),
+        (DIFFERENT, None, (2, 32)),
+        ([*BEDS, replace(BEDS[0], depth=0.04, rake=20.0)], Effects(symmetry=True), (32,)),
+        (BEDS, Effects(fluidity=True, nonlocality=True), (32,)),
+        (BEDS, Effects(symmetry=True, nonlocality=True, torque=False), (32,)),
+        (PERIODIC, None, (32,)),
+        ([cut(duration=0.15)] * 3, OWN, (32,)),
     ],
-    ids=["two", "all", "symmetric", "fluid", "nonlocal", "periodic", "effects"],
+    ids=["different", "symmetric", "fluid", "nonlocal", "periodic", "effects"],
 )
 def test_scenes_together_are_the_scenes_alone(scenes, effects, at_once):
     own = effects if isinstance(effects, list) else [effects] * len(scenes)
-    together = by_scene(frames_together(scenes, effects, at_once=at_once))
-    for scene, its_effects, frames in zip(scenes, own, together, strict=True):
-        assert_same_frames(frames, Solver(scene, its_effects).frames())
-    assert len({frames[-1].velocity.tobytes() for frames in together}) == len(scenes)
+    alone = [list(Solver(*one).frames()) for one in zip(scenes, own, strict=True)]
+    for number in at_once:
+        together = by_scene(frames_together(scenes, effects, at_once=number))
+        for frames, expected in zip(together, alone, strict=True):
+            assert_same_frames(frames, expected)
+        assert len({frames[-1].velocity.tobytes() for frames in together}) == len(scenes)
 
 
 def test_scenes_of_the_same_kernels_share_every_launch(monkeypatch):

@@ -167,7 +167,7 @@ def area_and_centre(outline):
 
 
 C_SHAPE = np.array([(0, 0), (3, 0), (3, 1), (1, 1), (1, 2), (3, 2), (3, 3), (0, 3)], float)
-ANGLE = np.linspace(0, 2 * np.pi, 20_000, endpoint=False)
+ANGLE = np.linspace(0, 2 * np.pi, 10_000, endpoint=False)
 STAR = (1 + 0.4 * np.sin(40 * ANGLE))[:, None] * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=-1)
 MIDPOINTS = np.array([(0, 0), (1, 0), (2, 0), (3, 0), (4, 0), (4, 1), (4, 2), (2, 1), (0, 2), (0, 1)], float)
 
@@ -177,11 +177,11 @@ def test_a_concave_face_keeps_its_opening(tmp_path, first):
     check_prism(tmp_path, np.roll(C_SHAPE, first, axis=0))
 
 
-@pytest.mark.parametrize("outline", [STAR, MIDPOINTS], ids=["20 000 corners", "corners in a line"])
+@pytest.mark.parametrize("outline", [STAR, MIDPOINTS], ids=["10 000 corners", "corners in a line"])
 def test_faces_of_many_corners(tmp_path, outline):
     begin = time.process_time()
     check_prism(tmp_path, outline)
-    assert time.process_time() - begin < 10.0
+    assert time.process_time() - begin < 5.0
 
 
 def check_prism(tmp_path, outline):

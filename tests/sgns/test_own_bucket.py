@@ -32,7 +32,7 @@ def test_the_guide_from_mesh_to_report(tmp_path, monkeypatch, no_pictures):
     done = []
     for block, line in re.findall(r"^```python\n(.*?)^```$|^ {4}sgns (.*?)$", text, re.M | re.S):
         if block:
-            small = block.replace("random_paths(60,", "random_paths(6,")
+            small = block.replace("random_paths(60,", "random_paths(4,")
             exec(compile(small, PAGE.name, "exec"), {})
             continue
         command, *rest = shlex.split(line)
@@ -40,5 +40,5 @@ def test_the_guide_from_mesh_to_report(tmp_path, monkeypatch, no_pictures):
         assert result.returncode == 0, (line, result.stdout, result.stderr)
         done.append(command)
     assert done == ["simulate", "train", "rollout", "plot", "evaluate"]
-    assert len((tmp_path / "data" / "own" / "runs.csv").read_text().splitlines()) == 7
+    assert len((tmp_path / "data" / "own" / "runs.csv").read_text().splitlines()) == 5
     assert (tmp_path / "new.h5").exists() and list((tmp_path / "outputs" / "own_report").glob("*.html"))

@@ -85,7 +85,9 @@ def test_an_output_that_is_a_pipe_or_taken_is_refused_before_anything_is_compute
         simulate.simulate_one(scene, cfg)
 
 
-@pytest.mark.parametrize("what", [[*SHORT, "output=run.h5"], ["dataset=quick", "dataset.path=data"]])
+@pytest.mark.parametrize(
+    "what", [[*SHORT, "output=run.h5"], ["dataset=quick", "dataset.runs=5", "dataset.path=data"]]
+)
 def test_what_takes_longer_or_more_disk_than_the_limits_is_refused_before_it_begins(tmp_path, what):
     for limit, words in (
         ("time=1e-9", "limits.time is 1e-09 days"),
