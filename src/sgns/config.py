@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import shlex
 import signal
 import threading
@@ -24,6 +25,16 @@ class UserError(Exception):
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same in C, where PyYAML has it
 _DEEPEST = 100
 _MOST = 1_000_000
+
+
+def library(name: str, what: str) -> Any:
+    """A library that only `what` needs."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise UserError(
+            f"{what} needs {name}, which cannot be imported ({error}); pip install {name}"
+        ) from error
 
 
 def parse_yaml(text: str) -> Any:

@@ -165,7 +165,7 @@ class TorchSimulator:
         motion = None
         if (pace := self._simulator._pace) is not None:
             each = (markers(*pair) for pair in zip(*self._plain(paths), strict=True))
-            motion = tuple(ToolMotion.along(path, *pace) for path in each)
+            motion = tuple(ToolMotion.along(path, pace) for path in each)
         count, nothing = len(paths), paths.new_zeros(len(paths), 3)
         before = paths[:, :1].expand(-1, self.history - given, -1)
         told, latent = self._told(context, count), self._history(latent_history, count)

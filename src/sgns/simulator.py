@@ -8,11 +8,12 @@ Letters: B paths, T frames, n particles, M body points, N body nodes, d history 
 from __future__ import annotations
 
 import copy
+import hashlib
 import math
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,21 +22,23 @@ import torch
 from torch import Tensor
 
 from mpm_warp.poses import in_world_frame
+from mpm_warp.settings import short
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate, pretrained_file
-from sgns.model.dynamics import Step, Stepper, together
-from sgns.model.features import ToolMotion, context_of, markers
+from sgns.model.dynamics import Place, Step, Stepper, together
+from sgns.model.features import Pace, context_of, markers
 from sgns.model.training_range import FAR, Excess, TrainingRange
 from sgns.numbers import (
     check_pose,
     check_poses,
+    counted,
     elapsed,
     finite_array,
     first_pose,
     is_whole,
     real_array,
 )
-from sgns.state import Rollout, Rollouts, State
+from sgns.state import Rollout, Rollouts, Snapshot, State
 
 # Every step it is looked at whether the tool's pose and its change are far outside the training range; the rest, such
 # as its lowest point, takes longer and is looked at every so many steps.
@@ -44,12 +47,33 @@ _LOOK_EVERY = 30
 _SETTLING = 0.5
 
 
-class _Place(NamedTuple):
-    """Where one member is."""
+class _Paths(NamedTuple):
+    """What B paths begin with."""
 
-    poses: list[np.ndarray]  # the last d of the tool, (7,) each; none before the first step
-    latent: Tensor  # the last d positions [m], (1, d, r, 3)
-    load: tuple[np.ndarray, np.ndarray]  # force [N] and torque [N m], (3,) each
+    poses: np.ndarray  # of the tool, shape (B, T, 7)
+    points: np.ndarray  # of all, in the body frame [m], shape (M, 3)
+    contexts: list[dict[str, float]]  # what the network is told of each
+    places: list[Sequence[Place]]  # of each, where every member is
+    starts: Sequence[Snapshot | None]
+
+    def part(self, some: slice) -> _Paths:
+        """Some of them."""
+        return _Paths(
+            self.poses[some], self.points, self.contexts[some], self.places[some], self.starts[some]
+        )
+
+
+class _Followed(NamedTuple):
+    """What the dynamics say of B paths, see `Rollout`; arrays of shape (B, T, ...)."""
+
+    latent: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    poses: np.ndarray
+    worlds: np.ndarray | None
+    force_spread: np.ndarray | None
+    latent_spread: np.ndarray | None
+    ends: list[Sequence[Place]]  # of each path, where every member is in the end
 
 
 class Simulator:
@@ -123,10 +147,10 @@ class Simulator:
         self.context_keys, self.predicts_body = dynamics.context_keys, dynamics.predicts_body
         self.frame_rate, self.card = surrogate.frame_rate, surrogate.card
         self.arrangement_hash = self.basis.arrangement_hash
-        # How a tool moves at least that the soil follows the clock under (see `ToolMotion`); None: it always does.
-        self._pace: tuple[float, int] | None = None
+        # When the soil takes a step; None: always.
+        self._pace: Pace | None = None
         if rate_independent and not dynamics.predicts_body:
-            self._pace = surrogate.slowest_travel, math.ceil(_SETTLING * surrogate.frame_rate)
+            self._pace = Pace.of(surrogate.slowest_travel, math.ceil(_SETTLING * surrogate.frame_rate))
         # Copies: what a tensor shares with an array is freed when the tensor is sent to another process.
         self.start_positions, self.body_points, self.mean_force = (
             tensor.cpu().numpy().copy()
@@ -167,16 +191,6 @@ class Simulator:
             UserError: None of that name ships; the line names those that do.
         """
         return cls.load(pretrained_file(name), **options)
-
-    @property
-    def pace(self) -> tuple[float, int] | None:
-        """`least` [m] and `settling` of `sgns.model.features.ToolMotion`; None: the soil follows the clock."""
-        return self._pace
-
-    @property
-    def training_range(self) -> TrainingRange:
-        """What the training runs covered."""
-        return self._surrogate.training_range
 
     @property
     def scene(self) -> dict[str, Any]:
@@ -221,17 +235,21 @@ class Simulator:
             poses = [] if pose is None else [pose] * self.history
         else:
             latent, poses = self._checked_beginning(history)
-        told = self._told(context)
+        told = self._told([context])
         steppers = [member.stepper(len(points), told) for member in self._members]
         # All is in order: nothing is changed before.
         self._frame, self._points, self._context, self._steppers = 0, points, context, steppers
-        place = _Place(poses, latent.clone()[None].to(self.device), (np.zeros(3), np.zeros(3)))
+        place = Place(
+            poses, latent.clone().to(self.device), np.zeros(3), np.zeros(3), self._slow_after(poses, points)
+        )
         self._places = [place] * len(steppers)
+        self._rows: list[np.ndarray | None] = [None] * len(steppers)
         self._answer = self._together(self._places)
-        self._motion: ToolMotion | None = None
         # The last two frames; what the network sees may be further apart.
         last = poses[-2:] or [np.full(7, np.nan)]
-        self._shown = list(zip(last, latent[-len(last) :].numpy().copy(), strict=True))
+        self._shown: Sequence[tuple[np.ndarray, np.ndarray]] = list(
+            zip(last, latent[-len(last) :].numpy().copy(), strict=True)
+        )
         return self._state()
 
     def step(self, tool_pose: np.ndarray) -> State:
@@ -245,18 +263,22 @@ class Simulator:
                 not finite; then the simulator stays where it was.
         """
         pose = check_pose(tool_pose, f"tool pose of frame {self._frame + 1}")
-        places, shown = self._places, self._shown[-1]
+        places, rows, shown = self._places, self._rows, self._shown[-1]
         if not places[0].poses:
-            places = [place._replace(poses=[pose] * self.history) for place in places]
+            poses = [pose] * self.history
+            slow = self._slow_after(poses, self._points)
+            places = [place._replace(poses=poses, slow=slow) for place in places]
             shown = pose, shown[1]
-        motion = None
-        if self._pace is not None:
-            before = self._motion or ToolMotion.along(self._markers(places[0].poses), *self._pace)
-            motion = before.moved(self._markers([pose])[0])
-        if motion is None or motion.steps:
-            places = self._step_soil(places, pose)
+        slow, steps = places[0].slow, True
+        if slow is not None and self._pace is not None:
+            moved, stepped = partial(self._pace.moved, self._points), places[0].poses[-1]
+            slow, steps = self._pace.after(slow, moved(shown[0], pose), lambda: moved(stepped, pose))
+        if steps:
+            places, rows = self._step_soil(places, pose)
             pose = mean_pose([place.poses[-1] for place in places])
-        self._places, self._motion, self._answer = places, motion, self._together(places)
+        if slow != places[0].slow:
+            places = [place._replace(slow=slow) for place in places]
+        self._places, self._rows, self._answer = places, rows, self._together(places)
         self._shown = [shown, (pose, self._answer[0])]
         self._frame += 1
         state = self._state()
@@ -302,31 +324,90 @@ class Simulator:
             stacklevel=3,
         )
 
-    def _step_soil(self, places: Sequence[_Place], pose: np.ndarray) -> list[_Place]:
-        """Let every member take a step to where the tool is put; returns where they are then. What fails changes
-        nothing."""
+    def _step_soil(
+        self, places: Sequence[Place], pose: np.ndarray
+    ) -> tuple[list[Place], list[np.ndarray | None]]:
+        """Let every member take a step to where the tool is put; returns where they are then, and the rows of the
+        tool's last d frames. What fails changes nothing."""
         memories = [stepper.memory for stepper in self._steppers]
         try:
-            return [self._stepped(*pair, pose) for pair in zip(self._steppers, places, strict=True)]
+            members = zip(self._steppers, places, self._rows, strict=True)
+            stepped = [self._stepped(*member, pose) for member in members]
+            return [place for place, _ in stepped], [rows for _, rows in stepped]
         except BaseException:  # an interruption as well
             for stepper, memory in zip(self._steppers, memories, strict=True):
                 stepper.memory = memory
             raise
 
-    def _stepped(self, stepper: Stepper, place: _Place, pose: np.ndarray) -> _Place:
-        """Where one member is after a step."""
-        # One frame more than the network sees, because the first motion needs a frame before it.
-        window = np.stack([*place.poses, pose])
-        body = self.dynamics.track(window, in_world_frame(window, self._points)).frames(slice(1, None))
+    def _stepped(
+        self, stepper: Stepper, place: Place, rows: np.ndarray | None, pose: np.ndarray
+    ) -> tuple[Place, np.ndarray]:
+        """Where one member is after a step, and the rows of the tool's last d frames."""
+        if rows is None:
+            rows = self.dynamics.rows(np.stack(place.poses), self._points)
+        before, following = place.poses[-1], partial(self.dynamics.next_rows, rows)
+        rows = following(before, pose, self._points)
+        step = stepper.step(place.latent[None], rows)
+        self._require_finite(step)
         with torch.inference_mode():
-            step = stepper.advance(place.latent, body)
-            self._require_finite(step)
-            latent = torch.cat([place.latent[:, 1:], step.latent[:, None]], dim=1)
+            latent = torch.cat([place.latent[1:], step.latent])
         if self.predicts_body:
-            there = body.position[0, -2] + step.displacement[0]
-            pose = self.dynamics.predicted_poses(pose[None], there[None].cpu().numpy(), self._points)[0]
+            there = torch.from_numpy(rows[-2, :, :3]) + step.displacement[0].cpu()
+            pose = self.dynamics.predicted_poses(pose[None], there[None].numpy(), self._points)[0]
+            rows = following(before, pose, self._points)
         load = step.force[0].cpu().numpy().copy(), step.torque[0].cpu().numpy().copy()
-        return _Place([*place.poses[1:], pose], latent, load)
+        return Place([*place.poses[1:], pose], latent, *load, place.slow), rows
+
+    def save(self) -> Snapshot:
+        """Where this is now: a small object to keep, to pickle and to send to other processes. `restore` goes on from
+        it; `rollout` and `rollouts` start from it."""
+        places = [
+            place._replace(latent=place.latent.cpu(), memory=stepper.memory)
+            for place, stepper in zip(self._places, self._steppers, strict=True)
+        ]
+        told = self._points, self._context, self._made_by
+        return Snapshot.of(self._frame, self._answer, self._shown, places, *told)
+
+    def restore(self, snapshot: Snapshot) -> State:
+        """Go on from where this simulator was saved, or another one of the same checkpoint and options, to the bit as
+        that one did; returns the state there.
+
+        Raises:
+            UserError: It was saved by another simulator; then this one stays where it was.
+        """
+        self._require_own(snapshot)
+        if self._context != snapshot._context or not np.array_equal(self._points, snapshot._points):
+            told = self._told([snapshot._context])
+            self._steppers = [member.stepper(len(snapshot._points), told) for member in self._members]
+        for stepper, place in zip(self._steppers, snapshot._places, strict=True):
+            stepper.memory = place.memory
+        self._frame, self._points, self._context = snapshot.frame, snapshot._points, snapshot._context
+        self._places = [place._replace(latent=place.latent.to(self.device)) for place in snapshot._places]
+        self._rows = [None] * len(self._places)
+        self._answer, self._shown = snapshot._answer, snapshot._shown
+        return self._state()
+
+    def _require_own(self, snapshot: Snapshot) -> None:
+        """Refuse what `save` of such a simulator did not give."""
+        if not isinstance(snapshot, Snapshot):
+            raise UserError(
+                f"the snapshot is a {type(snapshot).__name__}; it must be what `Simulator.save` gives"
+            )
+        if snapshot._made_by != self._made_by:
+            raise UserError(
+                f"the snapshot was saved by another simulator ({snapshot._made_by}) than this one ({self._made_by}); "
+                "load the checkpoint that it was saved with, with the same options"
+            )
+
+    @cached_property
+    def _made_by(self) -> str:
+        """What tells a place of this simulator from one of others."""
+        digest = hashlib.sha256()
+        for value in self._surrogate.dynamics.state_dict().values():
+            digest.update(value.cpu().numpy().tobytes())
+        kind, many = self.dynamics.settings.kind, counted(len(self._members), "member")
+        pace = "own pace" if self._pace is None else "tool's pace"
+        return f"{kind} {digest.hexdigest()[:8]}, {self.num_modes} modes, {many}, {pace}"
 
     def rollout(
         self,
@@ -336,76 +417,75 @@ class Simulator:
         force_history: np.ndarray | None = None,
         torque_history: np.ndarray | None = None,
         values: Mapping[str, Any] | None = None,
+        start: Snapshot | None = None,
     ) -> Rollout:
         """Follow a whole tool path; the same as stepping along it. Leaves `reset` and `step` alone.
 
         Args:
             poses: Tool at every frame, shape (T, 7); what is predicted of it is read in the given frames only.
-            body_points: In the body frame [m], shape (M, 3); None: those of the training runs.
+            body_points: In the body frame [m], shape (M, 3); None: those of the start, or of the training runs.
             latent_history: The first d frames [m], shape (d, r, 3); frames d to T - 1 are predicted. None:
-                the soil is at rest at its common start in frame 0, and frames 1 to T - 1 are predicted.
+                frame 0 is the start, and frames 1 to T - 1 are predicted.
             force_history: Force of the first d frames [N], shape (d, 3), copied; zero if None. Needs a latent history.
             torque_history: Torque of the first d frames [N m], likewise.
-            values: The scene as plain data, as for `reset`.
+            values: The scene as plain data, as for `reset`; None: those of the start, or of `simulator.scene`.
+            start: What `save` gave, or the `end` of another rollout: frame 0, in which the tool is where it was then.
+                None: the bed at rest at its common start.
 
         Raises:
             UserError: What is given is not of the shape and kind above, or the path is shorter than the history.
         """
-        poses, points, d = check_poses(poses), self._checked_points(body_points), self.history
+        poses, d = check_poses(poses), self.history
         loads = [
             None if load is None else finite_array(load, what, (d, 3))
             for what, load in (("force history", force_history), ("torque history", torque_history))
         ]
+        begin = self._begin(poses[None], body_points, [values], [start])
         if latent_history is None:
-            given, latent = 1, self._start_latent.expand(d, -1, -1)
+            given = 1
             if any(load is not None for load in loads):
                 raise UserError(
                     "a force or torque history needs the latent history of the same frames; give it, too"
                 )
         else:
             given, latent = d, self._checked_history(latent_history)
+            if start is not None:
+                raise UserError("a path begins with a start or with a latent history; give one of them")
             if len(poses) < d:
                 raise UserError(
                     f"the path has {len(poses)} frames; with a given history it needs at least {d}"
                 )
-        context = self._context_of(values)
-        told = self._told(context)
+            slow, rest = self._slow_after(poses[:d], begin.points), np.zeros(3)
+            begin = begin._replace(
+                places=[[Place(list(poses[:d]), latent, rest, rest, slow)] * len(self._members)]
+            )
         began = time.perf_counter()
-        found = self._followed(poses[None], points, told, latent, given, loads)
+        found = self._followed(begin, given, loads)
         wall_time = elapsed(began, time.perf_counter())
-        parts: list[Any] = [None if part is None else part[0] for part in found]
+        (context,), (end,) = begin.contexts, self._ends(found, begin)
+        parts: list[Any] = [None if part is None else part[0] for part in found[:-1]]
         states, force, torque, poses, world, *spread = parts
-        self._look(0, poses[None], points, context)
-        excess = partial(self._surrogate.training_range.excess, poses, points, states, context)
+        self._look(0, begin.poses, begin.points, context)
+        excess = partial(self._surrogate.training_range.excess, poses, begin.points, states, context)
         of = self.basis, self.scene
-        return Rollout(states, force, torque, poses, world, wall_time, *of, excess, *spread)
-
-    def _followed(self, poses: np.ndarray, *arguments: Any) -> tuple[Any, ...]:
-        """What `Dynamics.follow` finds, the mean of all members, then the spread of force and modes."""
-        points, told, latent, *given = arguments
-        each = [member.follow(poses, points, told, latent, self._pace, *given) for member in self._members]
-        if len(each) == 1:
-            return *each[0], None, None
-        states, force, torque, poses, worlds = (np.stack(parts) for parts in zip(*each, strict=True))
-        states, latent_spread = together(states, self._band[3])
-        force, force_spread = together(force, self._band[:3])
-        torque, worlds = (together(part, 1.0)[0] for part in (torque, worlds))
-        return states, force, torque, mean_pose(list(poses)), worlds, force_spread, latent_spread
+        return Rollout(states, force, torque, poses, world, wall_time, end, *of, excess, *spread)
 
     def rollouts(
         self,
         poses: np.ndarray,
         body_points: np.ndarray | None = None,
-        values: Mapping[str, Any] | None = None,
+        values: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
         paths_at_once: int = 256,
+        start: Snapshot | Sequence[Snapshot] | None = None,
     ) -> Rollouts:
-        """Follow many tool paths side by side, each from the bed at rest; one by one they give the same to rounding.
+        """Follow many tool paths side by side; one by one they give the same to rounding.
 
         Args:
             poses: Tool on every path at every frame, shape (B, T, 7).
-            body_points: In the body frame [m], shape (M, 3), for all; None: those of the training runs.
-            values: The scene as plain data, as for `reset`, for all.
+            body_points: As for `rollout`, for all paths.
+            values: As for `rollout`, for all paths or a list of B.
             paths_at_once: Paths stepped together: bounds the memory beside the result.
+            start: As for `rollout`, for all paths or a list of B.
 
         Returns:
             Modes, force, torque and poses of all paths: (B, T, ...) arrays, see `Rollouts`.
@@ -418,56 +498,139 @@ class Simulator:
             raise UserError(f"the array of paths has shape {poses.shape}; it needs shape (paths, frames, 7)")
         if not is_whole(paths_at_once) or paths_at_once < 1:
             raise UserError(f"paths_at_once is {paths_at_once!r}; it must be a whole number, at least 1")
-        points, context = self._checked_points(body_points), self._context_of(values)
-        told = self._told(context)
-        poses = np.stack([check_poses(path, f"path {i}") for i, path in enumerate(poses)])
-        start = self._start_latent.expand(self.history, -1, -1)
+        poses, count = np.stack([check_poses(path, f"path {i}") for i, path in enumerate(poses)]), len(poses)
+        told, starts = one_each(values, Mapping, "values", count), one_each(start, Snapshot, "start", count)
+        begin = self._begin(poses, body_points, told, starts)
         began = time.perf_counter()
-        parts = []
-        for first in range(0, len(poses), paths_at_once):
-            found = self._followed(poses[first : first + paths_at_once], points, told, start)
-            parts.append((*found[:4], *found[5:]))
-        whole: list[Any] = [
-            None if part[0] is None else np.concatenate(part) for part in zip(*parts, strict=True)
+        found = [
+            self._followed(begin.part(slice(first, first + paths_at_once)))._replace(worlds=None)
+            for first in range(0, count, paths_at_once)
         ]
-        latent, force, torque, poses, *spread = whole
+        whole: list[Any] = [
+            None if part[0] is None else np.concatenate(part) for part in list(zip(*found, strict=True))[:-1]
+        ]
+        latent, force, torque, poses, _, *spread = whole
         wall_time = elapsed(began, time.perf_counter())
-        self._look(0, poses, points, context, paths_at_once)
-        excess = partial(self._surrogate.training_range.excess, points=points, context=context)
-        scene = self._surrogate.card["scene"]
-        return Rollouts(latent, force, torque, poses, wall_time, self.basis, scene, excess, *spread)
+        ends = [
+            end
+            for first, part in enumerate(found)
+            for end in self._ends(part, begin.part(slice(first * paths_at_once, (first + 1) * paths_at_once)))
+        ]
+        self._look(0, begin.poses, begin.points, begin.contexts[0], paths_at_once)
+        excess = partial(self._surrogate.training_range.excess, points=begin.points)
+        of = self.basis, self._surrogate.card["scene"]
+        return Rollouts(latent, force, torque, poses, wall_time, ends, *of, excess, begin.contexts, *spread)
+
+    def _begin(
+        self,
+        poses: np.ndarray,
+        body_points: np.ndarray | None,
+        values: Sequence[Mapping[str, Any] | None],
+        starts: Sequence[Snapshot | None],
+    ) -> _Paths:
+        """What B paths of poses (B, T, 7) begin with."""
+        for start in starts:
+            if start is not None:
+                self._require_own(start)
+        own = [start._points for start in starts if start is not None]
+        if body_points is None and own:
+            points = own[0]
+            if any(not np.array_equal(points, other) for other in own):
+                raise UserError(
+                    "the starts have different body points; give body_points, or roll out each tool on its own"
+                )
+        else:
+            points = self._checked_points(body_points)
+        contexts: list[dict[str, float]] = []
+        places: list[Sequence[Place]] = []
+        poses, zero = poses.copy(), np.zeros(3)
+        for i, (path, told, start) in enumerate(zip(poses, values, starts, strict=True)):
+            contexts.append(self._context_of(told) if told is not None or start is None else start._context)
+            rest = [path[0].copy()] * self.history
+            slow = None if self._pace is None else self._pace.settling
+            if start is None:
+                latent = self._start_latent.expand(self.history, -1, -1)
+                places.append([Place(rest, latent, zero, zero, slow)] * len(self._members))
+            elif not start._places[0].poses:  # the tool is nowhere yet
+                places.append([place._replace(poses=rest, slow=slow) for place in start._places])
+            else:
+                there = start._shown[-1][0]
+                if not self.predicts_body and not same_pose(path[0], there):
+                    raise UserError(
+                        f"path {i} begins at {path[0].tolist()}, and the tool of its start is at {there.tolist()}; "
+                        "let it begin there: its frame 0 is the start"
+                    )
+                path[0] = there
+                places.append(start._places)
+        return _Paths(poses, points, contexts, places, starts)
+
+    def _followed(
+        self, begin: _Paths, given: int = 1, loads: Sequence[np.ndarray | None] = (None, None)
+    ) -> _Followed:
+        """What `Dynamics.follow` finds, the mean of all members, then the spread of force and modes."""
+        told = self._told(begin.contexts)
+        each, last = [], []
+        for member, places in zip(self._members, zip(*begin.places, strict=True), strict=True):
+            parts, final = member.follow(begin.poses, begin.points, told, places, self._pace, given, loads)
+            each.append(parts)
+            last.append(final)
+        ends: list[Sequence[Place]] = list(zip(*last, strict=True))
+        if len(each) == 1:
+            states, force, torque, poses, worlds = each[0]
+            return _Followed(states, force, torque, poses, worlds, None, None, ends)
+        states, force, torque, poses, worlds = (np.stack(parts) for parts in zip(*each, strict=True))
+        states, latent_spread = together(states, self._band[3])
+        force, force_spread = together(force, self._band[:3])
+        torque, worlds = (together(part, 1.0)[0] for part in (torque, worlds))
+        return _Followed(
+            states, force, torque, mean_pose(list(poses)), worlds, force_spread, latent_spread, ends
+        )
+
+    def _ends(self, found: _Followed, begin: _Paths) -> list[Snapshot]:
+        """Where each path ends."""
+        ends = []
+        for i, (places, start) in enumerate(zip(found.ends, begin.starts, strict=True)):
+            frame = found.latent.shape[1] - 1 + (0 if start is None else start.frame)
+            answer = (found.latent, found.force, found.torque, found.force_spread, found.latent_spread)
+            last = [part if part is None else part[i, -1].copy() for part in answer]
+            pairs = zip(found.poses[i, -2:].copy(), found.latent[i, -2:].copy(), strict=True)
+            told = begin.points, begin.contexts[i], self._made_by
+            ends.append(Snapshot.of(frame, tuple(last), list(pairs), places, *told))
+        return ends
 
     def _require_finite(self, step: Step) -> None:
         """Refuses a step that says nothing; the simulator stays where it was."""
-        if bool(torch.cat([part.flatten() for part in step]).isfinite().all()):
+        # A sum is quicker than a look at every value; it may also overflow.
+        if math.isfinite(sum(float(part.cpu().numpy().sum()) for part in step)):
             return
         names = "the soil's state", "the force", "the torque", "the tool's motion"
-        name = next(n for n, part in zip(names, step, strict=True) if not bool(part.isfinite().all()))
+        bad = [name for name, part in zip(names, step, strict=True) if not bool(part.isfinite().all())]
+        if not bad:
+            return
         raise UserError(
-            f"{name} is not finite at frame {self._frame + 1}, likely because the tool's pose of that frame lies "
+            f"{bad[0]} is not finite at frame {self._frame + 1}, likely because the tool's pose of that frame lies "
             f"far from everything the network knows; frame {self._frame} is kept: step to another pose, or reset"
         )
 
     def _state(self) -> State:
         """The newest state."""
-        # How far it is outside takes the frame before as well, for velocities.
-        poses, latent = (np.stack(part) for part in zip(*self._shown, strict=True))
         # It holds nothing of the simulator that goes on changing.
-        excess = partial(self._surrogate.training_range.excess, poses, self._points, latent, self._context)
+        excess = partial(_excess_of, self._surrogate.training_range, self._shown, self._points, self._context)
         copies: list[Any] = [part if part is None else part.copy() for part in self._answer]
-        _, force, torque, *spread = copies
-        scene, newest = self._surrogate.card["scene"], (latent[-1].copy(), force, torque, poses[-1].copy())
-        return State(self._frame, *newest, self.basis, scene, excess, *spread)
+        latent, force, torque, *spread = copies
+        scene, pose = self._surrogate.card["scene"], self._shown[-1][0].copy()
+        return State(self._frame, latent, force, torque, pose, self.basis, scene, excess, *spread)
 
-    def _together(self, places: Sequence[_Place]) -> tuple[Any, ...]:
+    def _together(self, places: Sequence[Place]) -> tuple[Any, ...]:
         """Newest latent positions, force and torque, the mean of all members, then the spread of force and modes."""
-        latents = [place.latent[0, -1].cpu().numpy() for place in places]
+        # Copies, see `__init__`.
+        latents = [place.latent[-1].cpu().numpy().copy() for place in places]
         if len(places) == 1:
-            return latents[0].copy(), *places[0].load, None, None
+            return latents[0], places[0].force, places[0].torque, None, None
         latent, latent_spread = together(np.stack(latents), self._band[3])
-        forces, torques = (np.stack(loads) for loads in zip(*(place.load for place in places), strict=True))
-        force, force_spread = together(forces, self._band[:3])
-        return latent, force, together(torques, 1.0)[0], force_spread, latent_spread
+        force, force_spread = together(np.stack([place.force for place in places]), self._band[:3])
+        torque, _ = together(np.stack([place.torque for place in places]), 1.0)
+        return latent, force, torque, force_spread, latent_spread
 
     def _context_of(self, values: Mapping[str, Any] | None) -> dict[str, float]:
         """The numbers of a scene that the network is told, by their keys."""
@@ -478,9 +641,17 @@ class Simulator:
         numbers = context_of(self.card["scene"] if values is None else values, self.context_keys)
         return dict(zip(self.context_keys, numbers.tolist(), strict=True))
 
-    def _told(self, context: Mapping[str, float]) -> Tensor:
-        """The numbers as the dynamics take them, shape (1, K)."""
-        return torch.tensor([list(context.values())], dtype=torch.float64, device=self.device)
+    def _told(self, contexts: Sequence[Mapping[str, float]]) -> Tensor:
+        """The numbers as the dynamics take them, shape (B, K)."""
+        rows = [list(context.values()) for context in contexts]
+        return torch.tensor(rows, dtype=torch.float64, device=self.device)
+
+    def _slow_after(self, poses: Sequence[np.ndarray] | np.ndarray, points: np.ndarray) -> int | None:
+        """Frames since the tool was last not slow after some poses, if that is looked at and it is somewhere."""
+        if self._pace is None or not len(poses):
+            return None
+        path = np.stack(list(poses))
+        return self._pace.slow_after(markers(path, in_world_frame(path, points)))
 
     def _checked_history(self, latent: np.ndarray | Tensor) -> Tensor:
         if isinstance(latent, Tensor):
@@ -511,10 +682,6 @@ class Simulator:
             )
         return found
 
-    def _markers(self, poses: Sequence[np.ndarray]) -> np.ndarray:
-        path = np.stack(poses)
-        return markers(path, in_world_frame(path, self._points))
-
 
 def mean_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
     """Of the poses (..., 7) that members predict, or that all were given."""
@@ -523,3 +690,28 @@ def mean_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
     mean = np.mean(poses, axis=0)
     mean[..., 3:] /= np.linalg.norm(mean[..., 3:], axis=-1, keepdims=True)
     return mean
+
+
+def same_pose(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two poses (7,) are the same within a micrometre and 0.1 mrad."""
+    return bool(np.abs(one[:3] - other[:3]).max() < 1e-6 and 1.0 - abs(one[3:] @ other[3:]) < 1e-9)
+
+
+def one_each(value: Any, kind: type, name: str, count: int) -> list[Any]:
+    """What is given for all paths, or a list of one for each, as such a list."""
+    if value is None or isinstance(value, kind):
+        return [value] * count
+    if not isinstance(value, (list, tuple)) or len(value) != count:
+        raise UserError(
+            f"{name} is {short(value)}; it must be one for all paths, or a list of {count}, one for each"
+        )
+    return list(value)
+
+
+def _excess_of(
+    known: TrainingRange, shown: Sequence[tuple[np.ndarray, np.ndarray]], *told: Any
+) -> Excess | None:
+    """Of the last two frames: velocities take the one before as well."""
+    poses, latent = (np.stack(part) for part in zip(*shown, strict=True))
+    points, context = told
+    return known.excess(poses, points, latent, context)

@@ -5,19 +5,24 @@ Letters: B paths, T frames, n particles, M body points, r modes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mpm_warp.settings import short_repr
-from sgns.config import UserError
+from sgns.config import UserError, library
+from sgns.data.run import AXES, POSE
 from sgns.data.surface import Surface, soil_surface
+from sgns.model.dynamics import Place
 from sgns.model.training_range import Excess
 from sgns.numbers import counted, is_whole
 from sgns.reduction.basis import Basis
+
+if TYPE_CHECKING:
+    import xarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +66,46 @@ class State:
         """Positions of all particles [m], shape (n, 3); decoded when asked for."""
         return self._basis.inverse(self.latent).numpy()
 
-    def surface(self) -> Surface:
-        """The soil's surface: x (nx,), y (ny,) and heights z (nx, ny) [m]; as `Run.surface`."""
-        return soil_surface(self.soil(), self._scene)
+    def surface(self, resolution: float | None = None) -> Surface:
+        """The soil's surface: x (nx,), y (ny,) and heights z (nx, ny) [m]; in cells with this edge [m], or in columns
+        two particle spacings wide; as `Run.surface`."""
+        return soil_surface(self.soil(), self._scene, resolution)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """All of it with named dimensions and units, and `position` of all particles. Needs xarray."""
+        position = ("particle", "axis"), self.soil(), {"units": "m"}
+        return _dataset(self, (), self._scene, position=position)
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """Where a simulator is, or where a path ends: soil, tool, and all that the next steps follow from. Made by
+    `Simulator.save`; small, and may be pickled.
+
+    Attributes:
+        frame: As of `State`.
+        latent: Likewise.
+        pose: Likewise.
+    """
+
+    __repr__ = short_repr
+
+    frame: int
+    latent: np.ndarray
+    pose: np.ndarray
+    _answer: tuple[Any, ...] = field(repr=False)
+    _shown: Sequence[tuple[np.ndarray, np.ndarray]] = field(repr=False)
+    _places: Sequence[Place] = field(repr=False)
+    _points: np.ndarray = field(repr=False)
+    _context: dict[str, float] = field(repr=False)
+    _made_by: str = field(repr=False)
+
+    @classmethod
+    def of(
+        cls, frame: int, answer: tuple[Any, ...], shown: Sequence[tuple[np.ndarray, np.ndarray]], *rest: Any
+    ) -> Snapshot:
+        """What may be written to is a copy."""
+        return cls(frame, answer[0].copy(), shown[-1][0].copy(), answer, shown, *rest)
 
 
 def require_index(name: str, index: Any, count: int) -> None:
@@ -83,6 +125,7 @@ class Rollout:
         poses: Of the tool, shape (T, 7); predicted where the tool is free.
         body_points: World frame [m], shape (T, M, 3).
         wall_time_s: Time of all steps, force included, decoding not [s].
+        end: Where the path ends; other paths may start there.
         force_spread: As of `State`, shape (T, 3), or None.
         latent_spread: Shape (T, r, 3), or None.
     """
@@ -96,6 +139,7 @@ class Rollout:
     poses: np.ndarray
     body_points: np.ndarray
     wall_time_s: float
+    end: Snapshot = field(repr=False)
     _basis: Basis = field(repr=False)
     _scene: Mapping[str, Any] = field(repr=False)
     _excess: Callable[[], Excess | None] = field(repr=False)
@@ -118,14 +162,20 @@ class Rollout:
         require_index("frame", frame, len(self.latent))
         return self._basis.inverse(self.latent[frame]).numpy()
 
-    def surface(self, frame: int = -1) -> Surface:
+    def surface(self, frame: int = -1, resolution: float | None = None) -> Surface:
         """The soil's surface there, as `State.surface`."""
-        return soil_surface(self.soil(frame), self._scene)
+        return soil_surface(self.soil(frame), self._scene, resolution)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """All frames with named dimensions and units, as `Run.to_xarray`, but modes in place of particles. Needs
+        xarray."""
+        return _dataset(self, ("time",), self._scene)
 
 
 @dataclass(frozen=True, eq=False)
 class Rollouts:
-    """Many tool paths: as of `Rollout`, with B before every shape; `wall_time_s` is that of all of them."""
+    """Many tool paths: as of `Rollout`, with B before every shape; `wall_time_s` is that of all of them, and `ends` are
+    where they end."""
 
     __repr__ = short_repr
 
@@ -134,9 +184,11 @@ class Rollouts:
     torque: np.ndarray
     poses: np.ndarray
     wall_time_s: float
+    ends: list[Snapshot] = field(repr=False)
     _basis: Basis = field(repr=False)
     _scene: Mapping[str, Any] = field(repr=False)
     _excess: Callable[..., Excess | None] = field(repr=False)
+    _contexts: list[dict[str, float]] = field(repr=False)
     force_spread: np.ndarray | None = None
     latent_spread: np.ndarray | None = None
 
@@ -144,7 +196,8 @@ class Rollouts:
     def outside(self) -> np.ndarray:
         """Of every path the largest of all frames, as `Rollout.outside`, shape (B,); computed when asked for."""
         each = [
-            self._excess(path, latent=latent) for path, latent in zip(self.poses, self.latent, strict=True)
+            self._excess(path, latent=latent, context=context)
+            for path, latent, context in zip(self.poses, self.latent, self._contexts, strict=True)
         ]
         return np.array([np.nan if found is None else found.largest for found in each])
 
@@ -155,6 +208,37 @@ class Rollouts:
             require_index(name, index, count)
         return self._basis.inverse(self.latent[path, frame]).numpy()
 
-    def surface(self, path: int, frame: int = -1) -> Surface:
+    def surface(self, path: int, frame: int = -1, resolution: float | None = None) -> Surface:
         """The soil's surface there, as `State.surface`."""
-        return soil_surface(self.soil(path, frame), self._scene)
+        return soil_surface(self.soil(path, frame), self._scene, resolution)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """As `Rollout.to_xarray`, with the dimension `path` and how far each is `outside`. Needs xarray."""
+        return _dataset(self, ("path", "time"), self._scene, outside=("path", self.outside))
+
+
+# What an answer may hold: the name of its variable, its dimensions in a frame, its unit.
+_NAMED = {
+    "latent": ("latent", ("mode", "axis"), "m"),
+    "force": ("force", ("axis",), "N"),
+    "torque": ("torque", ("axis",), "N m"),
+    "pose": ("pose", ("component",), "m, 1"),
+    "poses": ("pose", ("component",), "m, 1"),
+    "body_points": ("body_points", ("point", "axis"), "m"),
+    "force_spread": ("force_spread", ("axis",), "N"),
+    "latent_spread": ("latent_spread", ("mode", "axis"), "m"),
+}
+
+
+def _dataset(answer: Any, lead: tuple[str, ...], scene: Mapping[str, Any], **more: Any) -> xarray.Dataset:
+    """An answer whose arrays begin with some dimensions, and more variables."""
+    xr = library("xarray", f"{type(answer).__name__.lower()}.to_xarray()")
+    variables = {
+        name: ((*lead, *dims), getattr(answer, field), {"units": unit})
+        for field, (name, dims, unit) in _NAMED.items()
+        if getattr(answer, field, None) is not None
+    }
+    frames = np.arange(answer.force.shape[-2]) if "time" in lead else answer.frame
+    time = ("time",) if "time" in lead else (), frames / scene["frame_rate"], {"units": "s"}
+    coords = {"time": time, "axis": AXES, "component": POSE}
+    return xr.Dataset(variables | more, coords, {"frame_rate": scene["frame_rate"]})

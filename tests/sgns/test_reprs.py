@@ -30,6 +30,7 @@ def test_what_is_learned_prints_in_a_line(trained) -> None:
         "State(frame=0, latent=<(4, 3) float64>, force=[0, 0, 0]": state,
         f"Rollout(latent=<({len(path)}, 4, 3) float64>, ": rollout,
         f"Rollouts(latent=<(1, {len(path)}, 4, 3) float64>, ": simulator.rollouts(path[None]),
+        "Snapshot(frame=0, latent=<(4, 3) float64>, pose=[": simulator.save(),
         "Excess(amount=<": rollout.excess,
         "Basis(mean=<(": simulator.basis,
         "Surrogate(network: 4 modes of ": trained.surrogate("network"),

@@ -19,6 +19,7 @@ from sgns.model.checkpoint import load_surrogate
 from sgns.simulator import Simulator
 from sgns.train.command import train
 from sgns_testing.commands import python
+from sgns_testing.stepping import assert_same, stepped
 from sgns_testing.tiny import BRIEF, MODEL, POLYNOMIAL
 from sgns_testing.trained import TrainedKinds
 
@@ -31,15 +32,12 @@ def trained(tmp_path_factory) -> TrainedKinds:
     return TrainedKinds.of(tmp_path_factory.mktemp("tiny"), MODELS)
 
 
-def assert_same(found, expected, frame=...) -> None:
-    """Two states or rollouts to the bit, or a state and a frame of a rollout."""
-    for name in ("latent", "force", "torque"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name)[frame])
-
-
-def stepped(simulator: Simulator, path: np.ndarray) -> list:
-    """States along a path from its first pose."""
-    return [simulator.reset(path), *map(simulator.step, path[1:])]
+@pytest.fixture(scope="module")
+def told(trained, tmp_path_factory) -> Simulator:
+    """A network that is told the depth."""
+    folder = tmp_path_factory.mktemp("told")
+    train(trained.data, num_modes=4, model=MODEL | {"context": ["depth"]}, training=BRIEF, output=folder)
+    return Simulator.load(folder / "best.ckpt")
 
 
 def along_x(trained: TrainedKinds, steps: list[float]) -> np.ndarray:
@@ -91,6 +89,55 @@ def test_many_paths_are_the_paths_one_by_one(trained, kind) -> None:
             found, expected = getattr(many, name)[i], getattr(one, name)
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * max(np.abs(expected).max(), 1.0))
     assert not np.diff(many.latent[1], axis=0).any() and not many.force[1].any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_path_goes_on_from_anywhere_as_steps_do(trained, kind) -> None:
+    """At any pace, at its beginning, at rest, while the tool creeps, and after it."""
+    simulator, path = trained.simulator(kind), along_x(trained, CHANGING)
+    states = stepped(simulator, path)
+    for here in (0, 38, 46, 57):
+        stepped(simulator, path[: here + 1])
+        start, first = simulator.save(), simulator.rollout(path[: here + 1])
+        for begin in (start, first.end):
+            rest = simulator.rollout(path[here:], start=begin)
+            for frame, state in enumerate(states[here:]):
+                if kind != "points" or begin is start:
+                    assert_same(state, rest, frame)
+                else:  # what is kept of the edges within a body is not in a rollout's end
+                    np.testing.assert_allclose(state.latent, rest.latent[frame], rtol=0, atol=1e-5)
+        stepped(simulator, trained.data.runs("train")[0].pose[:3])
+        simulator.restore(start)
+        for pose, state in zip(path[here + 1 :], states[here + 1 :], strict=True):
+            assert_same(simulator.step(pose), state)
+
+
+def test_each_path_has_its_own_start_and_values(trained, told) -> None:
+    simulator, path = told, trained.run.pose
+    scene = simulator.scene
+    deeper = scene | {"depth": 1.5 * scene["depth"]}
+    simulator.reset(path, values=deeper)
+    for pose in path[1:4]:
+        simulator.step(pose)
+    here = simulator.save()
+    stepped(simulator, path[:4])
+    there = simulator.save()
+    starts, values = [here, there, here, there], [None, None, scene, deeper]
+    paths = np.stack([path[3:]] * 4)
+    many = simulator.rollouts(paths, start=starts, values=values)
+    each = [simulator.rollout(path[3:], start=s, values=v) for s, v in zip(starts, values, strict=True)]
+    for i, one in enumerate(each):
+        np.testing.assert_allclose(many.force[i], one.force, rtol=0, atol=1e-5 * np.abs(one.force).max())
+        assert many.outside[i] == pytest.approx(one.outside, rel=1e-3, abs=1e-6)
+    # Without values a path goes on with those of its start.
+    assert np.abs(each[0].force - each[2].force).max() > 1e-6
+    simulator.restore(here)
+    assert_same(simulator.step(path[4]), each[0], 1)
+    for depths in (values[2:], [deeper, scene]):
+        both = simulator.rollouts(paths[:2], values=depths)
+        for i, told_of in enumerate(depths):
+            one = simulator.rollout(path[3:], values=told_of)
+            np.testing.assert_allclose(both.latent[i], one.latent, rtol=0, atol=1e-5)
 
 
 def test_what_is_given_stays(trained) -> None:
@@ -391,6 +438,9 @@ def test_other_processes_answer_the_same(trained, method) -> None:
                 np.testing.assert_array_equal(there.soil(), here.soil())
             rollout = simulator.rollout(path)
             assert_same(pool.submit(simulator.rollout, path).result(timeout=100), rollout)
+            away = copy.copy(simulator)
+            away.reset()
+            assert_same(pool.submit(away.restore, simulator.save()).result(timeout=100), here)
             np.testing.assert_array_equal(here.latent, rollout.latent[6])
             for array, expected in zip(kept, known, strict=True):
                 np.testing.assert_array_equal(array, expected)
@@ -632,7 +682,15 @@ def test_steps_of_several_members_are_their_rollout(trained, ensemble) -> None:
         np.testing.assert_array_equal(state.force_spread, found.force_spread[frame])
         np.testing.assert_array_equal(state.latent_spread, found.latent_spread[frame])
     np.testing.assert_array_equal(many.force_spread[1], found.force_spread)
-    assert_same(copied.step(path[-1]), simulator.step(path[-1]), ...)
+    start = simulator.save()
+    more = path[-1:].repeat(3, axis=0)
+    rest = simulator.rollout(more, start=start)
+    for frame in (1, 2):
+        assert_same(copied.step(more[frame]), rest, frame)
+        state = simulator.step(more[frame])
+        assert_same(state, rest, frame)
+        np.testing.assert_array_equal(state.force_spread, rest.force_spread[frame])
+    np.testing.assert_array_equal(simulator.restore(rest.end).latent_spread, rest.latent_spread[-1])
     assert np.isfinite(states[-1].outside)
 
 

@@ -6,7 +6,6 @@ Letters: T frames, n soil particles, M body points; V vertices and F triangles o
 from __future__ import annotations
 
 import copy
-import importlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +19,7 @@ import numpy as np
 from mpm_warp import Scene, SceneError, Soil, State
 from mpm_warp.motions import Passes, along_and_across
 from mpm_warp.settings import short
-from sgns.config import UserError, parse_yaml
+from sgns.config import UserError, library, parse_yaml
 from sgns.data.files import one_line
 from sgns.data.hdf5 import BROKEN, own_attribute, own_dataset, own_object
 from sgns.data.run_file import (
@@ -187,18 +186,19 @@ class Run:
         """Velocities of the soil particles [m/s] in the chosen frames, shape (t, n, 3), float32."""
         return self._frames("velocity", frames)
 
-    def surface(self, frame: int = -1) -> Surface:
-        """The soil's surface in a frame, the last if none is given: x (nx,), y (ny,) and heights z (nx, ny) [m].
+    def surface(self, frame: int = -1, resolution: float | None = None) -> Surface:
+        """The soil's surface in a frame, the last if none is given: x (nx,), y (ny,) and heights z (nx, ny) [m]; in
+        columns two particle spacings wide, or in cells with this edge [m].
 
         Raises:
-            UserError: `frame` is no whole number or not one of the run, or the scene does not say how its bed is
-                filled.
+            UserError: `frame` is no whole number or not one of the run, the resolution is no such edge, or the scene
+                does not say how its bed is filled.
         """
         if not is_whole(frame):
             raise UserError(
                 f"frame is {frame!r}; it must be a whole number: that of a time t is round(t * run.frame_rate)"
             )
-        return soil_surface(self.positions(int(frame))[0], self.scene)
+        return soil_surface(self.positions(int(frame))[0], self.scene, resolution)
 
     def forces(self) -> pandas.DataFrame:
         """Force [N], torque [N m] and pose of every frame as a table: columns Fx Fy Fz, Tx Ty Tz, x y z [m] and qx qy
@@ -389,16 +389,6 @@ class Run:
             raise UserError(
                 f"{self.path}: {name} is damaged ({one_line(error)}); copy the file again or repeat the run"
             ) from error
-
-
-def library(name: str, what: str) -> Any:
-    """A library that only `what` needs."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise UserError(
-            f"{what} needs {name}, which cannot be imported ({error}); pip install {name}"
-        ) from error
 
 
 CHUNK_BYTES = 32e6  # positions held at one time, float64

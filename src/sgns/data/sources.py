@@ -15,10 +15,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from sgns.config import UserError
+from sgns.config import UserError, library
 from sgns.data.files import read_arrays, read_table
 from sgns.data.hdf5 import BROKEN, open_hdf5, own_attribute, own_dataset
-from sgns.data.run import POSE, library
+from sgns.data.run import POSE
 
 PAGE = "docs/guides/import.md says what a run must hold"
 

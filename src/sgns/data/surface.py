@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from numbers import Real
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from mpm_warp import Bed, SceneError
 from mpm_warp.settings import short_repr
-from sgns.config import UserError
+from sgns.config import UserError, library
+
+if TYPE_CHECKING:
+    import xarray
 
 # A column two particle spacings wide holds several particles of an undisturbed top layer, so that
 # the highest of them follows the surface and no column of a full bed is empty.
@@ -102,12 +107,28 @@ class Surface(NamedTuple):
     def __repr__(self) -> str:
         return short_repr(self)
 
+    def to_xarray(self) -> xarray.DataArray:
+        """The heights with named dimensions x and y. Needs xarray."""
+        xr = library("xarray", "surface.to_xarray()")
+        coords = {name: (name, getattr(self, name), {"units": "m"}) for name in ("x", "y")}
+        return xr.DataArray(self.z, coords, ("x", "y"), "height", {"units": "m"})
 
-def soil_surface(positions: np.ndarray, scene: Mapping[str, Any]) -> Surface:
+
+_MOST_CELLS = 10_000_000
+
+
+def soil_surface(positions: np.ndarray, scene: Mapping[str, Any], resolution: float | None = None) -> Surface:
     """Surface of particles (n, 3) [m] in the bin of a scene, given as plain data.
 
+    Args:
+        positions: Of the particles.
+        scene: Says how the bin is filled.
+        resolution: Edge of the cells [m]; the nearest to it that divides length and width is taken. Heights are still
+            those of columns two particle spacings wide, each cell has the mean over its area: the volume stays. None:
+            the columns themselves.
+
     Raises:
-        UserError: The scene does not say how its bed is filled.
+        UserError: The scene does not say how its bed is filled, or the resolution is no such edge.
     """
     try:
         bed = Bed.from_dict(scene["bed"])
@@ -117,4 +138,32 @@ def soil_surface(positions: np.ndarray, scene: Mapping[str, Any]) -> Surface:
         ) from error
     spacing = bed.particle_spacing * bed.store_every ** (1 / 3)
     grid = columns(np.zeros(3), np.array(bed.size), spacing)
-    return Surface(grid.x_centres, grid.y_centres, height_map(positions, grid) + 0.5 * spacing)
+    surface = Surface(grid.x_centres, grid.y_centres, height_map(positions, grid) + 0.5 * spacing)
+    if resolution is None:
+        return surface
+    size = bed.size[:2]
+    if not (isinstance(resolution, Real) and _least_edge(size) <= resolution <= max(size)):
+        raise UserError(
+            f"resolution is {resolution!r}; allowed: the edge of a cell in metres, {_least_edge(size):.2g} to "
+            f"{max(size):g}"
+        )
+    counts = [max(1, round(length / float(resolution))) for length in size]
+    edges = [np.linspace(0.0, length, count + 1) for length, count in zip(size, counts, strict=True)]
+    cells = SurfaceGrid(*edges)
+    across = _shares(grid.x_edges, cells.x_edges), _shares(grid.y_edges, cells.y_edges)
+    held, known = np.nan_to_num(surface.z), np.isfinite(surface.z).astype(float)
+    total, area = (across[0] @ part @ across[1].T for part in (held, known))
+    with np.errstate(invalid="ignore"):  # where a cell holds no particle
+        return Surface(cells.x_centres, cells.y_centres, total / area)
+
+
+def _least_edge(size: Sequence[float]) -> float:
+    """Of cells that are not too many for the memory [m]."""
+    return math.sqrt(size[0] * size[1] / _MOST_CELLS)
+
+
+def _shares(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """How much of each old interval lies in each new one [m], shape (new, old); by their borders."""
+    low, high = np.maximum(old[:-1], new[:-1, None]), np.minimum(old[1:], new[1:, None])
+    overlap = np.maximum(high - low, 0.0)
+    return np.where(overlap > 1e-9 * (old[-1] - old[0]), overlap, 0.0)  # not round-off

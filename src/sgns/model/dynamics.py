@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from mpm_warp.poses import fitted_poses, in_world_frame
 from sgns.config import UserError
-from sgns.model.features import BodyTrack, body_track, markers, step_frames
+from sgns.model.features import BodyTrack, Pace, body_track, markers, pose_step, step_frames
 from sgns.numbers import is_whole
 from sgns.settings import ModelSettings, PolynomialSettings
 
@@ -132,6 +132,21 @@ class Path(NamedTuple):
     body: BodyTrack  # at all frames, predicted where it is free
 
 
+class Place(NamedTuple):
+    """Where bed and tool are as one member of dynamics has them: all that its next steps follow from."""
+
+    poses: Sequence[
+        np.ndarray
+    ]  # of the tool in the d frames that the soil last took a step into, (7,) each; or none
+    latent: Tensor  # positions in these frames [m], shape (d, r, 3)
+    force: np.ndarray  # over the last step [N], shape (3,)
+    torque: np.ndarray  # [N m], shape (3,)
+    slow: (
+        int | None
+    )  # frames since the tool was last not slow (see `Pace`); None: it always steps, or is nowhere yet
+    memory: Any = None  # of the stepper (see `Stepper.memory`)
+
+
 class Dynamics(nn.Module):
     """History of the modes and motion of the body in, next state and force out.
 
@@ -239,13 +254,16 @@ class Dynamics(nn.Module):
         context (1, K)."""
         return Stepper(self, context)
 
-    def unroll(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Path:
+    def unroll(
+        self, latent: Tensor, body: BodyTrack, context: Tensor | None = None, memory: Any = None
+    ) -> Path:
         """Follow whole tool paths from a given history, feeding predictions back.
 
         Args:
             latent: The first d latent positions of each path [m], shape (B, d, r, 3).
             body: The body at all T frames, (B, T, N, ...); what is predicted of it is read in the first d frames only.
             context: As for `advance`.
+            memory: Of a stepper at the beginning of one path alone.
         """
         return unrolled(
             lambda history, window: self.advance(history, window, context), latent, body, self.predicts_body
@@ -256,64 +274,117 @@ class Dynamics(nn.Module):
         poses: np.ndarray,
         points: np.ndarray,
         context: Tensor,
-        latent: Tensor,
-        pace: tuple[float, int] | None,
+        places: Sequence[Place],
+        pace: Pace | None,
         given: int = 1,
         loads: Sequence[np.ndarray | None] = (None, None),
-    ) -> tuple[np.ndarray, ...]:
-        """Latent positions, force, torque, poses and body points in the world frame along some paths of a tool.
+    ) -> tuple[list[np.ndarray], list[Place]]:
+        """Latent positions, force, torque, poses and body points in the world frame along some paths of a tool, and
+        where each ends.
 
         Args:
             poses: Shape (B, T, 7).
             points: In the body frame [m], shape (M, 3).
-            context: Shape (1, K).
-            latent: The first d positions, shape (d, r, 3); of a bed at rest d times the same.
-            pace: `least` and `settling` of `ToolMotion`; None: the soil takes a step into every frame.
-            given: Frames of the paths that the first positions are of: 1 for a bed at rest, or d.
-            loads: Force and torque of these frames.
+            context: Shape (1, K) or (B, K).
+            places: Where each path begins, B of them.
+            pace: When the soil takes a step; None: into every frame.
+            given: Frames of the paths that are those places' last ones: 1, or d.
+            loads: Force and torque of these frames where they are not those of the places.
         """
-        count, padding = len(poses), self.history - given
+        count, d = len(poses), self.history
         worlds = np.stack([in_world_frame(path, points) for path in poses])
-        shown, newest = self.frames_of(poses, worlds, pace, given)
-        tracks = [self.track(poses[i, index], worlds[i, index]) for i, index in enumerate(shown)]
+        before = np.stack([np.stack(place.poses) for place in places])
+        before_worlds = np.stack([in_world_frame(path, points) for path in before])
+        frames, slow = [np.arange(given, poses.shape[1])] * count, [place.slow for place in places]
+        if pace is not None:
+            for i, path in enumerate(markers(*pair) for pair in zip(poses, worlds, strict=True)):
+                stepped, known = markers(before[i, -1:], before_worlds[i, -1:])[0], slow[i]
+                assert known is not None
+                found, slow[i] = step_frames(path[given - 1 :], stepped, known, pace)
+                frames[i] = found + (given - 1)
+        shown, newest = self.side_by_side(frames, poses.shape[1], given)
+        newest += d - given
+        tracks = []
+        for i, later in enumerate(shown[:, d:]):
+            pairs = (before[i], poses[i, later]), (before_worlds[i], worlds[i, later])
+            tracks.append(self.track(*map(np.concatenate, pairs)))
         track = BodyTrack(*(torch.cat(parts) for parts in zip(*tracks, strict=True)))
         with torch.inference_mode():
-            start = latent.to(self.lowest.device).expand(count, -1, -1, -1)
-            path = self.unroll(start, track, context.expand(count, -1))
-            parts = [part[:, padding:].cpu().numpy() for part in (path.latent, path.force, path.torque)]
-            nodes = path.body.position[:, padding:].cpu().numpy()
-        for part, load in zip(parts[1:], loads, strict=True):
-            if load is not None:
-                part[:, :given] = load
-        parts = [part[np.arange(count)[:, None], newest] for part in parts]
+            start = torch.stack([place.latent for place in places]).to(self.lowest.device)
+            whole = self.unroll(start, track, context.expand(count, -1), places[0].memory)
+            parts = [part.cpu().numpy() for part in (whole.latent, whole.force, whole.torque)]
+            nodes = whole.body.position.cpu().numpy()
+        for part, load, name in zip(parts[1:], loads, ("force", "torque"), strict=True):
+            if load is None:
+                part[:, d - 1] = [getattr(place, name) for place in places]
+            else:
+                part[:, d - given : d] = load
+        latent, force, torque, nodes = (part[np.arange(count)[:, None], newest] for part in (*parts, nodes))
         if self.predicts_body:
-            found = [self.predicted_poses(*pair, points) for pair in zip(poses, nodes, strict=True)]
-            poses, worlds = np.stack(found), nodes
+            poses = np.stack([self.predicted_poses(*pair, points) for pair in zip(poses, nodes, strict=True)])
+            worlds = nodes
             if self.settings.body_nodes == "pose":
                 worlds = np.stack([in_world_frame(path, points) for path in poses])
-        return *parts, poses, worlds
+        ends = []
+        for i, each in enumerate(frames):
+            last, stop = np.concatenate([before[i], poses[i, each]])[-d:].copy(), d + len(each)
+            positions = torch.tensor(parts[0][i, stop - d : stop])
+            ends.append(Place(list(last), positions, force[i, -1].copy(), torque[i, -1].copy(), slow[i]))
+        return [latent, force, torque, poses, worlds], ends
 
     def frames_of(
-        self, poses: np.ndarray, worlds: np.ndarray, pace: tuple[float, int] | None, given: int
+        self, poses: np.ndarray, worlds: np.ndarray, pace: Pace | None, given: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Frames that the soil takes a step into along paths (B, T, 7) with body points in the world frame
-        (B, T, M, 3), after the d that it begins with, shape (B, any); and for every frame of a path which of them, the
-        d but the given left out, is the newest, shape (B, T). Arguments as of `follow`."""
-        every = np.arange(poses.shape[1])
-        frames = [every] * len(poses)
+        """`side_by_side` of the frames that the soil takes a step into along paths (B, T, 7) with body points in the
+        world frame (B, T, M, 3), before which the tool rested. Other arguments as of `follow`."""
+        frames = [np.arange(given, poses.shape[1])] * len(poses)
         if pace is not None:
-            paths = (markers(*path) for path in zip(poses, worlds, strict=True))
-            frames = [step_frames(path, given, *pace) for path in paths]
-        newest = [np.searchsorted(each, every, side="right") - 1 for each in frames]
+            paths = [markers(*path) for path in zip(poses, worlds, strict=True)]
+            found = [
+                step_frames(path[given - 1 :], path[given - 1], pace.slow_after(path[:given]), pace)[0]
+                for path in paths
+            ]
+            frames = [each + given - 1 for each in found]
+        return self.side_by_side(frames, poses.shape[1], given)
+
+    def side_by_side(
+        self, frames: Sequence[np.ndarray], count: int, given: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The d frames that paths of so many frames begin with and those after them that the soil takes a step into,
+        shape (B, any); and for every frame of a path which of them, the d but the given left out, is the newest, shape
+        (B, T)."""
         # Before its first frame a bed is at rest. Side by side all take as many steps: those that are done rest.
-        padding, longest = self.history - given, max(map(len, frames))
-        shown = [np.pad(each, (padding, longest - len(each)), mode="edge") for each in frames]
+        each = [np.concatenate([np.arange(given), one]) for one in frames]
+        every, padding, longest = np.arange(count), self.history - given, max(map(len, each))
+        newest = [np.searchsorted(one, every, side="right") - 1 for one in each]
+        shown = [np.pad(one, (padding, longest - len(one)), mode="edge") for one in each]
         return np.stack(shown), np.stack(newest)
 
     def track(self, poses: np.ndarray, points: np.ndarray) -> BodyTrack:
         """Of poses (T, 7) and body points in the world frame (T, M, 3), with B = 1."""
         track, device = body_track(poses, points, self.settings.body_nodes), self.lowest.device
         return BodyTrack(*(part[None].to(device) for part in track))
+
+    def rows(self, poses: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """What `track` says of poses (T, 7) and body points in the body frame (M, 3), side by side, to be continued
+        frame by frame; shape (T, N, any)."""
+        track = body_track(poses, in_world_frame(poses, points), self.settings.body_nodes)
+        return np.concatenate([part.numpy() for part in track], axis=-1)
+
+    def next_rows(
+        self, rows: np.ndarray, before: np.ndarray, pose: np.ndarray, points: np.ndarray
+    ) -> np.ndarray:
+        """The rows of one frame later: the first frame leaves, the pose (7,) that comes after `before` joins."""
+        if self.settings.body_nodes == "points":
+            return np.concatenate([rows[1:], self.rows(np.stack([before, pose]), points)[1:]])
+        row = np.array(pose_step(before.tolist(), pose.tolist()))
+        return np.concatenate([rows[1:], row[None, None]])
+
+    def track_of(self, rows: np.ndarray) -> BodyTrack:
+        """The track of some rows, with B = 1."""
+        whole = torch.from_numpy(rows)[None].to(self.lowest.device)
+        motion = 9 if self.settings.body_nodes == "pose" else 3
+        return BodyTrack(whole[..., :3], whole[..., 3:motion], whole[..., motion:])
 
     def predicted_poses(self, poses: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Poses (T, 7) of body nodes (T, N, 3) [m]; the prescribed orientation of a pose node is kept."""
@@ -355,6 +426,10 @@ class Stepper:
         """One step; latent (1, d, r, 3) and body (1, d, N, ...) as for `Dynamics.advance`."""
         with torch.inference_mode():
             return self.dynamics.advance(latent, body, self.context)
+
+    def step(self, latent: Tensor, rows: np.ndarray) -> Step:
+        """As `advance`, of the body's rows of d frames (see `Dynamics.rows`)."""
+        return self.advance(latent, self.dynamics.track_of(rows))
 
 
 def unrolled(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mpm_warp.poses import fitted_rotations, rotation_matrices, rotation_vectors
+from mpm_warp.poses import fitted_rotations, in_world_frame, rotation_matrices, rotation_vectors
 from sgns.config import UserError
 from sgns.reduction.reduce import ReducedRun
 
@@ -138,6 +139,48 @@ def body_track(poses: np.ndarray, points: np.ndarray | None, body_nodes: str) ->
     )
 
 
+def pose_step(before: Sequence[float], pose: Sequence[float]) -> tuple[float, ...]:
+    """What `body_track` says of the last of two poses (7,), in plain numbers, which takes a thirtieth of the time:
+    position (3), orientation (6), displacement (3) and rotation vector (3); equal to the bit."""
+    (a, b, c, *q), (x, y, z, *r) = before, pose
+    i, j, k, w = r
+    columns = (
+        *(1 - 2 * (j * j + k * k), 2 * (i * j + k * w), 2 * (i * k - j * w)),
+        *(2 * (i * j - k * w), 1 - 2 * (i * i + k * k), 2 * (j * k + i * w)),
+    )
+    return (x, y, z, *columns, x - a, y - b, z - c, *_rotation_vector(q, r))
+
+
+def _rotation_vector(before: Sequence[float], after: Sequence[float]) -> tuple[float, float, float]:
+    """`rotation_vectors` of two quaternions, in SciPy's order of operations; NaN where SciPy refuses one."""
+    try:
+        (a, b, c, s), (x, y, z, w) = _unit(before), _unit(after)
+        # after * before^-1, the short way round.
+        u, v, t, e = _unit(
+            (
+                w * -a + s * x + (y * -c - z * -b),
+                w * -b + s * y + (z * -a - x * -c),
+                w * -c + s * z + (x * -b - y * -a),
+                w * s - x * -a - y * -b - z * -c,
+            )
+        )
+    except ZeroDivisionError:
+        return math.nan, math.nan, math.nan
+    if e < 0:
+        u, v, t, e = -u, -v, -t, -e
+    angle = 2 * math.atan2(math.sqrt(u * u + v * v + t * t), e)
+    square = angle * angle
+    small = angle <= 1e-3
+    scale = 2 + square / 12 + 7 * square * square / 2880 if small else angle / math.sin(angle / 2)
+    return scale * u, scale * v, scale * t
+
+
+def _unit(q: Sequence[float]) -> tuple[float, float, float, float]:
+    x, y, z, w = q
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    return x / length, y / length, z / length, w / length
+
+
 def free_axes(predicted: bool, body_nodes: str) -> Tensor:
     """Which axes of a body node's position the network predicts, shape (3,) of ones and zeros.
 
@@ -236,43 +279,96 @@ _STILL = 1e-9
 _STOPPING, _ROUNDING = 0.01, 0.01
 
 
+class Pace(NamedTuple):
+    """When soil takes a step under a prescribed tool.
+
+    Attributes:
+        least: How far the tool moves in a frame at least that is not called slow [m].
+        settling: Frames that the soil follows the clock after that: what was thrown up comes down.
+    """
+
+    least: float
+    settling: int
+
+    @classmethod
+    def of(cls, slowest_travel: float, settling: int) -> Pace:
+        """Of training runs whose tools move by so much in a frame at least [m]."""
+        return cls(max(slowest_travel, _STILL), settling)
+
+    def after(self, slow: int, fast: bool, far: Callable[[], bool]) -> tuple[int, bool]:
+        """Frames since the tool was last not slow, and whether the soil takes a step into this frame.
+
+        Args:
+            slow: These frames, of the frame before.
+            fast: Whether the tool has moved as far as `least` since the frame before.
+            far: Says whether it has since the soil took its last step.
+        """
+        slow = 0 if fast else slow + 1
+        return slow, slow < self.settling or far()
+
+    def slow_after(self, given: np.ndarray) -> int:
+        """As `after`, of given frames of markers (any, M + 1, 3), before which the tool rested."""
+        slow = self.settling
+        for fast in (distance(given[1:], given[:-1]) >= self.least).tolist():
+            slow = 0 if fast else slow + 1
+        return slow
+
+    def moved(self, points: np.ndarray, before: np.ndarray, pose: np.ndarray) -> bool:
+        """Whether a tool with points in the body frame (M, 3) [m] has moved as far as `least` between two poses."""
+        # Mostly its centre of mass alone says so, beyond round-off of one with the points.
+        if math.dist(before[:3].tolist(), pose[:3].tolist()) > 1.000001 * self.least:
+            return True
+        both = np.stack([before, pose])
+        return self.reached(*markers(both, in_world_frame(both, points)))
+
+    def reached(self, here: np.ndarray, there: np.ndarray) -> bool:
+        """Whether some markers (M + 1, 3) have."""
+        return bool(distance(here, there) >= self.least)
+
+
 class ToolMotion(NamedTuple):
     """How a tool has moved, as far as the next step of the soil depends on it."""
 
-    least: float  # how far it moves in a frame at least that is not called slow [m]
-    settling: int  # frames that the soil follows the clock after that: what was thrown up comes down
+    pace: Pace
     here: np.ndarray  # where its markers are (see `markers`) [m], shape (M + 1, 3)
     stepped: np.ndarray  # where they were when the soil took its last step
     slow: int  # frames since it was last not slow
     steps: bool  # whether the soil takes a step into this frame
 
     @classmethod
-    def along(cls, given: np.ndarray, least: float, settling: int) -> ToolMotion:
+    def along(cls, given: np.ndarray, pace: Pace) -> ToolMotion:
         """In the last of some given frames of markers (any, M + 1, 3), before which it rested."""
-        motion = cls(max(least, _STILL), settling, given[0], given[0], settling, True)
-        for here in given[1:]:
-            motion = motion.moved(here)
-        return motion._replace(stepped=given[-1], steps=True)
+        return cls(pace, given[-1], given[-1], pace.slow_after(given), True)
 
     def moved(self, here: np.ndarray) -> ToolMotion:
         """One frame later."""
-        slow = 0 if distance(here, self.here) >= self.least else self.slow + 1
-        steps = slow < self.settling or bool(distance(here, self.stepped) >= self.least)
-        return self._replace(here=here, stepped=here if steps else self.stepped, slow=slow, steps=steps)
+        reached = self.pace.reached
+        slow, steps = self.pace.after(
+            self.slow, reached(here, self.here), partial(reached, here, self.stepped)
+        )
+        return ToolMotion(self.pace, here, here if steps else self.stepped, slow, steps)
 
 
-def step_frames(path: np.ndarray, given: int, least: float, settling: int) -> np.ndarray:
-    """Numbers of the frames of a path of markers (T, M + 1, 3) that the soil takes a step into, and before them of
-    those that are given: 1 for a bed at rest, or d. For the others see `ToolMotion`."""
-    motion = ToolMotion.along(path[:given], least, settling)
-    if (distance(path[given:], path[given - 1 : -1]) >= motion.least).all():
-        return np.arange(len(path))  # as most paths; one by one it takes as long as the steps of many paths
-    frames = list(range(given))
-    for t in range(given, len(path)):
-        motion = motion.moved(path[t])
-        if motion.steps:
+def step_frames(path: np.ndarray, stepped: np.ndarray, slow: int, pace: Pace) -> tuple[np.ndarray, int]:
+    """Numbers of the frames of a path of markers (T, M + 1, 3), from 1, that the soil takes a step into, and the frames
+    since the tool was last not slow in the end.
+
+    Args:
+        path: From where the tool is.
+        stepped: Its markers when the soil took its last step, (M + 1, 3).
+        slow: Frames since it was last not slow.
+        pace: When soil takes a step.
+    """
+    fast = distance(path[1:], path[:-1]) >= pace.least
+    if fast.all():
+        return np.arange(1, len(path)), 0 if len(fast) else slow
+    frames = []
+    for t, is_fast in enumerate(fast.tolist(), 1):
+        slow, steps = pace.after(slow, is_fast, partial(pace.reached, path[t], stepped))
+        if steps:
+            stepped = path[t]
             frames.append(t)
-    return np.array(frames)
+    return np.array(frames, dtype=np.int64), slow
 
 
 def markers(poses: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -160,20 +161,16 @@ class LatentDynamics(Dynamics):
             edge_index,
             self.settings.edge_length,
         )
-        share = latent.shape[0] // self.members
-
-        def shares(part: Tensor) -> Sequence[Tensor]:
-            return part.split(share) if self.members > 1 else [part]
-
+        members, share = map(self.member, range(self.members)), len(latent) // self.members
         contexts: Sequence[Tensor | None] = [None] * self.members
         if context is not None:
-            contexts = shares(context)
+            contexts = context.split(share)
         decoded = [
             member.network(
                 torch.cat([own, member.told(modes, nodes, share, numbers)], dim=-1), own_edges, edge_index
             )
             for member, own, own_edges, numbers in zip(
-                map(self.member, range(self.members)), shares(features), shares(edges), contexts, strict=True
+                members, features.split(share), edges.split(share), contexts, strict=True
             )
         ]
         return self.read(torch.cat(decoded))
@@ -265,11 +262,15 @@ class LatentDynamics(Dynamics):
         """As for all `Dynamics`, but much faster than `advance`."""
         return PathStepper(self, 1 if self.settings.body_nodes == "pose" else body_points, context)
 
-    def unroll(self, latent: Tensor, body: BodyTrack, context: Tensor | None = None) -> Path:
+    def unroll(
+        self, latent: Tensor, body: BodyTrack, context: Tensor | None = None, memory: Any = None
+    ) -> Path:
         """As for all `Dynamics`; one path alone by the fast stepper."""
         if latent.shape[0] > 1 or torch.is_grad_enabled():
             return super().unroll(latent, body, context)
         stepper = self.stepper(body.position.shape[-2], context)
+        if memory is not None:
+            stepper.memory = memory
         if self.predicts_body:
             return unrolled(stepper.advance, latent, body, self.predicts_body)
         return stepper.unroll(latent, body)
@@ -331,8 +332,8 @@ class PathStepper(Stepper):
         return self.shape, None if self.graph is None else self.graph.kept
 
     @memory.setter
-    def memory(self, memory: tuple[Tensor | None, Tensor | None]) -> None:
-        self.shape, kept = memory
+    def memory(self, memory: tuple[Tensor | None, Tensor | None] | None) -> None:
+        self.shape, kept = memory or (None, None)
         if self.graph is not None:
             self.graph.kept = kept
 
@@ -369,6 +370,10 @@ class PathStepper(Stepper):
         self.load_scale = torch.cat([load.scale for load in loads]) / share
         self.load_mean = torch.cat([load.mean for load in loads])
         self.change_mean, self.change_scale = dynamics.change.mean, dynamics.change.scale
+        self.row_units = None
+        if dynamics.settings.next_motion and not dynamics.predicts_body and self.nodes.device.type == "cpu":
+            row = Standardiser.cat([dynamics.body_position, dynamics.body_orientation, dynamics.body_motion])
+            self.row_units = row.mean.numpy(), row.scale.numpy()
         self.accelerates = dynamics.settings.predicts == "acceleration"
         self.nearest, self.furthest = dynamics.reach()
 
@@ -429,14 +434,33 @@ class PathStepper(Stepper):
             decoded = self.decoded(latent[0], features[0], places[0])
             if self.dynamics.predicts_body:
                 return self.dynamics.stepped(self.dynamics.read(decoded[None]), latent, body)
-            following, load = self.outcome(decoded, latent[0])
-            torque = load[3:] if self.dynamics.settings.torque else self.dynamics.torque.mean
-            return Step(following[None], load[None, :3], torque[None], body.motion[:, -1, :, :3])
+            return self.said(decoded, latent, body.motion[:, -1, :, :3])
+
+    def step(self, latent: Tensor, rows: np.ndarray) -> Step:
+        if self.row_units is None:
+            return super().step(latent, rows)
+        # As `windows`, by NumPy: its calls take a third of torch's time.
+        settings, (mean, scale) = self.dynamics.settings, self.row_units
+        motion = 9 if settings.body_nodes == "pose" else 3
+        with np.errstate(over="ignore"):  # of a tool that is nowhere
+            normal = (rows - mean) / scale
+        places = normal[-2, :, :3] if settings.edge_scale is None else rows[-2, :, :3] / settings.edge_scale
+        own = normal[-2, :, 0 if settings.positions else 3 : motion]
+        moved = normal[:, :, motion:].transpose(1, 0, 2).reshape(len(own), -1)
+        features = torch.from_numpy(np.concatenate([own, moved], axis=1)).float()
+        with torch.inference_mode():
+            decoded = self.decoded(latent[0], features, torch.from_numpy(places))
+            return self.said(decoded, latent, torch.from_numpy(rows[None, -1, :, motion : motion + 3]))
+
+    def said(self, decoded: Tensor, latent: Tensor, displacement: Tensor) -> Step:
+        """The step under a prescribed body."""
+        following, load = self.outcome(decoded, latent[0])
+        torque = load[3:] if self.dynamics.settings.torque else self.dynamics.torque.mean
+        return Step(following[None], load[None, :3], torque[None], displacement)
 
     def unroll(self, latent: Tensor, body: BodyTrack) -> Path:
         """A whole path along a prescribed body; arguments as for `Dynamics.unroll`, B = 1."""
         d, frames = latent.shape[1], body.position.shape[1]
-        self.shape = None  # what follows does not depend on what was stepped before
         states = latent.new_empty((1, frames, *latent.shape[2:]), dtype=torch.float64)
         states[:, :d] = latent
         path = states[0]

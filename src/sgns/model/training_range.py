@@ -5,7 +5,6 @@ Letters: T frames, M body points, r modes, K context numbers.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +14,7 @@ import numpy as np
 
 from mpm_warp.poses import in_world_frame
 from mpm_warp.settings import short_repr
-from sgns.model.features import body_track, context_of
+from sgns.model.features import body_track, context_of, pose_step
 from sgns.reduction.reduce import ReducedRun
 
 NOTEWORTHY = 0.05
@@ -122,9 +121,9 @@ class TrainingRange:
 
     @cached_property
     def _box(self) -> tuple[list[float], list[float]]:
-        """Smallest and largest values of the tool that are not far outside, in the order of `_of_step`."""
+        """Smallest and largest values of the tool that are not far outside, in the order of `pose_step`."""
         low, high = np.full(15, -np.inf), np.full(15, np.inf)
-        for first, name in ((0, POSITION), (3, DISPLACEMENT), (6, ROTATION), (9, ORIENTATION)):
+        for first, name in ((0, POSITION), (3, ORIENTATION), (9, DISPLACEMENT), (12, ROTATION)):
             if name in self.low:
                 margin = FAR * widths(self.low[name], self.high[name])
                 part = slice(first, first + len(margin))
@@ -134,7 +133,7 @@ class TrainingRange:
     def far(self, before: np.ndarray, pose: np.ndarray) -> bool:
         """Whether a tool's position, orientation, or their change from one pose (7,) to the next is far outside: what
         of `excess` takes microseconds."""
-        values = _of_step(before.tolist(), pose.tolist())
+        values = pose_step(before.tolist(), pose.tolist())
         return any(v < low or v > high for v, low, high in zip(values, *self._box, strict=True))
 
     def in_millimetres(self, poses: np.ndarray) -> bool:
@@ -194,21 +193,6 @@ def quantities(
         VELOCITY: velocity,
         **{key: np.full((len(place), 1), value) for key, value in context.items()},
     }
-
-
-def _of_step(before: Sequence[float], pose: Sequence[float]) -> tuple[float, ...]:
-    """Of a step from one pose to the next: position [m], displacement [m], rotation [rad], and orientation, as
-    `quantities` has them, in plain numbers: a tenth of the time."""
-    (a, b, c, p, q, r, s), (x, y, z, i, j, k, w) = before, pose
-    # The part of pose * before^-1 along the axis, and across it; the shorter way round.
-    u, v, t = i * s - w * p - j * r + k * q, j * s - w * q - k * p + i * r, k * s - w * r - i * q + j * p
-    size, along = math.sqrt(u * u + v * v + t * t), w * s + i * p + j * q + k * r
-    turn = math.copysign(2.0 * math.atan2(size, abs(along)) / size, along) if size > 0.0 else 0.0
-    columns = (
-        *(1 - 2 * (j * j + k * k), 2 * (i * j + k * w), 2 * (i * k - j * w)),
-        *(2 * (i * j - k * w), 1 - 2 * (i * i + k * k), 2 * (j * k + i * w)),
-    )
-    return x, y, z, x - a, y - b, z - c, turn * u, turn * v, turn * t, *columns
 
 
 def widths(low: np.ndarray, high: np.ndarray) -> np.ndarray:

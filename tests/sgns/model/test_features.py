@@ -10,12 +10,14 @@ import torch
 from mpm_warp.poses import in_world_frame, rotation_matrices
 from sgns.config import UserError
 from sgns.model.features import (
+    Pace,
     ToolMotion,
     body_track,
     build_graph,
     context_of,
     edge_indices,
     markers,
+    pose_step,
     slowest_travel,
     step_frames,
     varying_context,
@@ -115,6 +117,13 @@ def line(*steps: float) -> np.ndarray:
     return path
 
 
+def frames_of(path: np.ndarray, given: int, pace: Pace) -> np.ndarray:
+    """Given frames, and those after them that the soil takes a step into."""
+    slow = pace.slow_after(path[:given])
+    frames, _ = step_frames(path[given - 1 :], path[given - 1], slow, pace)
+    return np.concatenate([np.arange(given), frames + given - 1])
+
+
 @pytest.mark.parametrize(
     ("why", "steps", "given", "least", "settling", "expected"),
     [
@@ -129,7 +138,7 @@ def line(*steps: float) -> np.ndarray:
     ],
 )
 def test_when_soil_takes_a_step(why, steps, given, least, settling, expected) -> None:
-    np.testing.assert_array_equal(step_frames(line(*steps), given, least, settling), list(expected))
+    np.testing.assert_array_equal(frames_of(line(*steps), given, Pace.of(least, settling)), list(expected))
 
 
 def test_turning_is_motion_of_the_points() -> None:
@@ -137,10 +146,10 @@ def test_turning_is_motion_of_the_points() -> None:
     poses = np.zeros((20, 7))
     poses[:, 5], poses[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
     points = 0.2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)[:, None]
-    frames = step_frames(markers(poses, points), 1, 0.2 * np.radians(2.5), 5)
+    frames = frames_of(markers(poses, points), 1, Pace.of(0.2 * np.radians(2.5), 5))
     np.testing.assert_array_equal(frames, np.arange(0, 20, 3))
     # A body without points shows its centre of mass only.
-    assert len(step_frames(markers(poses, points[:, :0]), 1, 0.01, 5)) == 1
+    assert len(frames_of(markers(poses, points[:, :0]), 1, Pace.of(0.01, 5))) == 1
 
 
 def test_any_turn_of_a_tool_in_its_place_is_seen() -> None:
@@ -152,13 +161,37 @@ def test_any_turn_of_a_tool_in_its_place_is_seen() -> None:
             poses = np.zeros((4, 7))
             poses[:, 3 + axis], poses[:, 6] = np.sin(turns / 2), np.cos(turns / 2)
             path = markers(poses, in_world_frame(poses, points))
-            np.testing.assert_array_equal(step_frames(path, 1, 1e-4, 1), np.arange(4))
+            np.testing.assert_array_equal(frames_of(path, 1, Pace.of(1e-4, 1)), np.arange(4))
+            assert all(Pace.of(1e-4, 1).moved(points, *pair) for pair in zip(poses[1:], poses, strict=False))
 
 
 def test_motion_is_not_changed_by_looking_ahead() -> None:
-    here = ToolMotion.along(line(0.5), 1.0, 5)
+    here = ToolMotion.along(line(0.5), Pace.of(1.0, 5))
     assert here.moved(line(1.5)[1]).steps and not here.moved(line(0.75)[1]).steps
     np.testing.assert_array_equal(here.stepped, line(0.5)[1])
+
+
+def test_a_path_may_go_on_anywhere() -> None:
+    """From what is known of it there: where the soil took its last step, and how long the tool has been slow."""
+    path, pace = line(*[2.0] * 3, *[0.0] * 4, *[0.3] * 9, *[2.0] * 2, *[0.4] * 7), Pace.of(1.0, 3)
+    whole, last = step_frames(path, path[0], pace.settling, pace)
+    for here in range(1, len(path)):
+        before, slow = step_frames(path[: here + 1], path[0], pace.settling, pace)
+        after, end = step_frames(path[here:], path[before[-1]], slow, pace)
+        np.testing.assert_array_equal([*before, *(after + here)], whole)
+        assert end == last
+
+
+def test_one_step_of_a_pose_is_that_of_a_track_to_the_bit() -> None:
+    rng = np.random.default_rng(0)
+    for size in (0.0, 1e-9, 1e-4, 1e-2, 1.0):
+        poses = np.cumsum(size * rng.normal(size=(200, 7)), axis=0) + rng.normal(size=7)
+        poses[:, 3:] *= rng.choice([-1.0, 1.0], size=(200, 1))  # the same rotations
+        poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+        track = torch.cat(body_track(poses, None, "pose"), dim=-1)[1:, 0].numpy()
+        steps = [pose_step(*pair) for pair in zip(poses.tolist(), poses[1:].tolist(), strict=False)]
+        np.testing.assert_array_equal(steps, track)
+    assert np.isnan(pose_step([0.0] * 7, poses[0].tolist())[-3:]).all()
 
 
 def test_the_slowest_travel_is_a_pace_not_a_stop(data) -> None:

@@ -204,20 +204,13 @@ def test_a_training_with_another_closure_is_another_training(data, checkpoint) -
 
 
 def test_the_validation_error_is_that_of_decoded_soil(data, checkpoint) -> None:
-    simulator, runs = Simulator.load(checkpoint), data.runs("validation")[:1]
+    simulator, runs = Simulator.load(checkpoint, rate_independent=False), data.runs("validation")[:1]
     settings = simulator.dynamics.settings
     d, basis = settings.history, data.of_modes(4)
     score = ValidationRollouts(runs, 4, d, "pose", (), basis).measure(simulator.dynamics)
     with Run(runs[0].path) as run:
         truth = run.positions()
-    latent = simulator.dynamics.follow(
-        runs[0].pose[None],
-        simulator.body_points,
-        torch.zeros(1, 0),
-        torch.from_numpy(runs[0].latent[:d, :4]),
-        None,
-        d,
-    )[0][0]
+    latent = simulator.rollout(runs[0].pose, latent_history=runs[0].latent[:d, :4]).latent
     error = basis.inverse(latent).numpy()[d:] - truth[d:]
     assert score.position_rmse == pytest.approx(float(np.mean(error**2) ** 0.5), rel=1e-5)
 
