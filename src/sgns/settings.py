@@ -475,6 +475,19 @@ class Rollout(_Command):
 
 
 @settings
+class Export(_Command):
+    """`sgns export`."""
+
+    checkpoint: str = setting("", "file.ckpt of `sgns train`, or the name of one that ships")
+    num_modes: int | None = _num_modes()
+    rate_independent: bool = setting(True, "under a slow tool soil follows its way")
+    output: str = setting(
+        "", "file.onnx, or file.pt2 of torch; file.decode.onnx or .pt2 is written beside it"
+    )
+    overwrite: bool = setting(False, "true: replace files that are there")
+
+
+@settings
 class Evaluate(_Command):
     """`sgns evaluate`."""
 
@@ -647,6 +660,7 @@ COMMANDS: dict[str, type[Group]] = {
     "reduce": Reduce,
     "train": Train,
     "rollout": Rollout,
+    "export": Export,
     "evaluate": Evaluate,
     "frontier": Frontier,
     "advise": Advise,

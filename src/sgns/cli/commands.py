@@ -77,6 +77,13 @@ COMMANDS = {
         ("checkpoint", "output"),
         value="wall_s_per_simulated_s",
     ),
+    "export": Command(
+        "sgns.export",
+        "write a trained network as ONNX or .pt2, for C++ and other programs",
+        "file",
+        ("checkpoint", "output"),
+        value="s_per_step",
+    ),
     "evaluate": Command(
         "sgns.evaluate.command",
         "compare a trained network with true runs; write the report",
