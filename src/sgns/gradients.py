@@ -84,7 +84,7 @@ class TorchSimulator:
         self.points = simulator.body_points
         self._simulator = simulator
         self._start = self.basis.transform(simulator.start_positions)
-        self._known = simulator._surrogate.training_range
+        self._known = simulator.training_range
 
     # --- Paths and steps ---
 
@@ -117,7 +117,7 @@ class TorchSimulator:
         if frames < given:
             raise UserError(f"the path has {frames} frames; with a given history it needs at least {d}")
         latent, told = self._history(latent_history, count), self._told(context, count)
-        shown, newest = self.dynamics.frames_of(*self._plain(paths), self._simulator._pace, given)
+        shown, newest = self.dynamics.frames_of(*self._plain(paths), self._simulator.pace, given)
         track = self._track(_chosen(paths, shown))
         longest = track.position.shape[1]
         every = math.ceil(math.sqrt(longest)) if segment is None else segment
@@ -163,7 +163,7 @@ class TorchSimulator:
         if paths.shape[1] != given:
             raise UserError(f"the tool's start has {paths.shape[1]} poses; this start needs {given}")
         motion = None
-        if (pace := self._simulator._pace) is not None:
+        if (pace := self._simulator.pace) is not None:
             each = (markers(*pair) for pair in zip(*self._plain(paths), strict=True))
             motion = tuple(ToolMotion.along(path, pace) for path in each)
         count, nothing = len(paths), paths.new_zeros(len(paths), 3)

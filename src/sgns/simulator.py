@@ -193,6 +193,16 @@ class Simulator:
         return cls.load(pretrained_file(name), **options)
 
     @property
+    def pace(self) -> Pace | None:
+        """When the soil takes a step under a prescribed tool; None: it follows the clock."""
+        return self._pace
+
+    @property
+    def training_range(self) -> TrainingRange:
+        """What the training runs covered."""
+        return self._surrogate.training_range
+
+    @property
     def scene(self) -> dict[str, Any]:
         """Scene of one of the training runs, as plain data, a copy: its bed is the bed it knows. The mesh of a tool is
         not in it, but in the run (`Run.mesh`)."""

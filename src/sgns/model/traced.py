@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mpm_warp.poses import rotation_matrices
 from sgns.model.dynamics import Dynamics
-from sgns.model.features import BodyTrack, ToolMotion
+from sgns.model.features import BodyTrack, Pace
 from sgns.reduction.basis import Basis
 
 
@@ -93,7 +93,7 @@ class Step(nn.Module):
         dynamics: Network or polynomials.
         points: Body points in the body frame [m], shape (M, 3).
         start: Of the soil at rest [m], shape (r, 3).
-        pace: `least` and `settling` of `ToolMotion`; None: the soil takes a step into every frame.
+        pace: When the soil takes a step; None: into every frame.
     """
 
     turning: Tensor
@@ -101,17 +101,13 @@ class Step(nn.Module):
     points: Tensor
     start: Tensor
 
-    def __init__(
-        self, dynamics: Dynamics, points: np.ndarray, start: Tensor, pace: tuple[float, int] | None
-    ) -> None:
+    def __init__(self, dynamics: Dynamics, points: np.ndarray, start: Tensor, pace: Pace | None) -> None:
         super().__init__()
         self.dynamics = _traceable(dynamics, len(points))
         self.body_nodes = dynamics.settings.body_nodes
         self.d, self.r = dynamics.history, dynamics.num_modes
         self.predicts_body = dynamics.predicts_body
-        self.pace: ToolMotion | None = None
-        if pace is not None:
-            self.pace = ToolMotion.along(np.zeros((self.d, 1, 3)), *pace)
+        self.pace = pace
         for name, value in (
             ("turning", _turning()),
             ("between", _between()),
@@ -146,10 +142,10 @@ class Step(nn.Module):
         if self.pace is not None:
             before = torch.where(begun, parts["pose"], pose)
             here, shown, stepped = self.markers(torch.stack([pose, before, poses[:, -1]], dim=1)).unbind(1)
-            slow = torch.where(begun, parts["slow"], float(self.pace.slow)) + 1.0
+            slow = torch.where(begun, parts["slow"], float(self.pace.settling)) + 1.0
             slow = torch.where(self.reaches(here, shown), torch.zeros_like(slow), slow)
             moves = begun & ((slow < self.pace.settling) | self.reaches(here, stepped))
-            rest = [pose, torch.where(begun, slow, float(self.pace.slow))]
+            rest = [pose, torch.where(begun, slow, float(self.pace.settling))]
         latent = torch.where(
             moves[..., None, None], torch.cat([latent[:, 1:], step.latent[:, None]], 1), latent
         )
