@@ -53,9 +53,10 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tenso
 
 
 def prefers_onednn(x: Tensor, weight: Tensor) -> bool:
-    """Whether oneDNN is there for this product and worth its start."""
+    """Whether oneDNN is there for this product and worth its start; not in a graph that is exported."""
     return (
         _AVAILABLE
+        and not torch.compiler.is_compiling()
         and x.dtype == torch.float32
         and x.device.type == "cpu"
         and x.numel() * weight.shape[0] >= _WORTH_IT

@@ -161,16 +161,20 @@ class LatentDynamics(Dynamics):
             edge_index,
             self.settings.edge_length,
         )
-        members, share = map(self.member, range(self.members)), len(latent) // self.members
+        share = latent.shape[0] // self.members
+
+        def shares(part: Tensor) -> Sequence[Tensor]:
+            return part.split(share) if self.members > 1 else [part]
+
         contexts: Sequence[Tensor | None] = [None] * self.members
         if context is not None:
-            contexts = context.split(share)
+            contexts = shares(context)
         decoded = [
             member.network(
                 torch.cat([own, member.told(modes, nodes, share, numbers)], dim=-1), own_edges, edge_index
             )
             for member, own, own_edges, numbers in zip(
-                members, features.split(share), edges.split(share), contexts, strict=True
+                map(self.member, range(self.members)), shares(features), shares(edges), contexts, strict=True
             )
         ]
         return self.read(torch.cat(decoded))

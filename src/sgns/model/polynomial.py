@@ -127,7 +127,7 @@ class PolynomialDynamics(Dynamics):
             body.motion[..., 3:],
             place[..., self.free],
             moved[:, :-1][..., self.free],
-            self.known_context(context) if self.context_keys else latent.new_zeros(len(latent), 0),
+            self.known_context(context) if self.context_keys else latent.new_zeros(latent.shape[0], 0),
         ]
         return [group.flatten(1) for group in groups]
 
