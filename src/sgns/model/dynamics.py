@@ -133,18 +133,23 @@ class Path(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where bed and tool are as one member of dynamics has them: all that its next steps follow from."""
+    """Where bed and tool are as one member of dynamics has them: all that its next steps follow from.
 
-    poses: Sequence[
-        np.ndarray
-    ]  # of the tool in the d frames that the soil last took a step into, (7,) each; or none
-    latent: Tensor  # positions in these frames [m], shape (d, r, 3)
-    force: np.ndarray  # over the last step [N], shape (3,)
-    torque: np.ndarray  # [N m], shape (3,)
-    slow: (
-        int | None
-    )  # frames since the tool was last not slow (see `Pace`); None: it always steps, or is nowhere yet
-    memory: Any = None  # of the stepper (see `Stepper.memory`)
+    Attributes:
+        poses: Of the tool in the d frames that the soil last took a step into, (7,) each; none: it is nowhere yet.
+        latent: Positions in these frames [m], shape (d, r, 3).
+        force: Over the last step [N], shape (3,).
+        torque: [N m], shape (3,).
+        slow: Frames since the tool was last not slow (see `Pace`); None: the soil always steps, or there is no tool.
+        memory: Of the stepper (see `Stepper.memory`).
+    """
+
+    poses: Sequence[np.ndarray]
+    latent: Tensor
+    force: np.ndarray
+    torque: np.ndarray
+    slow: int | None
+    memory: Any = None
 
 
 class Dynamics(nn.Module):
