@@ -122,6 +122,12 @@ COMMANDS = {
         plain=("run", "output"),
         function="render",
     ),
+    "view": Command(
+        "sgns.view.server",
+        "see a run, or drive a tool through a network's soil, on a page in the browser",
+        None,
+        plain=("run", "prediction"),
+    ),
 }
 
 
