@@ -11,6 +11,8 @@ import pytest
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 AFTER = {"best_of_100_paths": "train_and_step", "read_a_run": "bucket_on_a_path"}
 """What makes the files that an example reads."""
+LONG = {"onnx_run"}
+"""Those that take ten seconds and more."""
 NAMES = sorted(file.stem for file in EXAMPLES.glob("*.py") if file.stem != "demo")  # see test_demo.py
 
 
@@ -27,7 +29,13 @@ def run(name: str, folder: Path) -> str:
     return found.stdout
 
 
-@pytest.mark.parametrize("name", [*(name for name in NAMES if name not in AFTER), *AFTER])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.long if name in LONG else ())
+        for name in (*(name for name in NAMES if name not in AFTER), *AFTER)
+    ],
+)
 def test_an_example_holds_what_it_asserts(name: str, folder: Path) -> None:
     if name in AFTER and not (folder / AFTER[name]).exists():  # run alone
         run(AFTER[name], folder)
