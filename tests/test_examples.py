@@ -11,7 +11,7 @@ import pytest
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 AFTER = {"best_of_100_paths": "train_and_step", "read_a_run": "bucket_on_a_path"}
 """What makes the files that an example reads."""
-LONG = {"learn_to_dig", "mujoco_bucket", "ros2_node"}
+LONG = {"learn_to_dig", "mujoco_bucket", "onnx_run", "ros2_node"}
 """What takes many steps; tests/sgns/test_envs.py and test_coupling.py try what they use."""
 NAMES = sorted(file.stem for file in EXAMPLES.glob("*.py") if file.stem != "demo")  # see test_demo.py
 

@@ -186,5 +186,8 @@ def _functions(x: Tensor, centres: Tensor | None) -> Tensor:
         x = torch.nn.functional.pad(x, (1, 0), value=1.0)
         i, j = torch.triu_indices(x.shape[-1], x.shape[-1], device=x.device)
         return x[..., i] * x[..., j]
-    squares = torch.cdist(x.reshape(-1, x.shape[-1]), centres.double()).square_()
+    if torch.compiler.is_compiling():  # the other has another form for 25 rows and more
+        squares = (x.reshape(-1, 1, x.shape[-1]) - centres.double()).square().sum(-1)
+    else:
+        squares = torch.cdist(x.reshape(-1, x.shape[-1]), centres.double()).square_()
     return squares.neg_().exp_().reshape(*x.shape[:-1], len(centres))

@@ -32,6 +32,8 @@ SMALLER = {
     "rollout": ["scene.duration=0.1", "scene.start=0.5"],
     "evaluate": ["dataset.path=data/quick"],
 }
+LONG = "export"
+"""The command whose examples take ten seconds each."""
 LEFT_OUT = {"frontier": "takes minutes: see tests/sgns/frontier", "submitit": "needs a cluster"}
 
 
@@ -81,7 +83,10 @@ def needed(folder: Path, here: Path, example: str) -> None:
             (shutil.copytree if source.is_dir() else shutil.copy)(source, place)
 
 
-@pytest.mark.parametrize("example", examples())
+@pytest.mark.parametrize(
+    "example",
+    [pytest.param(one, marks=pytest.mark.long if one.split()[1] == LONG else ()) for one in examples()],
+)
 def test_examples_of_the_help_run(example: str, folder: Path, empty_folder: Path) -> None:
     for word, reason in LEFT_OUT.items():
         if word in example:
