@@ -261,6 +261,7 @@ class Drive:
             poses,
             in_world_frame(poses, self.simulator.body_points),
             self.computed,
+            self.simulator.save(),
             self.simulator.basis,
             self.values,
             lambda: excess,
