@@ -657,10 +657,13 @@ class Render(_Command):
 class View(_Command):
     """`sgns view`."""
 
-    run: str | None = setting(None, "run file to show; with checkpoint the one whose tool is driven; null: none")
+    run: str | None = setting(
+        None, "run file to show; with checkpoint the one whose tool is driven; null: none"
+    )
     prediction: str | None = setting(None, "another run of the same scene, shown beside `run`; null: none")
     checkpoint: str | None = setting(
-        None, "network to drive a tool in: file.ckpt of `sgns train`, or the name of one that ships; null: none"
+        None,
+        "network to drive a tool in: file.ckpt of `sgns train`, or the name of one that ships; null: none",
     )
     output: str = setting("view.h5", "run file for what is recorded; more of them are numbered")
     port: int = setting(8765, "of 127.0.0.1, where the page is; 0: any that is free", ge=0, le=65535)
