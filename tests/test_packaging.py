@@ -84,7 +84,7 @@ def test_every_setting_file_is_readable_and_ends_in_yaml() -> None:
 def test_templates_and_tables_are_installed(project: dict) -> None:
     installed = project["tool"]["setuptools"]["package-data"]
     for path in FOLDERS["sgns"].rglob("*"):
-        if path.suffix in (".j2", ".csv"):
+        if path.suffix in (".j2", ".csv", ".html", ".js", ".LICENSE"):
             assert any(path.match(pattern) for pattern in installed[f"sgns.{path.parent.name}"]), path
 
 

@@ -1,5 +1,5 @@
 """Pictures of one run: `sgns plot` draws a page with side views, the surface, and force and torque through time,
-`sgns render` a moving picture, soil from the side and the forward force through time."""
+`sgns render` a moving picture or a moment of it, soil from the side and the forward force through time."""
 
 from __future__ import annotations
 
@@ -225,48 +225,78 @@ COLOURS = 48
 
 
 def render(cfg: DictConfig) -> None:
-    """Draw the run `cfg.run` into the GIF file `cfg.output`."""
+    """Draw the run `cfg.run` into the file `cfg.output`: a moving picture, or as a PNG its last moment of work."""
     with Run(cfg.run) as run:
-        path = picture_place(cfg, ".gif")
+        path = picture_place(cfg, ".gif", ".mp4", ".png")
+        if path.suffix.lower() == ".mp4":
+            video()  # before anything is drawn
         who, _ = MADE_BY[run.producer]
+        if path.suffix.lower() == ".png":
+            frame = shown_times(run)[-1]
+            still({who: run}, frame, path)
+            log.info("%s: %s at %.3g s", path, cfg.run, run.time[frame])
+            return
         speed, end = moving_picture({who: run}, path), run.time[-1]
     pace = "in real time" if speed == 1.0 else f"{speed:.2g} times as fast as real"
     log.info("%s: %.3g s of %s, %s, %.1f MB", path, end, cfg.run, pace, path.stat().st_size / 1e6)
 
 
 def moving_picture(runs: Mapping[str, Run], path: Path) -> float:
-    """Runs below each other, by title, as a GIF of bounded size; returns how much faster than real it plays.
+    """Runs below each other, by title, as a GIF or MP4 of bounded size; returns how much faster than real it plays.
 
     Raises:
-        UserError: numbers to be drawn are not finite.
+        UserError: numbers to be drawn are not finite, or the library for MP4 is missing.
     """
     first = next(iter(runs.values()))
     count = min(run.frame_count for run in runs.values())
     every = max(1, round(first.frame_rate / RATE), math.ceil(count / MOST_PICTURES))
-    frames = range(0, count, every)
-    for run in runs.values():
-        require_finite(run, frames)
-    scales = common_scales(
-        list(runs.values()), frames[:: max(1, len(frames) // 8)], first.positions(0)[0].astype(np.float64)
-    )
-    with matplotlib.rc_context(STYLE | {"font.size": 9.5, "axes.titlesize": 9.5}):
-        shown = tqdm(frames, unit="picture", desc="drawing", disable=None)
-        pictures = [drawn(runs, frame, scales) for frame in shown]
-    palette = Image.fromarray(np.vstack(pictures[:: max(1, len(pictures) // 6)])).quantize(COLOURS)
-    indexed = [Image.fromarray(one).quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures]
+    pictures = drawn_frames(runs, range(0, count, every))
     step = every / first.frame_rate
     shown_for = min(step, LONGEST)
-    write_gif(indexed, path, 1000.0 * shown_for)
+    if path.suffix.lower() == ".mp4":
+        write_mp4(pictures, path, 1.0 / shown_for)
+    else:
+        palette = Image.fromarray(np.vstack(pictures[:: max(1, len(pictures) // 6)])).quantize(COLOURS)
+        indexed = [
+            Image.fromarray(one).quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures
+        ]
+        write_gif(indexed, path, 1000.0 * shown_for)
     return step / shown_for
 
 
-def drawn(runs: Mapping[str, Run], frame: int, scales: Scales) -> np.ndarray:
+def still(runs: Mapping[str, Run], frame: int, path: Path) -> None:
+    """One picture of those as a PNG file.
+
+    Raises:
+        UserError: numbers to be drawn are not finite.
+    """
+    (picture,) = drawn_frames(runs, [frame], 2)
+    with whole_file(path) as hidden:
+        Image.fromarray(picture).save(hidden, format="png")
+
+
+def drawn_frames(runs: Mapping[str, Run], frames: Sequence[int], scale: int = 1) -> list[np.ndarray]:
+    """Pictures of some frames, (height, width, 3) each; `scale` times as fine.
+
+    Raises:
+        UserError: numbers to be drawn are not finite.
+    """
+    for run in runs.values():
+        require_finite(run, frames)
+    start = next(iter(runs.values())).positions(0)[0].astype(np.float64)
+    scales = common_scales(list(runs.values()), frames[:: max(1, len(frames) // 8)], start)
+    with matplotlib.rc_context(STYLE | {"font.size": 9.5, "axes.titlesize": 9.5}):
+        shown = tqdm(frames, unit="picture", desc="drawing", disable=None if len(frames) > 1 else True)
+        return [drawn(runs, frame, scales, scale * DPI) for frame in shown]
+
+
+def drawn(runs: Mapping[str, Run], frame: int, scales: Scales, dpi: int = DPI) -> np.ndarray:
     """One picture, shape (height, width, 3): the side views, and the forward force up to the frame."""
     aspect = np.ptp(scales.z_limits) / np.ptp(scales.x_limits)
     width = min(VIEW, HIGHEST_MOVING_VIEW / len(runs) / aspect)
     view = width * aspect
     height = max(len(runs) * (view + 0.27) + 0.25, 2.2)
-    figure = new_figure(WIDTH, height, None, dpi=DPI)
+    figure = new_figure(WIDTH, height, None, dpi=dpi)
     for place, (title, run) in enumerate(reversed(list(runs.items()))):
         bottom = 0.25 + place * (view + 0.27)
         axis = figure.add_axes((0.1 / WIDTH, bottom / height, width / WIDTH, view / height))
@@ -322,17 +352,48 @@ def write_gif(pictures: Sequence[Image.Image], path: Path, duration: float) -> N
         hidden.write_bytes(content.getvalue())
 
 
+def video() -> Any:
+    """The library that writes videos.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise UserError(
+            "an MP4 file needs imageio-ffmpeg: pip install 'sgns[video]', or choose a .gif file"
+        ) from None
+    return imageio_ffmpeg
+
+
+def write_mp4(pictures: Sequence[np.ndarray], path: Path, rate: float) -> None:
+    """Write pictures (height, width, 3) as an MP4 file, so many a second [Hz]."""
+    height, width = (size - size % 2 for size in pictures[0].shape[:2])  # the format takes even sizes
+    with whole_file(path) as hidden:
+        options = {"fps": rate, "codec": "libx264", "quality": None, "macro_block_size": 2}
+        more = ["-crf", "20", "-movflags", "+faststart", "-f", "mp4"]
+        writer = video().write_frames(
+            str(hidden), (width, height), output_params=more, ffmpeg_log_level="error", **options
+        )
+        writer.send(None)
+        for one in pictures:
+            writer.send(np.ascontiguousarray(one[:height, :width]))
+        writer.close()
+
+
 # --- For both: a run that can be drawn, the name of its picture -------------------------------------------
 
 
-def picture_place(cfg: DictConfig, suffix: str) -> Path:
-    """Where the picture goes: `cfg.output`, else beside the run with its name.
+def picture_place(cfg: DictConfig, *suffixes: str) -> Path:
+    """Where the picture goes: `cfg.output`, else beside the run with its name and the first of some suffixes.
 
     Raises:
         UserError: it has another suffix, or is there and `cfg.overwrite` is false.
     """
-    path = Path(cfg.output or f"{os.path.splitext(cfg.run)[0]}{suffix}")
-    require_new(path, cfg.overwrite, "the picture", suffix)
+    path = Path(cfg.output or f"{os.path.splitext(cfg.run)[0]}{suffixes[0]}")
+    wanted = path.suffix.lower() if path.suffix.lower() in suffixes else suffixes[0]
+    require_new(path, cfg.overwrite, "the picture", wanted)
     require_replaceable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     return path

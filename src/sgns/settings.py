@@ -649,7 +649,9 @@ class Render(_Command):
     """`sgns render`."""
 
     run: str = setting("", "run file to show")
-    output: str | None = setting(None, "GIF file to write; null: beside the run, with its name")
+    output: str | None = setting(
+        None, "GIF, MP4 or PNG file to write; null: a GIF beside the run, with its name"
+    )
     overwrite: bool = _overwrite()
 
 

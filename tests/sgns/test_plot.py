@@ -1,6 +1,7 @@
 """`sgns plot` and `sgns render`: pictures of a run."""
 
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -99,6 +100,30 @@ def test_a_moving_picture_plays_in_real_time(run_file, tmp_path):
     plot.render(settings(run_file, output=str(tmp_path / "new.gif")))
     with Image.open(tmp_path / "new.gif") as picture:
         assert picture.n_frames == 5 and picture.info["duration"] == 50  # every third frame of 1/60 s
+
+
+def test_a_moving_picture_is_a_video_too(run_file, tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    plot.render(settings(run_file, output=str(tmp_path / "new.mp4")))
+    read = [ffmpeg.get_ffmpeg_exe(), "-i", tmp_path / "new.mp4", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    done = subprocess.run(read, capture_output=True, check=True)
+    assert b"h264" in done.stderr and b", 20 fps" in done.stderr
+    shown = np.frombuffer(done.stdout, np.uint8).reshape(5, -1, 680, 3)
+    assert shown[0].std() > 20.0 and (shown[0] != shown[-1]).any()
+
+
+def test_a_video_without_its_library_is_refused_before_it_is_drawn(run_file, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setattr(plot, "drawn_frames", None)
+    with pytest.raises(UserError, match=r"pip install 'sgns\[video\]', or choose a \.gif"):
+        plot.render(settings(run_file, output=str(tmp_path / "new.mp4")))
+    assert not (tmp_path / "new.mp4").exists()
+
+
+def test_a_still_picture_of_the_last_moment_of_work(run_file, tmp_path):
+    plot.render(settings(run_file, output=str(tmp_path / "new.PNG")))
+    with Image.open(tmp_path / "new.PNG") as picture:
+        assert picture.format == "PNG" and picture.width == 1360 and np.asarray(picture).std() > 20.0
 
 
 def test_a_long_run_gives_a_bounded_number_of_pictures(run_file, tmp_path, monkeypatch):

@@ -125,7 +125,7 @@ COMMANDS = {
     "view": Command(
         "sgns.view.server",
         "see a run, or drive a tool through a network's soil, on a page in the browser",
-        None,
+        "file",
         plain=("run", "prediction"),
     ),
 }

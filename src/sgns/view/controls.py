@@ -56,6 +56,7 @@ class Controls:
         wanted: Value of each.
         way: -1 back to 1 forward.
         told: Values of the scene that a person changes, by their keys.
+        plan: Places that the tip goes to by itself, x and z [m].
     """
 
     def __init__(self, scene: Scene, known: TrainingRange, rate: float) -> None:
@@ -90,9 +91,10 @@ class Controls:
     def reset(self) -> None:
         """The tool where it begins; sliders stay as they are, but for the depth."""
         self.speed = 0.0
+        self.plan: list[tuple[float, float]] = []
 
     def cut_again(self) -> None:
-        """Lift the tool, go back to where it began, and cut.
+        """Lift the tool, go back to where it began, and cut: as deep as is asked for, else as before.
 
         Raises:
             UserError: It cuts nothing.
@@ -128,19 +130,14 @@ class Controls:
 
 
 class ToolControls(Controls):
-    """Of a tool whose whole motion is prescribed: its tip has a depth, the tool a rake.
-
-    Attributes:
-        plan: Places that the tip goes to by itself, x and z [m].
-    """
+    """Of a tool whose whole motion is prescribed: its tip has a depth, the tool a rake."""
 
     def reset(self) -> None:
         super().reset()
         self.rake = self.wanted["rake"]
         self.tip = self.first[:3] + rotate(self.first[3:], self._tip)
-        self.start, self.furthest = self.tip.copy(), float(self.tip[0])
+        self.start, self.furthest, self.deepest = self.tip.copy(), float(self.tip[0]), 0.0
         self.wanted["depth"] = -float(self.tip[2])
-        self.plan: list[tuple[float, float]] = []
 
     def hear(self, asked: Mapping[str, Any]) -> None:
         before = self.wanted["depth"]
@@ -188,6 +185,7 @@ class ToolControls(Controls):
             self.tip[2] += min(max(fall, -fastest), fastest) * dt
         turn = (self.wanted["rake"] - self.rake) / SETTLING
         self.rake += min(max(turn, -TURNING), TURNING) * dt
+        self.deepest = max(self.deepest, -float(self.tip[2]))
         if self.tip[2] < 0.0:
             self.furthest = max(self.furthest, float(self.tip[0]))
 
@@ -199,10 +197,11 @@ class ToolControls(Controls):
         sines = self._trained("the tool's orientation", 2) or (0.0, 0.0)
         least, most = (math.degrees(math.asin(min(max(sine, -1.0), 1.0))) for sine in sines)
         deepest = min(1.2 * max(-low, 0.01), self.scene.bed.size[2])
-        ends = max(least - MARGIN, -60.0), min(most + MARGIN, 60.0)
+        rake = rake_of(self.first[3:])
+        ends = max(min(least, rake) - MARGIN, -60.0), min(max(most, rake) + MARGIN, 60.0)
         return [
             Slider("depth", "depth", "mm", 1e3, 1e-3, -2.0 * LIFT, deepest, 0.0, (-high, -low)),
-            Slider("rake", "rake", "°", 1.0, 0.5, *ends, rake_of(self.first[3:]), (least, most)),
+            Slider("rake", "rake", "°", 1.0, 0.5, *ends, rake, (least, most)),
             Slider("speed", "speed", "mm/s", 1e3, 1e-3, 0.0, 1.5 * speed, 0.7 * speed, (0.0, speed)),
         ]
 

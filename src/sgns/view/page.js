@@ -32,7 +32,10 @@ function told(message) {
   if ("error" in message) say(message.error, true);
   if ("said" in message) say(message.said);
   if ("paused" in message) pause(message.paused);
-  if ("wanted" in message) for (const [key, value] of Object.entries(message.wanted)) slide(key, value);
+  for (const [key, value] of Object.entries(message.wanted ?? {})) {
+    slide(key, value);
+    asked[key] = sliders[key].value; // known there
+  }
 }
 
 function begin(message) {
@@ -220,6 +223,7 @@ function slide(key, value) {
 function pause(now) {
   paused = now;
   $("pause").firstElementChild.textContent = paused ? "Go on" : "Pause";
+  $("pace").textContent = paused ? "paused" : "…";
 }
 
 // What keys, gamepad and sliders ask for, `dt` seconds after the last time.
@@ -248,6 +252,7 @@ function steer(dt) {
 
 function driven(numbers) {
   const at = Object.fromEntries(about.fields.map((name, i) => [name, numbers[i]]));
+  if (at.frame && at.frame === frame?.frame) return void ([frame, fresh] = [at, true]); // it is recorded, or no more
   const jumped = frame !== null && at.frame <= frame.frame;
   view?.coordinates(numbers.subarray(about.fields.length));
   if (jumped || frame === null) view?.still();
@@ -264,6 +269,7 @@ function driven(numbers) {
 }
 
 function show() {
+  view?.dig(about.wheel ? frame.sinkage : frame.depth);
   view?.panels[0].move(0, [frame.x, frame.y, frame.z, frame.qx, frame.qy, frame.qz, frame.qw]);
   view?.panels[0].push([frame.fx, frame.fy, frame.fz]);
   for (const [id, out] of Object.entries(reads)) {
@@ -366,7 +372,7 @@ function showRuns() {
 
 // --- Every picture -------------------------------------------------------------------------------------------
 
-let last = 0, pictures = 0, since = 0, slow = 0;
+let last = 0, pictures = 0, since = 0, slow = 0, moved = 0;
 
 function drawing(now) {
   requestAnimationFrame(drawing);
@@ -383,7 +389,10 @@ function drawing(now) {
     ask(Math.min(Math.round(time * about.rate), about.frames - 1));
     if (fresh) showRuns();
   }
-  if (view && (fresh || view.stale)) view.draw();
+  if (view && (fresh || view.stale)) {
+    view.draw();
+    moved = now;
+  } else if (view && !view.fine && now - moved > 400) view.draw(true);
   pictures += fresh ? 1 : 0;
   fresh = false;
   slow += 1;

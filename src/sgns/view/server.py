@@ -61,13 +61,13 @@ BEHIND = 0.25
 
 def main(cfg: DictConfig) -> None:
     """Serve the page until Ctrl-C."""
+    if cfg.prediction is not None and (cfg.run is None or cfg.checkpoint is not None):
+        raise UserError("prediction goes with run=..., the true one, and without checkpoint")
     if cfg.checkpoint is None and cfg.run is None:
         raise UserError(
             "nothing to show: give a run file, as in sgns view run.h5, or a network to drive a tool in, as in "
             "sgns view checkpoint=excavation"
         )
-    if cfg.prediction is not None and (cfg.run is None or cfg.checkpoint is not None):
-        raise UserError("prediction goes with run=..., the true one, and without checkpoint")
     with ExitStack() as stack, single_thread():
         runs = [stack.enter_context(Run(path)) for path in (cfg.run, cfg.prediction) if path is not None]
         make = maker(cfg, runs)
@@ -177,7 +177,8 @@ async def driven(socket: web.WebSocketResponse, drive: Drive, output: Path) -> N
 
 async def tick(socket: web.WebSocketResponse, drive: Drive) -> None:
     """A step every frame of simulated time; the page is sent each."""
-    clock, due, outside, shown = asyncio.get_running_loop().time, 0.0, "", None
+    clock, due, outside, left = asyncio.get_running_loop().time, 0.0, "", 0
+    shown, recording = None, False
     while not socket.closed:
         if not drive.paused:
             try:
@@ -185,12 +186,15 @@ async def tick(socket: web.WebSocketResponse, drive: Drive) -> None:
             except UserError as error:
                 drive.pause(True)
                 await socket.send_json({"error": f"{error}; reset to go on", "paused": True})
-        if shown is not drive.kept[-1]:  # after a reset, too
-            shown = drive.kept[-1]
+        if shown is not drive.kept[-1] or recording != drive.recording:  # after a reset, too
+            shown, recording = drive.kept[-1], drive.recording
             await socket.send_bytes(drive.frame())
         if outside != drive.outside:
             outside = drive.outside
             await socket.send_json({"outside": outside})
+        if left != len(drive.controls.plan):  # the tool goes by itself: its sliders follow
+            left = len(drive.controls.plan)
+            await socket.send_json({"wanted": drive.controls.wanted})
         due = max(due + 1.0 / drive.rate, clock() - BEHIND)
         await asyncio.sleep(max(due - clock(), 0.0))
 

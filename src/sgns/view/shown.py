@@ -30,9 +30,11 @@ from sgns.evaluate.views import LEAST_SPEED, nice
 from sgns.model.checkpoint import Surrogate
 from sgns.model.features import context_of, is_wheel
 from sgns.model.training_range import NOTEWORTHY, Excess
+from sgns.plot import MADE_BY, require_finite
 from sgns.rollout import require_known_bed, require_same_freedom, write_rollout
 from sgns.simulate.campaign import require_space
-from sgns.simulator import Rollout, Simulator, State
+from sgns.simulator import Simulator
+from sgns.state import Rollout, State
 from sgns.view.controls import ToolControls, WheelControls
 
 FIELDS = (
@@ -92,7 +94,7 @@ class Drive:
         checkpoint: str | Path = "",
     ) -> None:
         self.simulator = Simulator(surrogate, device, spread=surrogate.dynamics.members > 1)
-        self.known, self.checkpoint = surrogate.training_range, checkpoint
+        self.known, self.checkpoint = self.simulator.training_range, checkpoint
         self.scene = driven_scene(self.simulator, run, checkpoint)
         self.rate = float(self.simulator.frame_rate)
         kind = WheelControls if self.simulator.predicts_body else ToolControls
@@ -241,7 +243,7 @@ class Drive:
         if len(frames) < 2:
             raise UserError("nothing was recorded yet: let the clock run first")
         require_space(output.absolute().parent, len(frames) * len(self.simulator.start_positions) * 24)
-        self.recording = False
+        self.recording, self._end = False, self.simulator.save()
         return frames
 
     def write(self, frames: Sequence[Kept], path: Path) -> str:
@@ -261,7 +263,7 @@ class Drive:
             poses,
             in_world_frame(poses, self.simulator.body_points),
             self.computed,
-            self.simulator.save(),
+            self._end,
             self.simulator.basis,
             self.values,
             lambda: excess,
@@ -321,18 +323,21 @@ class Replay:
                         f"{first.path} and {other.path} differ in their {what} ({a}, {b}); give two runs of one bed"
                     )
         self.frame_count = min(run.frame_count for run in runs)
+        sampled = np.linspace(0, self.frame_count - 1, SAMPLED).astype(int)
+        self.sampled: list[int] = np.unique(sampled).tolist()
+        for run in runs:
+            require_finite(run, self.sampled)
 
     def about(self) -> dict[str, Any]:
         """All that the page has to know before the first frame."""
         first, start = self.runs[0], self.runs[0].positions(0)[0]
-        who = {"mpm": "simulated (MPM)", "rollout": "network"}
         low, high = start.min(axis=0), start.max(axis=0)
         forces = [np.linalg.norm(body.force, axis=-1).max() for run in self.runs for body in bodies(run)]
         return words(first.scene) | {
             "mode": "replay",
             "title": f"{first.scene.get('kind', 'scene')}, {first.particle_count} particles, {first.time[-1]:.3g} s",
             "runs": [run.path.name for run in self.runs],
-            "who": [who.get(run.producer, run.producer) for run in self.runs],
+            "who": [MADE_BY[run.producer][0] for run in self.runs],
             "turned": bool(np.abs(first.force[:, 1]).max() > 0.05 * float(np.max(forces))),
             "rate": first.frame_rate,
             "frames": self.frame_count,
@@ -391,13 +396,13 @@ class Replay:
         """Ends of the colours' scales: speed [m/s], way from the start [m], and of two runs their distance [m]."""
         start = self.runs[0].positions(0)[0]
         found: dict[str, float] = {"speed": LEAST_SPEED, "displacement": 1e-3}
-        for index in np.unique(np.linspace(0, self.frame_count - 1, SAMPLED).astype(int)).tolist():
+        for index in self.sampled:
             places = [run.positions(index)[0] for run in self.runs]
             sizes = {"speed": self.runs[0].velocities(index)[0], "displacement": places[0] - start}
             if len(places) > 1:
                 sizes["error"] = places[1] - places[0]
             for name, vectors in sizes.items():
-                size = float(np.nanpercentile(np.linalg.norm(vectors, axis=1), 99.5))
+                size = float(np.percentile(np.linalg.norm(vectors, axis=1), 99.5))
                 found[name] = max(found.get(name, 1e-4), size)
         return {name: nice(size) for name, size in found.items()}
 

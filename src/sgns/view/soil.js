@@ -72,6 +72,12 @@ const SHADED = `
     colour = vec4((0.62 + 0.38 * light) * paint, 1.0);
   }`;
 
+// A number of half precision.
+function half(bits) {
+  const power = (bits >> 10) & 31, part = bits & 1023;
+  return (bits >> 15 ? -1 : 1) * (power ? 2 ** (power - 15) * (1 + part / 1024) : 2 ** -24 * part);
+}
+
 const material = (vertexShader, uniforms) => new RawShaderMaterial({
   glslVersion: GLSL3, vertexShader, fragmentShader: SHADED,
   uniforms: { size: { value: 1 }, top: { value: 1 }, stops: { value: [] }, ...uniforms },
@@ -171,9 +177,10 @@ export class View {
     this.controls.addEventListener("change", () => (this.stale = true));
     this.controls.addEventListener("end", () => this.order());
     this.panels = [];
-    this.detail = Math.min(window.devicePixelRatio || 1, 2);
+    this.finest = this.detail = Math.min(window.devicePixelRatio || 1, 2); // points of the picture per point of the page
     this.colours = null;
     this.shown = "speed";
+    this.dug = about.mode === "drive" ? 0 : Infinity; // how deep a tool has been [m]
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
   }
 
@@ -196,7 +203,12 @@ export class View {
       modes: { value: texture }, now: { value: this.now }, before: { value: this.last }, gain: { value: 1 },
     });
     panel.body(corners);
-    panel.places = mean;
+    panel.places = mean.slice(); // at rest
+    for (let i = 0; i < count; i++)
+      for (let k = 0; k < wide; k++) {
+        const weight = half(modes[wide * i + k]);
+        for (let axis = 0; axis < 3; axis++) panel.places[3 * i + axis] += weight * rest[3 * k + axis];
+      }
     this.panels.push(panel);
   }
 
@@ -283,7 +295,6 @@ export class View {
     const box = this.canvas.parentElement.getBoundingClientRect();
     this.width = Math.max(box.width, 1);
     this.height = Math.max(box.height, 1);
-    this.renderer.setPixelRatio(this.detail);
     this.renderer.setSize(this.width, this.height, false);
     this.look();
   }
@@ -306,8 +317,11 @@ export class View {
     this.controls.update();
   }
 
-  draw() {
-    this.stale = false;
+  // What stands still is drawn as fine as the screen is.
+  draw(still = false) {
+    const detail = still ? this.finest : this.detail;
+    [this.stale, this.fine] = [false, still];
+    if (this.renderer.getPixelRatio() !== detail) this.renderer.setPixelRatio(detail);
     const many = this.panels.length, across = this.across;
     const wide = across ? this.width / many : this.width, high = across ? this.height : this.height / many;
     this.camera.aspect = wide / high;
@@ -316,28 +330,38 @@ export class View {
       const left = across ? i * wide : 0, bottom = across ? 0 : (many - 1 - i) * high;
       this.renderer.setViewport(left, bottom, wide, high);
       this.renderer.setScissor(left, bottom, wide, high);
-      panel.material.uniforms.size.value = 1.2 * this.about.spacing * 0.5 * high * this.detail;
+      panel.material.uniforms.size.value = 1.2 * this.about.spacing * 0.5 * high * detail;
       this.renderer.render(panel.scene, this.camera);
     });
   }
 
-  // Particles that are nearer are drawn first and hide the rest, which then costs nothing.
+  // Particles that are nearer are drawn first and hide the rest, which then costs less. Those far below all that was
+  // dug, and not at a side of the bin, nobody can see.
   order() {
-    const { x, y, z } = this.camera.position;
+    const { x, y, z } = this.camera.position, [X, Y, Z] = this.about.bed, few = 1.5 * this.about.spacing;
+    const low = -this.dug - 6 * this.about.spacing;
     for (const panel of this.panels) {
       const p = panel.places, away = new Float32Array(p.length / 3);
       for (let i = 0; i < away.length; i++) away[i] = Math.hypot(p[3 * i] - x, p[3 * i + 1] - y, p[3 * i + 2] - z);
-      const nearest = Uint32Array.from(away, (_, i) => i).sort((i, j) => away[i] - away[j]);
-      panel.points.geometry.setIndex(new BufferAttribute(nearest, 1));
+      const hidden = (i) => {
+        const [u, v, w] = [p[3 * i], p[3 * i + 1], p[3 * i + 2]];
+        return w < low && w > few - Z && u > few && u < X - few && v > few && v < Y - few;
+      };
+      const seen = Uint32Array.from(away, (_, i) => i).filter((i) => !hidden(i)).sort((i, j) => away[i] - away[j]);
+      panel.points.geometry.setIndex(new BufferAttribute(seen, 1));
     }
     this.stale = true;
   }
 
+  // The tool is this deep [m].
+  dig(depth) {
+    if (depth < this.dug + this.about.spacing) return;
+    this.dug = depth;
+    this.order();
+  }
+
   // Fewer points of the screen where the machine is slow.
   coarser() {
-    if (this.detail > 0.5) {
-      this.detail = Math.max(0.5, 0.75 * this.detail);
-      this.resize();
-    }
+    this.detail = Math.min(this.detail, Math.max(0.5, 0.75 * this.detail));
   }
 }

@@ -87,7 +87,9 @@ def needed(folder: Path, here: Path, example: str) -> None:
     "example",
     [pytest.param(one, marks=pytest.mark.long if one.split()[1] == LONG else ()) for one in examples()],
 )
-def test_examples_of_the_help_run(example: str, folder: Path, empty_folder: Path) -> None:
+def test_examples_of_the_help_run(
+    example: str, folder: Path, empty_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for word, reason in LEFT_OUT.items():
         if word in example:
             pytest.skip(reason)
@@ -106,8 +108,15 @@ def test_examples_of_the_help_run(example: str, folder: Path, empty_folder: Path
         smaller = [word for word in smaller if not word.startswith("dataset.path=")]
     if any(word.startswith("continue_from=") for word in words):
         smaller = []
+    if command == "view":  # which serves its page until Ctrl-C: tests/sgns/view
+        monkeypatch.setattr("sgns.view.server.serve", served)
+        shutil.copy(folder / "run.h5", empty_folder / "new.h5")
     done = call(command, *words, *smaller)
     assert done.returncode == 0, done.stderr
+
+
+async def served(*_: object) -> None:
+    """Nobody opens the page."""
 
 
 def test_a_rollout_plays_the_scene_of_its_checkpoint(folder: Path) -> None:
