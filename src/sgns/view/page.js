@@ -208,7 +208,16 @@ function controls() {
 const DRIVES = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "KeyA", "KeyD", "KeyW", "KeyS", "KeyQ", "KeyE"];
 
 function wish(name) {
+  tell({ way: asked.way ?? 0 }); // sliders that were moved just before
   if (socket.readyState === 1) socket.send(JSON.stringify({ do: name }));
+}
+
+// What has changed since the last time.
+function tell(now) {
+  for (const [key, one] of Object.entries(sliders)) now[key] = one.value;
+  const changed = Object.fromEntries(Object.entries(now).filter(([key, value]) => asked[key] !== value));
+  if (Object.keys(changed).length && socket.readyState === 1) socket.send(JSON.stringify(changed));
+  asked = now;
 }
 
 function slide(key, value) {
@@ -243,11 +252,7 @@ function steer(dt) {
   if (down && sliders.depth) slide("depth", sliders.depth.value + down * dt * (sliders.speed?.value ?? 0.1));
   if (turn && sliders.rake) slide("rake", sliders.rake.value + 15 * turn * dt);
   if (turn && sliders.slip) slide("slip", sliders.slip.value + 0.2 * turn * dt);
-  const now = { way: Math.min(Math.max(way, -1), 1) };
-  for (const [key, one] of Object.entries(sliders)) now[key] = one.value;
-  const changed = Object.fromEntries(Object.entries(now).filter(([key, value]) => asked[key] !== value));
-  if (Object.keys(changed).length && socket.readyState === 1) socket.send(JSON.stringify(changed));
-  asked = now;
+  tell({ way: Math.min(Math.max(way, -1), 1) });
 }
 
 function driven(numbers) {

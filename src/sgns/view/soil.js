@@ -148,13 +148,14 @@ class Panel {
     const way = new Vector3(...force), size = way.length(), scale = this.about.arrow, longest = 0.5 * this.about.bed[0];
     this.arrow.visible = size * scale > 0.02 * longest && Number.isFinite(size);
     if (!this.arrow.visible) return;
-    const long = Math.min(size * scale, longest), head = Math.min(0.09 * longest, long), body = this.bodies[0];
+    const long = Math.min(size * scale, longest), head = Math.min(0.09 * longest, 0.5 * long), body = this.bodies[0];
     way.normalize();
     this.arrow.quaternion.setFromUnitVectors(new Vector3(0, 1, 0), way);
     this.arrow.position.copy(this.foot).applyQuaternion(body.quaternion).add(body.position).addScaledVector(way, -long);
-    this.shaft.scale.set(longest, Math.max(long - 0.9 * head, 1e-6), longest);
+    const thick = head / 0.09; // a short arrow is thin
+    this.shaft.scale.set(thick, long - 0.9 * head, thick);
     this.head.position.set(0, long - head, 0);
-    this.head.scale.set(longest, head / 0.09, longest);
+    this.head.scale.set(thick, thick, thick);
   }
 }
 
@@ -177,7 +178,7 @@ export class View {
     this.controls.addEventListener("change", () => (this.stale = true));
     this.controls.addEventListener("end", () => this.order());
     this.panels = [];
-    this.finest = this.detail = Math.min(window.devicePixelRatio || 1, 2); // points of the picture per point of the page
+    this.finest = this.detail = Math.min(window.devicePixelRatio || 1, 2); // the picture's points per point of the page
     this.colours = null;
     this.shown = "speed";
     this.dug = about.mode === "drive" ? 0 : Infinity; // how deep a tool has been [m]
