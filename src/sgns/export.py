@@ -169,11 +169,18 @@ def write(
     model = made.model_proto
     model.ir_version = IR_VERSION
     # What torch notes about every node are lines of this package, with the folders it lies in.
-    for one in (*model.graph.node, *model.graph.value_info, *model.graph.initializer, model.graph):
+    model.graph.ClearField("value_info")
+    for one in (
+        *model.graph.node,
+        *model.graph.initializer,
+        *model.graph.input,
+        *model.graph.output,
+        model.graph,
+    ):
         one.ClearField("metadata_props")
     for value, port in zip((*model.graph.input, *model.graph.output), (*inputs, *outputs), strict=True):
-        value.ClearField("metadata_props")
         value.doc_string = f"{port.meaning} [{port.unit or '-'}]"
+        value.type.tensor_type.shape.dim[0].dim_param = port.shape[0]
     model.producer_name, model.producer_version = "sgns", __version__
     onnx.helper.set_model_props(model, about)
     onnx.checker.check_model(model, full_check=True)

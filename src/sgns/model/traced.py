@@ -173,9 +173,8 @@ class Step(nn.Module):
         # The part of the rotation between two poses along its axis; the shorter way round.
         turned = _products(poses[:, 1:, 3:], poses[:, :-1, 3:]) @ self.between
         sine, cosine = turned[..., :3].square().sum(-1, keepdim=True).sqrt(), turned[..., 3:].abs()
-        # onnxruntime has no arctangent of doubles: one of floats, made exact.
+        # onnxruntime has no arctangent of doubles; what networks are told is rounded to floats anyway.
         half = torch.atan((sine / cosine).float()).double()
-        half = half + (sine * half.cos() - cosine * half.sin())
         sign = torch.where(turned[..., 3:] < 0.0, -2.0, 2.0)
         vector = turned[..., :3] * (sign * half / sine.clamp_min(1e-12))
         motion = torch.cat([poses[:, 1:, :3] - poses[:, :-1, :3], vector], dim=-1)
