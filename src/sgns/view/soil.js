@@ -26,24 +26,23 @@ const HEAD = `
     share = clamp(value / top, 0.0, 1.0);
   }`;
 
+// Written out: a loop over an array of uniforms takes some processors much longer.
 const DECODED = (groups) => `${HEAD}
   precision highp sampler2D;
   in vec3 position;
   uniform sampler2D modes;
-  uniform vec3 now[${4 * groups}], before[${4 * groups}];
-  uniform float gain;
+  uniform vec3 now[${4 * groups}], way[${4 * groups}];
   void main() {
+    int at = gl_VertexID * ${groups};
     vec3 p = position, d = vec3(0.0);
-    for (int k = 0; k < ${groups}; k++) {
-      int at = gl_VertexID * ${groups} + k;
-      vec4 m = texelFetch(modes, ivec2(at % ${WIDTH}, at / ${WIDTH}), 0);
-      for (int c = 0; c < 4; c++) {
-        p += m[c] * now[4 * k + c];
-        d += m[c] * (now[4 * k + c] - before[4 * k + c]);
-      }
-    }
-    place(p, gain * length(d));
+    vec4 m;
+    ${Array.from({ length: groups }, (_, k) => `
+    m = texelFetch(modes, ivec2((at + ${k}) % ${WIDTH}, (at + ${k}) / ${WIDTH}), 0);
+    p += ${sum("now", k)};
+    d += ${sum("way", k)};`).join("")}
+    place(p, length(d));
   }`;
+const sum = (name, k) => ["x", "y", "z", "w"].map((c, i) => `m.${c} * ${name}[${4 * k + i}]`).join(" + ");
 
 const RECORDED = `${HEAD}
   in vec4 position, first, other;  // shares of boxes, and of the largest speed
@@ -201,7 +200,7 @@ export class View {
     this.last = this.rest.slice();
     const panel = new Panel(this.about);
     panel.soil(new BufferGeometry().setAttribute("position", new BufferAttribute(mean, 3)), DECODED(groups), {
-      modes: { value: texture }, now: { value: this.now }, before: { value: this.last }, gain: { value: 1 },
+      modes: { value: texture }, now: { value: this.now }, way: { value: zeros() },
     });
     panel.body(corners);
     panel.places = mean.slice(); // at rest
@@ -231,13 +230,20 @@ export class View {
   coordinates(modes) {
     [this.last, this.now] = [this.now, this.last];
     this.now.set(modes);
-    const { now, before } = this.panels[0].material.uniforms;
+    this.measure();
+  }
+
+  // What the soil is coloured by: its velocity, or its way from where it was at rest.
+  measure() {
+    const { now, way } = this.panels[0].material.uniforms, speed = this.shown === "speed";
+    const from = speed ? this.last : this.rest, gain = speed ? this.about.rate : 1;
     now.value = this.now;
-    before.value = this.shown === "speed" ? this.last : this.rest;
+    way.value.forEach((_, k) => (way.value[k] = gain * (this.now[k] - from[k])));
   }
 
   still() { // after a jump: nothing has moved since the frame before
     this.last.set(this.now);
+    this.measure();
   }
 
   positions(i, shares, low, high, fastest, first) {
@@ -278,10 +284,8 @@ export class View {
         return new Vector3((paint >> 16) / 255, ((paint >> 8) & 255) / 255, (paint & 255) / 255);
       });
       of.top.value = top;
-      if (of.gain) {
-        of.gain.value = name === "speed" ? this.about.rate : 1;
-        of.before.value = name === "speed" ? this.last : this.rest;
-      } else of.colour.value = ["speed", "displacement", "error"].indexOf(name);
+      if (of.way) this.measure();
+      else of.colour.value = ["speed", "displacement", "error"].indexOf(name);
     }
   }
 
