@@ -73,6 +73,8 @@ def parse(command: str) -> tuple[str, list[str]]:
         overrides.append("files=[run.h5]")
     if name in ("plot", "render", "convert"):
         overrides.append("run=run.h5")
+    if name == "import":
+        overrides.append("source=[run.npz]")
     plain = []
     for override, text in zip(OverridesParser.create().parse_overrides(overrides), overrides, strict=True):
         if text.startswith(("hydra/", "hydra.launcher.")):  # a launcher that is a package of its own

@@ -9,11 +9,17 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
-AFTER = {"best_of_100_paths": "train_and_step", "read_a_run": "bucket_on_a_path"}
+AFTER = {
+    "best_of_100_paths": "train_and_step",
+    "read_a_run": "bucket_on_a_path",
+    "open_elsewhere": "bucket_on_a_path",
+}
 """What makes the files that an example reads."""
-LONG = {"learn_to_dig", "mujoco_bucket", "onnx_run", "ros2_node"}
-"""What takes many steps; tests/sgns/test_envs.py and test_coupling.py try what they use."""
-NAMES = sorted(file.stem for file in EXAMPLES.glob("*.py") if file.stem != "demo")  # see test_demo.py
+LONG = {"import_runs", "learn_to_dig", "mujoco_bucket", "onnx_run", "open_elsewhere", "ros2_node"}
+"""What takes many steps; tests of the package try what they use."""
+ELSEWHERE = ("demo", "newton_runs")
+"""See test_demo.py; Newton is not installed here and takes minutes."""
+NAMES = sorted(file.stem for file in EXAMPLES.glob("*.py") if file.stem not in ELSEWHERE)
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,17 @@ class UserError(Exception):
     """Bad input from a person: one line with what, where, what is allowed and what to do."""
 
 
+# --- What tells the jobs of a sweep apart ---------------------------------------------------------------
+
+shared_overrides: list[str] = []
+"""What all jobs of the sweep are given; empty outside of one, and in the processes of other launchers."""
+
+
+def own_overrides(overrides: Sequence[str]) -> list[str]:
+    """Of a job's, those that not all jobs have; all of them where none differs."""
+    return [one for one in overrides if one not in shared_overrides] or list(overrides)
+
+
 # --- Plain data from YAML text that anybody may have written --------------------------------------------
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same in C, where PyYAML has it

@@ -143,6 +143,7 @@ def _groups() -> Iterator[tuple[str, tuple[str, ...], str, Any]]:
         "plot": (f"run={RUN}", "output=a.png"),
         "render": (f"run={RUN}", "output=a.gif"),
         "convert": (f"run={RUN}", "output=a.csv"),
+        "import": (f"source=[{RUN}]", "output=a.h5"),
     }
     for name, cls in typed.COMMANDS.items():
         yield name, own.get(name, ()), "", cls

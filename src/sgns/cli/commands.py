@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from sgns import __version__
 from sgns.cli.help import open_closed_streams, write_error, write_output
-from sgns.config import Interrupted, UserError, heeded_signals
+from sgns.config import Interrupted, UserError, heeded_signals, own_overrides, shared_overrides
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -320,12 +320,11 @@ def _check_jobs(hydra: Any, command: str, settings: Sequence[str]) -> None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
-    from sgns.cli.help import LineFormatter
     from sgns.cli.settings import check_shared, sweep_jobs
 
     master = hydra.config_loader.load_configuration(command, settings, RunMode.MULTIRUN)
     jobs = sweep_jobs(settings)
-    LineFormatter.same = tuple(set(jobs[0]).intersection(*jobs)) if len(jobs) > 1 else ()
+    shared_overrides[:] = set(jobs[0]).intersection(*jobs) if len(jobs) > 1 else ()
     check = getattr(importlib.import_module(COMMANDS[command].module), "check_settings", None)
     for number, job in enumerate(jobs if len(jobs) <= _MOST_CHECKED else ()):
         try:
@@ -343,10 +342,7 @@ def _check_jobs(hydra: Any, command: str, settings: Sequence[str]) -> None:
 
 def _label(number: int, overrides: Sequence[str]) -> str:
     """What a job of a sweep is called: by what differs between the jobs."""
-    from sgns.cli.help import LineFormatter
-
-    own = [one for one in overrides if one not in LineFormatter.same] or overrides
-    return f"job {number} ({_one_line(','.join(own))}): "
+    return f"job {number} ({_one_line(','.join(own_overrides(overrides)))}): "
 
 
 def _show_settings(hydra: Any, command: str, arguments: argparse.Namespace) -> None:

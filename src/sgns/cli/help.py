@@ -16,11 +16,11 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, Any, ClassVar, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import yaml
 
-from sgns.config import UserError
+from sgns.config import UserError, shared_overrides
 
 if TYPE_CHECKING:
     from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
@@ -33,13 +33,10 @@ if TYPE_CHECKING:
 class LineFormatter(logging.Formatter):
     """Plain text for information, the level's name first for warnings and errors."""
 
-    same: ClassVar[tuple[str, ...]] = ()
-    """Overrides that all jobs of a sweep have; Hydra's line for each job leaves them out."""
-
     def format(self, record: logging.LogRecord) -> str:
         line = super().format(record)
-        if self.same and record.name.startswith("hydra") and line.startswith("\t#"):
-            for one in self.same:
+        if record.name.startswith("hydra") and line.startswith("\t#"):  # Hydra's line for each job
+            for one in shared_overrides:
                 line = line.replace(f" {one}", "", 1)
         return f"{record.levelname.lower()}: {line}" if record.levelno >= logging.WARNING else line
 

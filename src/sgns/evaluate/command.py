@@ -161,7 +161,9 @@ def evaluate(
         with Run(path) as run:
             require_known_run(simulator, run, checkpoint)
     costs = network_costs(checkpoint, simulator.card)
-    training_log = read_log(checkpoint.parent / "tensorboard")
+    # Of a job of a sweep the folder is called as the job.
+    logs = sorted(file.parent for file in checkpoint.parent.glob("*/*tfevents*"))
+    training_log = read_log(logs[0] if logs else checkpoint.parent / "tensorboard")
     require_replaceable(
         *(output / name for name in ("metrics.csv", "examples.csv", "metrics.json", "report.html")),
         *(output / "figures").glob("*.png"),

@@ -408,7 +408,9 @@ def histogram_figure(runs: Sequence[ParticleErrors]) -> Figure:
 # --- How a network was trained: loss and skill by step --------------------------------------------------
 
 VALIDATION = {
-    "skill/validation": ("position skill", NETWORK),
+    "judged/skill": ("position skill", NETWORK),
+    "judged/force NRMSE": ("force NRMSE", ACCENT),
+    "skill/validation": ("position skill", NETWORK),  # as earlier trainings called them
     "force_nrmse/validation": ("force NRMSE", ACCENT),
 }
 # Of the losses; what a model predicts decides which there are.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import re
 import shlex
 import shutil
 import signal
@@ -32,7 +33,16 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import OmegaConf
 
 import sgns
-from sgns.config import Interrupted, UserError, differences, flattened, of_dataset
+from sgns.config import (
+    Interrupted,
+    UserError,
+    differences,
+    flattened,
+    of_dataset,
+    own_overrides,
+    parse_yaml,
+)
+from sgns.data.dataset import IMPORTED
 from sgns.data.files import only_here, require_replaceable, write_whole
 from sgns.model.checkpoint import SUMMARY, read_checkpoint, read_summary
 from sgns.numbers import counted, error_hint, error_words
@@ -82,6 +92,8 @@ def main(cfg: DictConfig) -> float:
     else:
         dataset = Dataset.open(cfg.dataset.path, cfg.dataset.get("where"))
         reduced, title = reduce_dataset(dataset, cfg.reduction, device=cfg.device), dataset.title
+    hydra = HydraConfig.get() if HydraConfig.initialized() else None
+    job = own_overrides(hydra.overrides.task) if hydra is not None and hydra.mode == RunMode.MULTIRUN else ()
     skill = train(
         reduced,
         num_modes=reduced.num_modes,
@@ -92,10 +104,10 @@ def main(cfg: DictConfig) -> float:
         device=cfg.device,
         start_from=cfg.checkpoint,
         provenance={"preset": plain["preset"]["name"], "dataset": title},
+        job=job,
     )
-    # A sweep ends with a table.
-    if first and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.RUN:
-        for line in next_commands(output / "best.ckpt", reduced, HydraConfig.get().overrides.task):
+    if first and hydra is not None and not job:  # a sweep ends with a table
+        for line in next_commands(output / "best.ckpt", reduced, hydra.overrides.task):
             log.info("%s", line)
     return skill
 
@@ -135,7 +147,9 @@ def next_commands(checkpoint: Path, reduced: ReducedDataset, given: Sequence[str
     file += " spread=true" * (members > 1)
     lines = [f"next: sgns evaluate {' '.join([*of_dataset(given), file])}"]
     scene = reduced.runs("train")[0].scene
-    if "bed" in scene:  # published runs have no particles
+    if (
+        "bed" in scene and scene.get("kind") != IMPORTED
+    ):  # published runs have no particles, imported ones no scene
         own = ["scene.path=path.csv"] * (scene.get("path") is not None)
         own += ["scene.tool.file=tool.stl"] * ((scene.get("tool") or {}).get("shape") == "mesh")
         lines.append(f"      sgns rollout {' '.join([file, *own])} output=new.h5")
@@ -154,6 +168,7 @@ def train(
     device: str = "cpu",
     start_from: str | Path | None = None,
     provenance: Mapping[str, Any] | None = None,
+    job: Sequence[str] = (),
 ) -> float:
     """Train, or go on training, or take what is complete; returns the skill of the best checkpoint's rollouts on the
     validation runs.
@@ -168,6 +183,7 @@ def train(
         device: "cpu" or "cuda"; polynomials know the first only.
         start_from: Checkpoint whose weights and normalisation a network starts from.
         provenance: More plain values for the checkpoint.
+        job: Of a job of a sweep what tells it from the others, as key=value: TensorBoard calls it so.
 
     Raises:
         UserError: Bad settings, a loss that is not finite, or an `output` of another training, there or under way.
@@ -201,7 +217,7 @@ def train(
         "package_version": sgns.__version__,
     }
     with only_here(output / "best.ckpt") if first else nullcontext():
-        resumed = what_is_there(output, asked, how.resume) if first or how.resume else ""
+        resumed = what_is_there(output, asked, how.resume, log_folder(job)) if first or how.resume else ""
         if resumed == "complete":
             summary = read_summary(output)
             log.info("%s is complete; training.resume=false trains anew", output)
@@ -209,7 +225,7 @@ def train(
 
         output.mkdir(parents=True, exist_ok=True)
         torch.manual_seed(seed)
-        logger = TensorBoardLogger(output, name="", version="tensorboard", default_hp_metric=False)
+        logger = Logger(output, name="", version=log_folder(job), default_hp_metric=False)
         try:
             fitted = fit.run(
                 Task(
@@ -245,12 +261,13 @@ def train(
             metrics["position_rmse"] = score.position_rmse
         if fitted.surrogate.dynamics.predicts_body:
             metrics["body_rmse"] = score.body_rmse
-        # TensorBoard's HParams tab takes one level, scalars or text.
+        # TensorBoard's HParams tab takes one level, scalars or text; of a sweep what it is over.
+        told = {key: parse_yaml(value) for key, _, value in (one.partition("=") for one in job)}
         hyperparameters = {
             key: value if isinstance(value, (bool, int, float, str)) else str(value)
-            for key, value in flattened(asked).items()
+            for key, value in (told or flattened(asked)).items()
         }
-        logger.log_hyperparams(hyperparameters, {f"final/{key}": value for key, value in metrics.items()})
+        logger.log_hyperparams(hyperparameters, {f"result/{key}": value for key, value in metrics.items()})
         logger.finalize("success")
         summary = {**fitted.about, **metrics, "seconds": round(fitted.seconds, 1)}
         write_whole(output / SUMMARY, json.dumps(summary, indent=2) + "\n")
@@ -262,7 +279,23 @@ def train(
         return score.skill
 
 
-def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> str:
+class Logger(TensorBoardLogger):
+    """TensorBoard's, without the number of the epoch, of which there is one."""
+
+    def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
+        super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
+
+
+def log_folder(job: Sequence[str]) -> str:
+    """Where the log is below the output; TensorBoard calls the job so."""
+    parts = [one.partition("=")[::2] for one in job]
+    short = [key.rpartition(".")[2] for key, _ in parts]
+    keys = short if len(set(short)) == len(short) else [key for key, _ in parts]
+    name = ",".join(f"{key}={value}" for key, (_, value) in zip(keys, parts, strict=True))
+    return re.sub(r"[^\w.=+,-]+", "_", name)[:100] or "tensorboard"
+
+
+def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool, log: str = "tensorboard") -> str:
     """ "" (nothing), "partial" or "complete"; with resume=false what is there is removed.
 
     Raises:
@@ -274,7 +307,7 @@ def what_is_there(output: Path, asked: dict[str, Any], resume: str | bool) -> st
     if resume is False:
         for file in files:
             file.unlink(missing_ok=True)
-        shutil.rmtree(output / "tensorboard", ignore_errors=True)
+        shutil.rmtree(output / log, ignore_errors=True)
         return ""
     found = [output / name for name in ("last.ckpt", "best.ckpt") if (output / name).exists()]
     if not found:

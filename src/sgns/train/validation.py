@@ -63,7 +63,8 @@ class RolloutScore(NamedTuple):
     mean_force_nrmse: float  # the same of the training runs' mean force
     force_nrmse_at_rest: float
     body_rmse: float  # RMS distance between predicted and true body nodes [m]; 0 for a prescribed body
-    force: Tensor  # predicted from d true frames [N], shape (B, T, 3), zero in the history
+    latent: Tensor  # predicted from d true frames [m], shape (B, T, r, 3)
+    force: Tensor  # likewise [N], shape (B, T, 3), zero in the history
     band: list[float] | None  # of several members, see `Dynamics`; the rest is of their mean
 
     @property
@@ -118,6 +119,7 @@ class ValidationRollouts:
         # Of the positions and of their way since the history's end, what the modes do not see (see `squares`) [m^2].
         self.unseen, self.unseen_way = 0.0, 0.0
         self.coordinates = math.nan  # 3 n
+        self.basis: Basis | None = None  # where there are particles
         self.closure: Closure | None = None
         paths = [run.path for run in runs if run.path is not None]
         packed = [(run.latent[:, num_modes:], run.unseen) for run in runs if run.unseen is not None]
@@ -131,7 +133,7 @@ class ValidationRollouts:
             self.unseen, self.unseen_way = (
                 self.squares(stacked(part)[..., None, None].sqrt()) for part in parts
             )
-            self.coordinates = 3.0 * basis.num_particles
+            self.coordinates, self.basis = 3.0 * basis.num_particles, basis
             if closure := basis.closure:
                 end = num_modes + closure.num_modes
                 self.closure, self.beyond = closure, stacked([run.latent[:, num_modes:end] for run in runs])
@@ -169,6 +171,7 @@ class ValidationRollouts:
                 self.force_error(mean_force),
                 self.force_error(force_at_rest),
                 self.body_error(body) if dynamics.predicts_body else 0.0,
+                latent,
                 force,
                 band,
             )
@@ -251,10 +254,42 @@ def force_figure(rollouts: ValidationRollouts, score: RolloutScore, most: int = 
     return figure
 
 
+def soil_figure(rollouts: ValidationRollouts, score: RolloutScore) -> Figure | None:
+    """The soil at the end of the first validation run, seen from the side near mid-width, in truth (as the modes hold
+    it) and predicted, coloured by how far it has come [mm]; None without particles."""
+    if rollouts.basis is None:
+        return None
+    last = rollouts.lengths[0] - 1
+    start, truth, network = (
+        rollouts.basis.inverse(latent).numpy()
+        for latent in (rollouts.latent[0, 0], rollouts.latent[0, last], score.latent[0, last])
+    )
+    y = start[:, 1]
+    chosen = np.abs(y - y.mean()) <= 0.15 * np.ptp(y)
+    height = float(np.ptp(truth[:, 2]) / np.ptp(truth[:, 0]))
+    figure = Figure(figsize=(6.4, 1.2 + 11.0 * min(height, 1.0)), layout="constrained")
+    axes = figure.subplots(2, 1, sharex=True, sharey=True)
+    size = float(np.clip(2e4 * height / chosen.sum(), 1.0, 40.0))
+    way = [1e3 * np.linalg.norm(soil - start, axis=1)[chosen] for soil in (truth, network)]
+    top = max(float(way[0].max()), 1e-3)
+    for axis, soil, moved, name in zip(axes, (truth, network), way, ("truth", "network"), strict=True):
+        x, _, z = soil[chosen].T
+        dots = axis.scatter(x, z, s=size, c=moved, cmap="viridis", vmin=0.0, vmax=top, linewidths=0)
+        axis.set(ylabel="z [m]", aspect="equal")
+        axis.set_title(f"{name}, {rollouts.names[0]}, last frame", fontsize=8)
+    axes[1].set_xlabel("x [m]")
+    figure.colorbar(dots, ax=axes, label="way since the start [mm]")
+    return figure
+
+
 # --- Between the steps of Lightning's trainer: rollouts of the validation runs, checkpoints, TensorBoard, a bar
 
 
 log = logging.getLogger(__name__)
+
+
+JUDGED = "judged/"
+"""Group of TensorBoard's charts; these follow one another by name: pictures, judgements, losses, pace, result."""
 
 
 class RolloutValidation(L.Callback):
@@ -296,7 +331,9 @@ class RolloutValidation(L.Callback):
             rate = (step - before) * self.settings.windows / elapsed(then, now)
             self._mark = (step, now)
             current = trainer.optimizers[0].param_groups[0]["lr"]
-            logger_of(trainer).log_metrics({"samples_per_s": rate, "learning_rate": current}, step)
+            logger_of(trainer).log_metrics(
+                {"pace/windows per second": rate, "pace/learning rate": current}, step
+            )
         if step % self.settings.validate_every == 0 or step == self.settings.max_steps:
             paused = time.perf_counter()
             self.validate(trainer, step)
@@ -318,22 +355,26 @@ class RolloutValidation(L.Callback):
             self.surrogate.dynamics.band.copy_(torch.tensor(score.band, dtype=torch.float64))
         trainer.lightning_module.train()
         logger = logger_of(trainer)
-        logger.log_metrics(
-            {
-                "skill/validation": score.skill,
-                "skill/validation_at_rest": score.skill_at_rest,
-                "skill/validation_in_subspace": score.skill_in_subspace,
-                "force_nrmse/validation": score.force_nrmse,
-                "force_nrmse/validation_at_rest": score.force_nrmse_at_rest,
-            },
-            step,
-        )
-        logger.experiment.add_figure("force/validation", force_figure(self.rollouts, score), step)
+        shown = {
+            "skill": score.skill,
+            "skill from rest": score.skill_at_rest,
+            "skill in the modes": score.skill_in_subspace,
+            "force NRMSE": score.force_nrmse,
+            "force NRMSE from rest": score.force_nrmse_at_rest,
+            "soil error [mm]": 1e3 * score.position_rmse,
+        }
+        judged = {f"{JUDGED}{name}": value for name, value in shown.items() if not math.isnan(value)}
+        logger.log_metrics(judged, step)
         loss = float(trainer.callback_metrics["loss/total"])
         steps = self.settings.max_steps
         log.info("step %d of %d: loss %.3g; on validation runs: %s", step, steps, loss, score.words())
         if better := score.skill > self.best or not (self.output / "best.ckpt").exists():
             self.best = score.skill
+            soil = soil_figure(self.rollouts, score)
+            forces = force_figure(self.rollouts, score)
+            for name, figure in (("force along a path", forces), ("soil at the end", soil)):
+                if figure is not None:
+                    logger.experiment.add_figure(f"best checkpoint/{name}", figure, step)
         return better
 
     def require_finite_weights(self, step: int) -> None:

@@ -57,6 +57,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = sgns(here, "train", "dataset=quick", *TRAIN, "output=outputs/first")
     assert done.returncode == 0, done.stderr
     assert sgns(here, "simulate", *SMALL, "output=run.h5").returncode == 0
+    for name in ("arrays.npz", "arrays_1.npz", "arrays_2.npz", "arrays_3.npz"):
+        assert sgns(here, "convert", "run.h5", name).returncode == 0
     scene, effects = scene_from_config(composed(*SMALL)), Effects()
     count = iter(range(100))
 
@@ -76,6 +78,9 @@ def needed(folder: Path, here: Path, example: str) -> None:
     shutil.copytree(folder / "data", here / "data")
     if "dataset=quick_reduced" in example:
         shutil.copytree(REDUCED, here / "reduced")
+    if "import arrays" in example or "import 'arrays" in example:
+        for file in folder.glob("arrays*.npz"):
+            shutil.copy(file, here)
     for name in re.findall(r"=(outputs/\w+)/best\.ckpt|(run[.\w]*\.h5)", example):
         if "output=" + "".join(name) not in example:
             source, place = folder / "".join(name), here / "".join(name)

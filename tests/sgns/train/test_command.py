@@ -18,12 +18,13 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from mpm_warp.poses import in_body_frame
 from sgns.config import Interrupted, UserError
 from sgns.data.dataset import Dataset
 from sgns.data.run import Run
-from sgns.evaluate.command import evaluate
+from sgns.evaluate.command import evaluate, read_log
 from sgns.model.checkpoint import load_surrogate
 from sgns.model.dynamics import Path, Standardiser
 from sgns.model.features import BodyTrack
@@ -35,7 +36,7 @@ from sgns.train import validation
 from sgns.train.command import main, train
 from sgns.train.validation import ValidationRollouts
 from sgns.train.windows import Batch
-from sgns_testing.commands import TRAIN, call, environment
+from sgns_testing.commands import TRAIN, call, environment, sgns, small_dataset
 from sgns_testing.tiny import BRIEF, MODEL, REDUCTION, TRAINING, make_dataset
 
 
@@ -134,13 +135,37 @@ def test_what_tensorboard_shows(trained) -> None:
     folder, skill = trained
     events = EventAccumulator(str(folder / "tensorboard"))
     events.Reload()
-    scalars = set(events.Tags()["scalars"])
-    assert {"loss/change", "loss/force", "loss/torque", "loss/total"} <= scalars
-    assert {"skill/validation", "skill/validation_at_rest", "skill/validation_in_subspace"} <= scalars
-    assert "force_nrmse/validation" in scalars
-    assert {"learning_rate", "samples_per_s", "final/skill", "final/force_nrmse"} <= scalars
-    assert events.Tags()["images"] == ["force/validation"]
-    assert events.Scalars("final/skill")[0].value == pytest.approx(skill)
+    scalars = sorted(events.Tags()["scalars"])
+    groups = [
+        "judged",
+        "loss",
+        "pace",
+        "result",
+    ]  # the useful ones first, no constant ones
+    assert list(dict.fromkeys(name.partition("/")[0] for name in scalars)) == groups
+    assert events.Tags()["images"] == [
+        "best checkpoint/force along a path",
+        "best checkpoint/soil at the end",
+    ]
+    titles = [name.partition("/")[2] for name in scalars if not name.startswith("result/")]
+    assert len(set(titles)) == len(titles) == 12
+    assert {"loss/change", "loss/force", "loss/torque", "loss/total"} <= set(scalars)
+    assert events.Scalars("result/skill")[0].value == pytest.approx(skill)
+
+
+def test_the_jobs_of_a_sweep_have_names_and_their_keys_in_tensorboard(tmp_path) -> None:
+    small_dataset(tmp_path / "data")
+    few = [word for word in TRAIN if "num_modes" not in word]
+    sweep = ["-m", "reduction.num_modes=2,3", "dataset=quick", "dataset.path=data", *few, "output=out"]
+    done = sgns(tmp_path, "train", *sweep)
+    assert done.returncode == 0, done.stderr
+    for job, modes in enumerate((2, 3)):
+        folder = tmp_path / f"out/{job}/num_modes={modes}"
+        events = EventAccumulator(str(folder)).Reload()
+        plugin = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+        told = HParamsPluginData.FromString(plugin).session_start_info.hparams
+        assert {key: value.number_value for key, value in told.items()} == {"reduction.num_modes": modes}
+        assert len(read_log(folder)) == 2
 
 
 class Known(torch.nn.Linear):

@@ -51,7 +51,7 @@ def test_what_is_written_is_what_was_fitted(data, tmp_path) -> None:
     assert summary["motion"]["noise"] in FIT["noises"] and summary["force"]["penalty"] in FIT["penalties"]
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
-    assert events.Scalars("final/skill")[0].value == pytest.approx(skill)
+    assert events.Scalars("result/skill")[0].value == pytest.approx(skill)
 
 
 def test_a_complete_fit_is_not_repeated(data, tmp_path, monkeypatch) -> None:
