@@ -12,17 +12,16 @@ import hashlib
 import math
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from mpm_warp.poses import in_world_frame
-from mpm_warp.settings import short
 from sgns.config import UserError
 from sgns.model.checkpoint import Surrogate, load_surrogate, pretrained_file
 from sgns.model.dynamics import Place, Step, Stepper, together
@@ -38,51 +37,21 @@ from sgns.numbers import (
     is_whole,
     real_array,
 )
+from sgns.paths import Followed, Paths, ends_of, followed, mean_pose, one_each, same_pose, told_numbers
 from sgns.state import Rollout, Rollouts, Snapshot, State
 
-# Every step it is looked at whether the tool's pose and its change are far outside the training range; the rest, such
-# as its lowest point, takes longer and is looked at every so many steps.
-_LOOK_EVERY = 30
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
 _SETTLING = 0.5
-
-
-class _Paths(NamedTuple):
-    """What B paths begin with."""
-
-    poses: np.ndarray  # of the tool, shape (B, T, 7)
-    points: np.ndarray  # of all, in the body frame [m], shape (M, 3)
-    contexts: list[dict[str, float]]  # what the network is told of each
-    places: list[Sequence[Place]]  # of each, where every member is
-    starts: Sequence[Snapshot | None]
-
-    def part(self, some: slice) -> _Paths:
-        """Some of them."""
-        return _Paths(
-            self.poses[some], self.points, self.contexts[some], self.places[some], self.starts[some]
-        )
-
-
-class _Followed(NamedTuple):
-    """What the dynamics say of B paths, see `Rollout`; arrays of shape (B, T, ...)."""
-
-    latent: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
-    poses: np.ndarray
-    worlds: np.ndarray | None
-    force_spread: np.ndarray | None
-    latent_spread: np.ndarray | None
-    ends: list[Sequence[Place]]  # of each path, where every member is in the end
 
 
 class Simulator:
     """Steps a bed of soil in a few modes under a tool whose poses are given.
 
     Copies go on from where this one is, to the bit as it does, and on their own: `copy.copy`, which shares the weights,
-    `copy.deepcopy`, and pickled ones, in other processes too. `reset` and `step` are for one thread at a time: give
-    each thread a copy. `rollout` and `rollouts` change nothing and may run in several threads. Processes made by `fork`
-    need `torch.set_num_threads(1)` first, else torch may wait for threads that stayed with their parent.
+    `copy.deepcopy`, and pickled ones, in other processes too. `reset`, `step` and `restore` are for one thread at a
+    time: give each thread a copy. `rollout` and `rollouts` change nothing and may run in several threads, of one
+    simulator, too. Processes made by `fork` need `torch.set_num_threads(1)` first, else torch may wait for threads that
+    stayed with their parent.
 
     Args:
         surrogate: Network, basis and start.
@@ -245,7 +214,7 @@ class Simulator:
             poses = [] if pose is None else [pose] * self.history
         else:
             latent, poses = self._checked_beginning(history)
-        told = self._told([context])
+        told = told_numbers([context], self.device)
         steppers = [member.stepper(len(points), told) for member in self._members]
         # All is in order: nothing is changed before.
         self._frame, self._points, self._context, self._steppers = 0, points, context, steppers
@@ -293,7 +262,7 @@ class Simulator:
         self._frame += 1
         state = self._state()
         known = self._surrogate.training_range
-        if not self._warned and (self._frame % _LOOK_EVERY == 1 or known.far(shown[0], pose)):
+        if not self._warned and (self._frame == 1 or known.far(shown[0], pose, self._points)):
             self._look(self._frame - 1, np.stack([shown[0], pose])[None], self._points, self._context)
         return state
 
@@ -387,7 +356,7 @@ class Simulator:
         """
         self._require_own(snapshot)
         if self._context != snapshot._context or not np.array_equal(self._points, snapshot._points):
-            told = self._told([snapshot._context])
+            told = told_numbers([snapshot._context], self.device)
             self._steppers = [member.stepper(len(snapshot._points), told) for member in self._members]
         for stepper, place in zip(self._steppers, snapshot._places, strict=True):
             stepper.memory = place.memory
@@ -470,9 +439,9 @@ class Simulator:
                 places=[[Place(list(poses[:d]), latent, rest, rest, slow)] * len(self._members)]
             )
         began = time.perf_counter()
-        found = self._followed(begin, given, loads)
+        found = self._follow(begin, given, loads)
         wall_time = elapsed(began, time.perf_counter())
-        (context,), (end,) = begin.contexts, self._ends(found, begin)
+        (context,), (end,) = begin.contexts, ends_of(found, begin, self._made_by)
         parts: list[Any] = [None if part is None else part[0] for part in found[:-1]]
         states, force, torque, poses, world, *spread = parts
         self._look(0, begin.poses, begin.points, context)
@@ -512,20 +481,17 @@ class Simulator:
         told, starts = one_each(values, Mapping, "values", count), one_each(start, Snapshot, "start", count)
         begin = self._begin(poses, body_points, told, starts)
         began = time.perf_counter()
-        found = [
-            self._followed(begin.part(slice(first, first + paths_at_once)))._replace(worlds=None)
-            for first in range(0, count, paths_at_once)
-        ]
+        found, ends = [], []
+        for first in range(0, count, paths_at_once):
+            some = begin.part(slice(first, first + paths_at_once))
+            one = self._follow(some)
+            found.append(one._replace(worlds=None))
+            ends += ends_of(one, some, self._made_by)
         whole: list[Any] = [
             None if part[0] is None else np.concatenate(part) for part in list(zip(*found, strict=True))[:-1]
         ]
         latent, force, torque, poses, _, *spread = whole
         wall_time = elapsed(began, time.perf_counter())
-        ends = [
-            end
-            for first, part in enumerate(found)
-            for end in self._ends(part, begin.part(slice(first * paths_at_once, (first + 1) * paths_at_once)))
-        ]
         self._look(0, begin.poses, begin.points, begin.contexts[0], paths_at_once)
         excess = partial(self._surrogate.training_range.excess, points=begin.points)
         of = self.basis, self._surrogate.card["scene"]
@@ -537,7 +503,7 @@ class Simulator:
         body_points: np.ndarray | None,
         values: Sequence[Mapping[str, Any] | None],
         starts: Sequence[Snapshot | None],
-    ) -> _Paths:
+    ) -> Paths:
         """What B paths of poses (B, T, 7) begin with."""
         for start in starts:
             if start is not None:
@@ -572,46 +538,17 @@ class Simulator:
                     )
                 path[0] = there
                 places.append(start._places)
-        return _Paths(poses, points, contexts, places, starts)
+        return Paths(poses, points, contexts, places, starts)
 
-    def _followed(
-        self, begin: _Paths, given: int = 1, loads: Sequence[np.ndarray | None] = (None, None)
-    ) -> _Followed:
-        """What `Dynamics.follow` finds, the mean of all members, then the spread of force and modes."""
-        told = self._told(begin.contexts)
-        each, last = [], []
-        for member, places in zip(self._members, zip(*begin.places, strict=True), strict=True):
-            parts, final = member.follow(begin.poses, begin.points, told, places, self._pace, given, loads)
-            each.append(parts)
-            last.append(final)
-        ends: list[Sequence[Place]] = list(zip(*last, strict=True))
-        if len(each) == 1:
-            states, force, torque, poses, worlds = each[0]
-            return _Followed(states, force, torque, poses, worlds, None, None, ends)
-        states, force, torque, poses, worlds = (np.stack(parts) for parts in zip(*each, strict=True))
-        states, latent_spread = together(states, self._band[3])
-        force, force_spread = together(force, self._band[:3])
-        torque, worlds = (together(part, 1.0)[0] for part in (torque, worlds))
-        return _Followed(
-            states, force, torque, mean_pose(list(poses)), worlds, force_spread, latent_spread, ends
-        )
-
-    def _ends(self, found: _Followed, begin: _Paths) -> list[Snapshot]:
-        """Where each path ends."""
-        ends = []
-        for i, (places, start) in enumerate(zip(found.ends, begin.starts, strict=True)):
-            frame = found.latent.shape[1] - 1 + (0 if start is None else start.frame)
-            answer = (found.latent, found.force, found.torque, found.force_spread, found.latent_spread)
-            last = [part if part is None else part[i, -1].copy() for part in answer]
-            pairs = zip(found.poses[i, -2:].copy(), found.latent[i, -2:].copy(), strict=True)
-            told = begin.points, begin.contexts[i], self._made_by
-            ends.append(Snapshot.of(frame, tuple(last), list(pairs), places, *told))
-        return ends
+    @property
+    def _follow(self) -> Callable[..., Followed]:
+        """`followed` with what does not change."""
+        return partial(followed, self._members, self._band, self._pace)
 
     def _require_finite(self, step: Step) -> None:
         """Refuses a step that says nothing; the simulator stays where it was."""
-        # A sum is quicker than a look at every value; it may also overflow.
-        if math.isfinite(sum(float(part.cpu().numpy().sum()) for part in step)):
+        # A sum in plain numbers is quickest; it may also overflow.
+        if math.isfinite(sum(sum(part.flatten().tolist()) for part in step)):
             return
         names = "the soil's state", "the force", "the torque", "the tool's motion"
         bad = [name for name, part in zip(names, step, strict=True) if not bool(part.isfinite().all())]
@@ -651,11 +588,6 @@ class Simulator:
         numbers = context_of(self.card["scene"] if values is None else values, self.context_keys)
         return dict(zip(self.context_keys, numbers.tolist(), strict=True))
 
-    def _told(self, contexts: Sequence[Mapping[str, float]]) -> Tensor:
-        """The numbers as the dynamics take them, shape (B, K)."""
-        rows = [list(context.values()) for context in contexts]
-        return torch.tensor(rows, dtype=torch.float64, device=self.device)
-
     def _slow_after(self, poses: Sequence[np.ndarray] | np.ndarray, points: np.ndarray) -> int | None:
         """Frames since the tool was last not slow after some poses, if that is looked at and it is somewhere."""
         if self._pace is None or not len(poses):
@@ -691,31 +623,6 @@ class Simulator:
                 "that do not"
             )
         return found
-
-
-def mean_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
-    """Of the poses (..., 7) that members predict, or that all were given."""
-    if all(np.array_equal(pose, poses[0]) for pose in poses[1:]):
-        return poses[0]
-    mean = np.mean(poses, axis=0)
-    mean[..., 3:] /= np.linalg.norm(mean[..., 3:], axis=-1, keepdims=True)
-    return mean
-
-
-def same_pose(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two poses (7,) are the same within a micrometre and 0.1 mrad."""
-    return bool(np.abs(one[:3] - other[:3]).max() < 1e-6 and 1.0 - abs(one[3:] @ other[3:]) < 1e-9)
-
-
-def one_each(value: Any, kind: type, name: str, count: int) -> list[Any]:
-    """What is given for all paths, or a list of one for each, as such a list."""
-    if value is None or isinstance(value, kind):
-        return [value] * count
-    if not isinstance(value, (list, tuple)) or len(value) != count:
-        raise UserError(
-            f"{name} is {short(value)}; it must be one for all paths, or a list of {count}, one for each"
-        )
-    return list(value)
 
 
 def _excess_of(

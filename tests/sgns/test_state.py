@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -159,6 +160,20 @@ def test_rollouts_of_one_simulator_in_several_threads(simulator, path) -> None:
                 assert_same(found, known)
     finally:
         sys.setswitchinterval(interval)
+
+
+@pytest.mark.long  # times say little while other tests run
+def test_a_step_takes_about_the_time_of_a_frame_of_a_rollout(simulator, path) -> None:
+    ratios = []
+    for _ in range(15):
+        simulator.reset(path)
+        begin = time.process_time()
+        for pose in path[1:]:
+            simulator.step(pose)
+        middle = time.process_time()
+        simulator.rollout(path)
+        ratios.append((middle - begin) / (time.process_time() - middle))
+    assert np.median(ratios) < 2.0  # it was 3.0
 
 
 # --- Surfaces and named dimensions ----------------------------------------------------------------------

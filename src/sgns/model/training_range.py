@@ -121,19 +121,23 @@ class TrainingRange:
 
     @cached_property
     def _box(self) -> tuple[list[float], list[float]]:
-        """Smallest and largest values of the tool that are not far outside, in the order of `pose_step`."""
-        low, high = np.full(15, -np.inf), np.full(15, np.inf)
-        for first, name in ((0, POSITION), (3, ORIENTATION), (9, DISPLACEMENT), (12, ROTATION)):
+        """Smallest and largest values of the tool that are not far outside, in the order of `pose_step`, then of its
+        lowest point."""
+        low, high = np.full(16, -np.inf), np.full(16, np.inf)
+        for first, name in ((0, POSITION), (3, ORIENTATION), (9, DISPLACEMENT), (12, ROTATION), (15, LOWEST)):
             if name in self.low:
                 margin = FAR * widths(self.low[name], self.high[name])
                 part = slice(first, first + len(margin))
                 low[part], high[part] = self.low[name] - margin, self.high[name] + margin
         return low.tolist(), high.tolist()
 
-    def far(self, before: np.ndarray, pose: np.ndarray) -> bool:
-        """Whether a tool's position, orientation, or their change from one pose (7,) to the next is far outside: what
-        of `excess` takes microseconds."""
-        values = pose_step(before.tolist(), pose.tolist())
+    def far(self, before: np.ndarray, pose: np.ndarray, points: np.ndarray) -> bool:
+        """Whether a tool's position, orientation, lowest point, or their change from one pose (7,) to the next is far
+        outside: what of `excess` takes microseconds. Body points in the body frame (M, 3) [m]."""
+        _, _, z, i, j, k, w = there = pose.tolist()
+        if len(points):
+            z += float((points @ (2 * (i * k - j * w), 2 * (j * k + i * w), 1 - 2 * (i * i + j * j))).min())
+        values = (*pose_step(before.tolist(), there), z)
         return any(v < low or v > high for v, low, high in zip(values, *self._box, strict=True))
 
     def in_millimetres(self, poses: np.ndarray) -> bool:

@@ -50,6 +50,25 @@ def test_rollout_is_stepping_and_needs_no_height(trained, kind) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_wheel_goes_on_from_where_it_is(trained, kind) -> None:
+    """Whatever height is put in then, too."""
+    path, simulator = trained.run.pose.copy(), trained.simulator(kind)
+    simulator.reset(path)
+    for pose in path[1:6]:
+        simulator.step(pose)
+    here = simulator.save()
+    path[5:, 2] += 0.1
+    rollout, many = simulator.rollout(path[5:], start=here), simulator.rollouts(path[None, 5:], start=here)
+    states = [simulator.restore(here), *map(simulator.step, path[6:])]
+    for frame, state in enumerate(states):
+        for found in (rollout.latent, many.latent[0]):
+            np.testing.assert_allclose(found[frame], state.latent, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(rollout.poses[frame], state.pose, rtol=0, atol=1e-5)
+    simulator.restore(rollout.end)
+    np.testing.assert_allclose(rollout.end.pose, states[-1].pose, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_copies_go_on_to_the_bit(trained, kind) -> None:
     path, simulator = trained.run.pose, trained.simulator(kind)
     simulator.reset(path)
