@@ -19,7 +19,7 @@ here = simulator.save()
 # 200 ways through the next second: forward speed [m/s] and how much deeper the blade goes [m].
 rng = np.random.default_rng(0)
 time = np.arange(61) / simulator.frame_rate
-speed, deeper = rng.uniform(0.06, 0.14, 200), rng.uniform(-0.02, 0.03, 200)
+speed, deeper = rng.uniform(0.04, 0.18, 200), rng.uniform(0.0, 0.05, 200)
 paths = np.tile(here.pose, (200, 61, 1))  # frame 0 is the tool's place now
 paths[:, :, 0] += speed[:, None] * time
 paths[:, :, 2] -= deeper[:, None] * np.sin(0.5 * np.pi * time) ** 2
