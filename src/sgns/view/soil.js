@@ -344,7 +344,7 @@ export class View {
   // dug, and not at a side of the bin, nobody can see.
   order() {
     const { x, y, z } = this.camera.position, [X, Y, Z] = this.about.bed, few = 1.5 * this.about.spacing;
-    const low = -this.dug - 6 * this.about.spacing;
+    const low = -this.dug - 4 * this.about.spacing;
     for (const panel of this.panels) {
       const p = panel.places, away = new Float32Array(p.length / 3);
       for (let i = 0; i < away.length; i++) away[i] = Math.hypot(p[3 * i] - x, p[3 * i + 1] - y, p[3 * i + 2] - z);
