@@ -2,6 +2,10 @@
 //
 // Soil of a network is decoded by the graphics card: position = mean + sum of mode * coordinate. Soil of a run comes as
 // numbers of 16 bits between the corners of a box.
+//
+// three.js is three 0.187.0 from npm, with what is imported here: a file that exports these names from "three", and
+// OrbitControls from "three/addons/controls/OrbitControls.js", made one by
+// npx esbuild names.js --bundle --minify --format=esm --legal-comments=eof --outfile=three.js
 
 import {
   AmbientLight, BoxGeometry, BufferAttribute, BufferGeometry, Color, ConeGeometry, CylinderGeometry, DataTexture,
