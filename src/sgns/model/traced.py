@@ -163,7 +163,9 @@ class Step(nn.Module):
         rotation = (_products(q, q) @ self.turning + torch.eye(3, dtype=q.dtype).flatten()).unflatten(
             -1, (3, 3)
         )
-        return rotation, self.points @ rotation.transpose(-1, -2) + poses[..., None, :3]
+        # No product with a transposed matrix: onnxruntime 1.21 and older refuse those of doubles.
+        turned = (rotation.unsqueeze(-3) * self.points.unsqueeze(-2)).sum(-1)
+        return rotation, turned + poses[..., None, :3]
 
     def track(self, poses: Tensor) -> BodyTrack:
         """What the dynamics see of poses (B, d + 1, 7), without the first; as `sgns.model.features.body_track`."""
@@ -198,7 +200,7 @@ class Step(nn.Module):
         629, 1987), which squaring the matrix leaves over.
         """
         here, there = self.points - self.points.mean(0), world.mean(1)
-        product = (world - there[:, None]).transpose(1, 2) @ here
+        product = ((world - there[:, None])[..., None] * here[:, None]).sum(1)
         matrix = (product.flatten(1) @ self.turning.T).unflatten(1, (4, 4))
         matrix = matrix / matrix.square().sum((1, 2), keepdim=True).sqrt()
         matrix = matrix + torch.eye(4, dtype=world.dtype)  # no eigenvalue is negative
@@ -220,4 +222,6 @@ class Decode(nn.Module):
         self.basis = basis
 
     def forward(self, latent: Tensor) -> Tensor:
-        return self.basis.inverse(latent).float()
+        soil = self.basis.modes @ latent + self.basis.mean
+        closure = self.basis.closure
+        return (soil if closure is None else soil + closure.displacement(latent)).float()
