@@ -67,6 +67,12 @@ async def fits(tab: Tab) -> bool:
     return await tab.eval("document.documentElement.scrollWidth <= window.innerWidth")
 
 
+async def drawn(tab: Tab) -> None:
+    """Wait until what came last is on the screen."""
+    await tab.eval("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))")
+    await tab.eval("new Promise((done) => setTimeout(() => requestAnimationFrame(() => done(1)), 100))")
+
+
 @pytest.mark.long
 def test_a_tool_is_driven_and_its_force_is_read(tmp_path: Path) -> None:
     async def look(tab: Tab, address: str) -> None:
@@ -80,7 +86,7 @@ def test_a_tool_is_driven_and_its_force_is_read(tmp_path: Path) -> None:
         await tab.key("Space", " ", True)
         await tab.key("Space", " ", False)
         await tab.until("document.querySelector('#pace').textContent === 'paused'")
-        await tab.eval("new Promise((done) => setTimeout(done, 300))")  # the last frames are drawn
+        await drawn(tab)
         draft, vertical = float(await text(tab, "force0")), float(await text(tab, "force2"))
         await tab.key("KeyV", "v", True)
         await tab.key("KeyV", "v", False)
