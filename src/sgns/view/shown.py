@@ -342,7 +342,9 @@ class Replay:
             "rate": first.frame_rate,
             "frames": self.frame_count,
             "particles": first.particle_count,
-            "bed": [float(high[0]), float(high[1]), -float(low[2])],
+            "bed": [
+                float(size) for size in (first.scene.get("bed") or {}).get("size") or [*high[:2], -low[2]]
+            ],
             "spacing": particle_spacing(start),
             "bodies": [len(bodies(run)) for run in self.runs],
             "arrow": 0.2 * float(high[0] - low[0]) / max(float(np.max(forces)), 1e-9),

@@ -201,7 +201,8 @@ def test_runs_are_sent_frame_by_frame(tmp_path: Path) -> None:
             client.ws_connect(f"{address}/socket") as page,
         ):
             about = await told(page, "mode")
-            assert about["frames"] == 8 and about["who"] == ["simulated (MPM)", "network"]
+            assert about["bed"] == [0.8, 0.6, 0.15] and about["frames"] == 8
+            assert about["who"] == ["simulated (MPM)", "network"]
             for _ in range(2 * 3):
                 assert (await page.receive(20)).type == aiohttp.WSMsgType.BINARY
             await page.send_json({"frame": 5})
