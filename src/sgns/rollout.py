@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from sgns.config import UserError, differences
+from sgns.data.dataset import IMPORTED
 from sgns.data.files import only_here
 from sgns.data.run import frame_chunks
 from sgns.data.writer import RunWriter, require_new_run
@@ -204,6 +205,11 @@ def scene_groups(checkpoint: str | Path) -> dict[str, dict[str, Any]]:
         UserError: The checkpoint cannot be read.
     """
     scene = read_checkpoint(checkpoint)["hyper_parameters"].get("scene")
+    if isinstance(scene, dict) and scene.get("kind") == IMPORTED:
+        raise UserError(
+            f"{checkpoint} was trained on imported runs, which no scene describes; give their poses in Python: "
+            "Simulator.load(...).rollout(poses)"
+        )
     if not isinstance(scene, dict) or not isinstance(scene.get("material"), dict):
         raise UserError(f"{checkpoint} does not say what its scene is; train again")
     if "${" in json.dumps(scene):

@@ -81,6 +81,7 @@ class FakeSimulator:
             poses,
             in_world_frame(poses, body_points),
             0.01,
+            None,  # nothing is to go on from its end
             self.basis,
             self.scene,
             lambda: None,

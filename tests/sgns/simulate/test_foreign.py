@@ -218,6 +218,8 @@ def test_a_dataset_of_imported_runs_is_trained_on(tmp_path: Path, judged: bool) 
     done = sgns(tmp_path, "train", *where, *TRAIN, "output=out")
     assert done.returncode == 0, done.stderr
     assert "sgns rollout" not in done.stdout  # whose scenes have beds of ours
+    rollout = ("rollout", "checkpoint=out/best.ckpt", "output=new.h5")
+    assert "trained on imported runs, which no scene describes" in refusal(tmp_path, *rollout)
     simulator = Simulator.load(tmp_path / "out" / "best.ckpt")
     assert simulator.context_keys == ("load",)
     with Run(next((tmp_path / "data" / "runs").glob("*.h5"))) as run:
