@@ -383,7 +383,7 @@ class Simulator:
         """What tells a place of this simulator from one of others."""
         digest = hashlib.sha256()
         for value in self._surrogate.dynamics.state_dict().values():
-            digest.update(value.cpu().numpy().tobytes())
+            digest.update(value.cpu().reshape(-1).view(torch.uint8).numpy().tobytes())
         kind, many = self.dynamics.settings.kind, counted(len(self._members), "member")
         pace = "own pace" if self._pace is None else "tool's pace"
         return f"{kind} {digest.hexdigest()[:8]}, {self.num_modes} modes, {many}, {pace}"

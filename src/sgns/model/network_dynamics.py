@@ -375,7 +375,8 @@ class PathStepper(Stepper):
         self.load_mean = torch.cat([load.mean for load in loads])
         self.change_mean, self.change_scale = dynamics.change.mean, dynamics.change.scale
         self.row_units = None
-        if dynamics.settings.next_motion and not dynamics.predicts_body and self.nodes.device.type == "cpu":
+        by_numpy = self.nodes.device.type == "cpu" and self.nodes.dtype != torch.bfloat16
+        if dynamics.settings.next_motion and not dynamics.predicts_body and by_numpy:
             row = Standardiser.cat([dynamics.body_position, dynamics.body_orientation, dynamics.body_motion])
             self.row_units = row.mean.numpy(), row.scale.numpy()
         self.accelerates = dynamics.settings.predicts == "acceleration"

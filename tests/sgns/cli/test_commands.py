@@ -92,7 +92,7 @@ def test_help_of_a_command(command: str, empty_folder: Path) -> None:
     assert "Examples:" in result.stdout and "$" not in result.stdout
     if command != "check":  # takes paths
         own = typed.COMMANDS[command]
-        keys = [name for name, *_ in described(own) if name not in ("error", "limits")]
+        keys = [name for name, *_ in described(own) if name not in ("error", "limits", "names")]
         assert all(re.search(rf"^  {name} +\S", result.stdout, re.M) for name in keys)
     for group, default in groups_of(command).items():
         if options_of(group):
