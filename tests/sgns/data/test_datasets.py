@@ -34,7 +34,11 @@ def cuts(name):
 
 @pytest.mark.parametrize(
     "name",
-    [name for name in options_of("dataset") if name not in ("published", "own", "imported") and "reduced" not in name],
+    [
+        name
+        for name in options_of("dataset")
+        if name not in ("published", "own", "imported") and "reduced" not in name
+    ],
 )
 def test_every_dataset_has_valid_scenes_that_share_a_bed(name):
     campaign = planned(name)
