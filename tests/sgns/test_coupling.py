@@ -184,12 +184,15 @@ def test_ros_messages_become_poses_and_wrenches(simulator: Simulator, cut: np.nd
     assert reply.header.stamp.sec == 5 and reply.header.frame_id == "bed"
 
 
+@pytest.mark.parametrize(("file", "exporter"), [("fmi2.py", "pythonfmu"), ("fmi3.py", "pythonfmu3")])
 def test_an_fmu_gives_the_forces_of_the_simulator(
-    tmp_path: Path, simulator: Simulator, cut: np.ndarray
+    tmp_path: Path, simulator: Simulator, cut: np.ndarray, file: str, exporter: str
 ) -> None:
-    builder = pytest.importorskip("pythonfmu").FmuBuilder
+    builder = pytest.importorskip(exporter).FmuBuilder
     fmpy = pytest.importorskip("fmpy")
-    fmu = builder.build_FMU(EXAMPLES / "fmu" / "soil_tool.py", dest=tmp_path)
+    folder = EXAMPLES / "fmu"
+    fmu = builder.build_FMU(folder / file, dest=tmp_path, project_files=[folder / "soil.py"])
+    assert fmpy.read_model_description(str(fmu)).fmiVersion[0] == file[3]
     names = ["x", "y", "z", "qx", "qy", "qz", "qw"]
     times = np.arange(41) / 60
     table: Any = np.array(
