@@ -1,12 +1,12 @@
 """How good do surrogates become with more runs and more training?
 
     python experiments/paper_scale/run.py paper_excavation --runs 25 50 100 200 --seeds 0 1 2
-    python experiments/paper_scale/run.py paper_excavation --steps 30000 --seeds 0 1 2 model.hidden_width=192
+    python experiments/paper_scale/run.py paper_excavation model.hidden_width=192 --steps 30000 --seeds 0 1 2
 
 Trains on so many runs of a packed dataset (`reduced/<name>`), the first ones of one order drawn at random, and predicts
-all of its test runs from rest. The basis is always that of all training runs. Positions count all particles, the
-surface that of the soil decoded from all modes that are packed. A training that is complete in `--output` is not
-repeated. Puts a row for each training into table.csv, in place of an equal one.
+all of its test runs from rest. The basis is always that of all training runs. Positions count all particles; the
+surface, in two measures, is compared with that of the soil decoded from all modes that are packed. A training that is
+complete in `--output` is not repeated. Puts a row for each training into table.csv, in place of an equal one.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ import torch
 from common import read_rows, training_settings, write_rows
 
 from mpm_warp.poses import in_body_frame
-from sgns.data.surface import height_map, surface_grid
+from sgns.data.surface import SurfaceGrid, height_map, particle_spacing, surface_grid
+from sgns.evaluate.command import scored
 from sgns.evaluate.metrics import height_error
-from sgns.evaluate.modes import scored
 from sgns.evaluate.results import Scores, aggregate
 from sgns.reduction.packed import packed_dataset
 from sgns.reduction.reduce import ReducedDataset, ReducedRun, fitted_closure
@@ -56,15 +56,44 @@ def of_runs(data: ReducedDataset, count: int, settings: dict[str, Any]) -> Reduc
     return replace(data, _runs=runs, closure=closure)
 
 
+def filled(positions: np.ndarray, grid: SurfaceGrid, volume: float) -> np.ndarray:
+    """How high the soil of a column would fill it [m], shape (nx, ny).
+
+    Every particle (n, 3) [m] stands for so much volume [m^3], shared among the four nearest columns. The highest
+    particle of a column (`height_map`) is another measure: it jumps when one particle changes columns.
+    """
+    shape = np.array(grid.shape)
+    low = np.array([grid.x_edges[0], grid.y_edges[0]])
+    edge = np.array([np.ptp(grid.x_edges), np.ptp(grid.y_edges)]) / shape
+    place = np.clip((positions[:, :2] - low) / edge, 0.0, shape) - 0.5
+    first = np.floor(place)
+    share = place - first
+    heights = np.zeros(grid.shape)
+    for corner in np.ndindex(2, 2):
+        column, row = np.clip(first + np.array(corner), 0, shape - 1).astype(int).T
+        np.add.at(heights, (column, row), np.where(corner, share, 1.0 - share).prod(axis=1))
+    return heights * volume / edge.prod()
+
+
 def surfaces(simulator: Simulator, data: ReducedDataset, run: ReducedRun, latent: np.ndarray) -> np.ndarray:
-    """Mean squares of the surface [m^2] of a prediction and of soil that stays, (t, 2)."""
+    """Mean squares [m^2], (t, 4): of the surface by the highest particles, of a prediction and of soil that stays; then
+    of both by how high columns are filled."""
     grid = surface_grid(data.start_positions)
-    still = height_map(data.start_positions, grid)
+    volume = particle_spacing(data.start_positions) ** 3
+    measures = (lambda soil: height_map(soil, grid), lambda soil: filled(soil, grid, volume))
     found = []
     for frame in range(EVERY, len(latent), EVERY):
-        true = height_map(data.basis.inverse(torch.from_numpy(run.latent[frame])).numpy(), grid)
-        guess = height_map(simulator.basis.inverse(torch.from_numpy(latent[frame])).numpy(), grid)
-        found.append([height_error(guess, true), height_error(still, true)])
+        true, guess = (
+            basis.inverse(torch.from_numpy(modes[frame])).numpy()
+            for basis, modes in ((data.basis, run.latent), (simulator.basis, latent))
+        )
+        found.append(
+            [
+                height_error(measure(soil), measure(true))
+                for measure in measures
+                for soil in (guess, data.start_positions)
+            ]
+        )
     return np.array(found)
 
 
@@ -83,7 +112,7 @@ def judged(simulator: Simulator, data: ReducedDataset) -> dict[str, Any]:
         rollout.soil(-1)
         decode.append(time.perf_counter() - began)
     total = aggregate(scores)
-    surface, still = (1e3 * math.sqrt(value) for value in np.concatenate(squares).mean(axis=0))
+    surface, still, fill, still_fill = (1e3 * np.sqrt(np.concatenate(squares).mean(axis=0))).tolist()
     force, absolute = total.force, total.force.absolute_mpe
     body = {} if math.isnan(total.sinkage_mae) else {"sinkage_mae_mm": 1e3 * total.sinkage_mae}
     return {
@@ -95,6 +124,8 @@ def judged(simulator: Simulator, data: ReducedDataset) -> dict[str, Any]:
         "skill_constant_velocity": total.skill("constant_velocity"),
         "surface_rmse_mm": surface,
         "still_surface_rmse_mm": still,
+        "filled_rmse_mm": fill,
+        "still_filled_rmse_mm": still_fill,
         **body,
         "force_nrmse": force.overall_nrmse,
         "mean_force_nrmse": total.mean_force.overall_nrmse,
