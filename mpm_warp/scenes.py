@@ -553,5 +553,5 @@ class Incline(Scene):
     def initial_velocities(self) -> np.ndarray:
         velocities = super().initial_velocities()
         if self.flowing:
-            velocities[:, 0] = self.steady_velocity(self.filled[0][:, 2] + self.bed.size[2])
+            velocities[:, 0] = self.steady_velocity(self.initial_positions()[:, 2] + self.bed.size[2])
         return velocities

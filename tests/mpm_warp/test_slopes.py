@@ -8,7 +8,7 @@ import bagnold
 import numpy as np
 import pytest
 
-from mpm_warp import Bed, Column, Solver
+from mpm_warp import Bed, Column, Incline, Other, Solver, Sphere
 
 LAYER = bagnold.layer(0.003, 1, material=replace(bagnold.BEADS, youngs_modulus=1.0e5), duration=0.5)
 """Glass beads, 3 cm thick, on a slope of 26 degrees: ten cells high, one particle per cell."""
@@ -39,6 +39,14 @@ def test_the_steady_flow_stays():
     assert np.abs(frame.velocity[:, 1:]).max() < 0.01 * exact.max()
     travelled = frame.position[:, 0] - LAYER.initial_positions()[:, 0]
     np.testing.assert_allclose(travelled, 0.5 * exact, atol=0.02 * 0.5 * exact.max())
+
+
+def test_a_stone_in_the_steady_flow_takes_the_place_of_soil():
+    stone = Other(tool=Sphere(diameter=0.004), position=(0.003, 0.003, -0.01))
+    scene = Incline(others=(stone,))
+    assert len(scene.displaced) > 0
+    steady = scene.steady_velocity(scene.initial_positions()[:, 2] + 0.03)
+    np.testing.assert_array_equal(scene.initial_velocities()[:, 0], steady)
 
 
 def test_a_column_spreads_and_stops_below_the_angle_of_repose():
