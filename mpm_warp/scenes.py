@@ -474,7 +474,8 @@ class Column(Scene):
 
     @property
     def arrangement_hash(self) -> str:
-        return digest([self.bed.arrangement_hash, self.shape, self.radius])
+        found = digest([self.bed.arrangement_hash, self.shape, self.radius])
+        return digest([found, "without", self.displaced.tolist()]) if len(self.displaced) else found
 
 
 def bagnold_speed(scene: Scene, inertial_number: float, height: np.ndarray) -> np.ndarray:

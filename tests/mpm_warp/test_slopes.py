@@ -73,7 +73,9 @@ def test_a_column_is_round_and_as_heavy_as_it_should_be():
     slab = column(shape="slab")
     assert np.ptp(slab.filled[0][:, 1]) > 0.38
     assert len(slab.filled[0]) * slab.filled[1] == pytest.approx(slab.soil_volume)
-    assert len({scene.arrangement_hash, slab.arrangement_hash, column().arrangement_hash}) == 3
+    inside = column(others=(Other(tool=Sphere(diameter=0.04), position=(0.2, 0.2, -0.03)),))
+    assert len(inside.displaced) > 0
+    assert len({one.arrangement_hash for one in (scene, slab, column(), inside)}) == 4
 
 
 def test_the_flow_finds_its_speed():
