@@ -371,8 +371,9 @@ class Wheel(Scene):
         return sinkage(vars(self), poses)
 
     def mean_sinkage(self, poses: np.ndarray) -> float:
-        """While driving [m], of poses (T, 7)."""
-        return float(self.sinkage(poses)[self._driving(len(poses))].mean())
+        """While driving [m], of poses (T, 7); of a wheel that never does, at the end."""
+        driving = self._driving(len(poses))
+        return float(self.sinkage(poses)[driving if driving.any() else -1].mean())
 
     def _driving(self, count: int) -> np.ndarray:
         return self.times()[:count] > self.settle + 0.5 / self.frame_rate
@@ -393,6 +394,8 @@ class Wheel(Scene):
 
     def results(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> dict[str, float]:
         driving = self._driving(len(force))
+        if not driving.any():  # it was only to settle
+            return {}
         pull, lateral, vertical = along_and_across(vars(self), force[driving].mean(axis=0))
         return {
             "mean_pull_N": float(pull),
@@ -403,7 +406,10 @@ class Wheel(Scene):
         }
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
-        pull, lateral, vertical, sinkage, axle_torque = self.results(force, torque, poses).values()
+        found = self.results(force, torque, poses)
+        if not found:
+            return ""
+        pull, lateral, vertical, sinkage, axle_torque = found.values()
         sideways = f"lateral force {lateral:.2f} N, " if self.slip_angle else ""
         return (
             f"while driving: mean drawbar pull {pull:.2f} N, {sideways}vertical force {vertical:.2f} N, "
