@@ -107,7 +107,7 @@ class Excavation(Scene):
         return self.body.points(*self.body_grid)
 
     def warnings(self) -> list[str]:
-        found = super().warnings()
+        found = super().warnings() + _unused_passes(self)
         if self.blade.thickness < _COARSE * self.bed.spacing:
             found.append(self._thickness())
         return found
@@ -131,6 +131,14 @@ class Excavation(Scene):
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         draft, vertical = self.results(force, torque, poses).values()
         return f"mean draft {draft:.1f} N, vertical force {vertical:.1f} N" + _each_pass(self, force)
+
+
+def _unused_passes(scene: Excavation | Body) -> list[str]:
+    if scene.motion == "passes" or scene.passes == Passes():
+        return []
+    return [
+        f"scene.passes is not used: scene.motion is {scene.motion!r}; scene.motion=passes makes several cuts"
+    ]
 
 
 def _each_pass(scene: Excavation | Body, force: np.ndarray) -> str:
@@ -197,9 +205,10 @@ class Body(Scene):
         return self.passes.turns(self.depth, self.speed) if self.motion == "passes" else super().path_times()
 
     def warnings(self) -> list[str]:
+        found = super().warnings() + _unused_passes(self)
         if odd_size(self.tool, self.bed.size, self.open_sides):
-            return super().warnings()  # which is another matter
-        return super().warnings() + thin_walls(self.tool, self.contact_distance, self.bed.spacing)
+            return found  # which is another matter
+        return found + thin_walls(self.tool, self.contact_distance, self.bed.spacing)
 
     def results(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> dict[str, float]:
         names = (f"mean_force_{axis}_N" for axis in "xyz")
