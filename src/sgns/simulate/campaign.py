@@ -82,7 +82,7 @@ def run_cost(scene: Scene, effects: Effects | None = None) -> RunCost:
     frames = scene.frame_count
     computed = particles // 2 if effects is not None and effects.symmetry else particles
     size = frames * per_frame + computed * _BYTES_OF_STATE + _BYTES_PER_FILE
-    return RunCost(particles, substeps, frames, size)
+    return RunCost(computed, substeps, frames, size)
 
 
 def cost_line(costs: Sequence[RunCost]) -> str:
