@@ -396,6 +396,9 @@ def split_runs(grids: list[list[str]], shares: tuple[float, ...], rng: np.random
     part = {}
     for names in grids:
         validation, test = (max(round(s * len(names)), 1 if s > 0 else 0) for s in shares[1:])
+        if len(grids) == 1 and shares[0] > 0:  # of few runs one is trained on
+            validation = min(validation, len(names) - 1)
+            test = min(test, len(names) - 1 - validation)
         for rank, index in enumerate(rng.permutation(len(names))):
             part[names[index]] = (
                 "validation" if rank < validation else "test" if rank < validation + test else "train"
