@@ -77,7 +77,7 @@ def scene_from_data(data: dict[str, Any]) -> Scene:
     except SceneError as error:  # its rows are lines of the file
         further = re.search(r"scene\.others\[\d+\]", words := str(error))
         file, lines = read.get(further[0] if further else "scene", (None, []))
-        if file is None:
+        if file is None or "bed.surface" in words:  # whose rows are others
             raise
         words = re.sub(r"\brow (\d+)", lambda row: f"line {lines[int(row[1]) - 1]} of {file}", words)
         raise SceneError(words) from None

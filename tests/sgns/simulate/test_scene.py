@@ -278,6 +278,14 @@ def test_what_is_wrong_with_poses_is_told_by_the_line_of_the_file(tmp_path, rows
         scene_from_data({"kind": "body", "path": str(tmp_path / "path.csv")})
 
 
+def test_the_rows_of_a_map_are_no_lines_of_the_path(tmp_path):
+    (tmp_path / "path.csv").write_text("0,0.2,0.3,0.2,0,0,0,1")
+    (tmp_path / "map.csv").write_text("0,0\n0,0\n0,nan")
+    data = {"kind": "body", "path": str(tmp_path / "path.csv"), "bed": {"surface": str(tmp_path / "map.csv")}}
+    with pytest.raises(SceneError, match=r"^bed.surface .* in row 3, number 2$"):
+        scene_from_data(data)
+
+
 def test_a_further_body_has_its_path_from_a_file(tmp_path):
     file = tmp_path / "path.csv"
     data = {"others": [{"position": [0.2, 0.2, 0.2]}, {"motion": "path", "path": str(file)}]}
