@@ -367,13 +367,19 @@ def test_a_map_that_cannot_be_read(name, content, words, tmp_path):
     assert str(caught.value).startswith("scene.bed.surface: cannot read") and "\n" not in str(caught.value)
 
 
-def test_maps_of_whole_numbers_or_objects_are_refused(tmp_path):
+def test_maps_of_whole_numbers_or_objects_are_refused(tmp_path, monkeypatch):
     Image.fromarray(np.zeros((3, 3), np.uint8)).save(tmp_path / "map.tif")
     with pytest.raises(UserError, match="its heights are whole numbers, of no unit"):
         read_heights(tmp_path / "map.tif")
     Image.fromarray(np.zeros((400, 300), np.float32)).save(tmp_path / "map.tif")
     with pytest.raises(UserError, match="it holds 300 x 400 heights, at most 100000"):
         read_heights(tmp_path / "map.tif")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    with pytest.raises(UserError, match="at most 100000 heights are allowed; coarsen it"):
+        read_heights(tmp_path / "map.tif")
+    np.savez(tmp_path / "map.npz", np.zeros((3, 3)))
+    with pytest.raises(UserError, match="it is an archive of arrays"):
+        read_heights((tmp_path / "map.npz").rename(tmp_path / "map.npy"))
     np.save(tmp_path / "map.npy", np.array([[{}]], dtype=object), allow_pickle=True)
     with pytest.raises(UserError, match="allow_pickle=False"):
         read_heights(tmp_path / "map.npy")
