@@ -66,8 +66,9 @@ def read_mesh(file: Path) -> tuple[np.ndarray, np.ndarray, float | None]:
         ) from None
     except OSError as error:
         raise SceneError(f"tool.file: cannot read {file}: {error.strerror}") from None
-    except (ValueError, IndexError, OverflowError, struct.error) as error:
-        raise SceneError(f"tool.file: {file} is not a good {suffix[1:].upper()} file: {error}") from None
+    except Exception as error:  # a damaged file leads anywhere
+        words = error if isinstance(error, ValueError) else f"{type(error).__name__} {error}"
+        raise SceneError(f"tool.file: {file} is not a good {suffix[1:].upper()} file: {words}") from None
     if len(triangles) == 0:
         raise SceneError(f"tool.file: {file} holds no triangles")
     vertices = found.points
@@ -263,22 +264,32 @@ def _ply(data: bytes) -> Polygons:
         elif words[0] == "element":
             elements.append((words[1], int(words[2]), []))
         elif words[0] == "property":
-            kinds = [word if form == "ascii" else _PLY_TYPES[word] for word in words[1:-1] if word != "list"]
+            kinds = [word for word in words[1:-1] if word != "list"]
+            if odd := [word for word in kinds if word not in _PLY_TYPES]:
+                raise ValueError(f"it has a property of the type {odd[0][:40]!r}, which PLY does not know")
+            kinds = kinds if form == "ascii" else [_PLY_TYPES[word] for word in kinds]
             elements[-1][2].append((words[-1], kinds))
     if form == "ascii":
         source: Any = iter([line.split() for line in _lines(body) if line])
         read: Callable[..., Any] = _ply_text
     else:
-        order = {"binary_little_endian": "<", "binary_big_endian": ">"}[form]
+        orders = {"binary_little_endian": "<", "binary_big_endian": ">"}
+        if form not in orders:
+            raise ValueError(f"its format is {form[:40]!r}; allowed: ascii, {', '.join(orders)}")
+        order = orders[form]
         source, read = (io.BytesIO(body), order), _ply_binary
     found = {}
     for name, count, properties in elements:
         if not 0 <= count <= 4 * MOST_TRIANGLES:
             raise ValueError(f"it says that it has {count} times {name}; {_FEWER}")
         found[name] = read(source, count, properties)
+    if not set("xyz") <= set(found.get("vertex", {})):
+        raise ValueError("it has no element vertex with x, y and z")
     points = np.stack([np.asarray(found["vertex"][axis], dtype=float) for axis in "xyz"], axis=-1)
     faces = found.get("face", {})
     named = [faces[key] for key in ("vertex_indices", "vertex_index") if key in faces]
+    if named and not all(np.ndim(face) == 1 for face in named[0]):
+        raise ValueError("its faces are no lists of vertices")
     return _polygons(points, named[0] if named else [])
 
 

@@ -107,7 +107,7 @@ class Excavation(Scene):
         return self.body.points(*self.body_grid)
 
     def warnings(self) -> list[str]:
-        found = super().warnings()
+        found = super().warnings() + _unused_passes(self)
         if self.blade.thickness < _COARSE * self.bed.spacing:
             found.append(self._thickness())
         return found
@@ -131,6 +131,14 @@ class Excavation(Scene):
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
         draft, vertical = self.results(force, torque, poses).values()
         return f"mean draft {draft:.1f} N, vertical force {vertical:.1f} N" + _each_pass(self, force)
+
+
+def _unused_passes(scene: Excavation | Body) -> list[str]:
+    if scene.motion == "passes" or scene.passes == Passes():
+        return []
+    return [
+        f"scene.passes is not used: scene.motion is {scene.motion!r}; scene.motion=passes makes several cuts"
+    ]
 
 
 def _each_pass(scene: Excavation | Body, force: np.ndarray) -> str:
@@ -197,9 +205,10 @@ class Body(Scene):
         return self.passes.turns(self.depth, self.speed) if self.motion == "passes" else super().path_times()
 
     def warnings(self) -> list[str]:
+        found = super().warnings() + _unused_passes(self)
         if odd_size(self.tool, self.bed.size, self.open_sides):
-            return super().warnings()  # which is another matter
-        return super().warnings() + thin_walls(self.tool, self.contact_distance, self.bed.spacing)
+            return found  # which is another matter
+        return found + thin_walls(self.tool, self.contact_distance, self.bed.spacing)
 
     def results(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> dict[str, float]:
         names = (f"mean_force_{axis}_N" for axis in "xyz")
@@ -371,8 +380,9 @@ class Wheel(Scene):
         return sinkage(vars(self), poses)
 
     def mean_sinkage(self, poses: np.ndarray) -> float:
-        """While driving [m], of poses (T, 7)."""
-        return float(self.sinkage(poses)[self._driving(len(poses))].mean())
+        """While driving [m], of poses (T, 7); of a wheel that never does, at the end."""
+        driving = self._driving(len(poses))
+        return float(self.sinkage(poses)[driving if driving.any() else -1].mean())
 
     def _driving(self, count: int) -> np.ndarray:
         return self.times()[:count] > self.settle + 0.5 / self.frame_rate
@@ -393,6 +403,8 @@ class Wheel(Scene):
 
     def results(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> dict[str, float]:
         driving = self._driving(len(force))
+        if not driving.any():  # it was only to settle
+            return {}
         pull, lateral, vertical = along_and_across(vars(self), force[driving].mean(axis=0))
         return {
             "mean_pull_N": float(pull),
@@ -403,7 +415,10 @@ class Wheel(Scene):
         }
 
     def summary(self, force: np.ndarray, torque: np.ndarray, poses: np.ndarray) -> str:
-        pull, lateral, vertical, sinkage, axle_torque = self.results(force, torque, poses).values()
+        found = self.results(force, torque, poses)
+        if not found:
+            return ""
+        pull, lateral, vertical, sinkage, axle_torque = found.values()
         sideways = f"lateral force {lateral:.2f} N, " if self.slip_angle else ""
         return (
             f"while driving: mean drawbar pull {pull:.2f} N, {sideways}vertical force {vertical:.2f} N, "
@@ -474,7 +489,8 @@ class Column(Scene):
 
     @property
     def arrangement_hash(self) -> str:
-        return digest([self.bed.arrangement_hash, self.shape, self.radius])
+        found = digest([self.bed.arrangement_hash, self.shape, self.radius])
+        return digest([found, "without", self.displaced.tolist()]) if len(self.displaced) else found
 
 
 def bagnold_speed(scene: Scene, inertial_number: float, height: np.ndarray) -> np.ndarray:
@@ -553,5 +569,5 @@ class Incline(Scene):
     def initial_velocities(self) -> np.ndarray:
         velocities = super().initial_velocities()
         if self.flowing:
-            velocities[:, 0] = self.steady_velocity(self.filled[0][:, 2] + self.bed.size[2])
+            velocities[:, 0] = self.steady_velocity(self.initial_positions()[:, 2] + self.bed.size[2])
         return velocities

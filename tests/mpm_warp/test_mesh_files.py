@@ -225,9 +225,25 @@ BAD = {
         (ply("ascii", FACES)[:-30], "fewer lines than it says|names a vertex|fewer numbers"),
         (ply("binary_little_endian", FACES)[:-3], "not a good PLY file"),
         (ply("ascii", FACES).replace(b"vertex 8", b"vertex 999999999"), "decimate"),
+        (
+            ply("ascii", FACES).replace(b"element vertex", b"element corner"),
+            "no element vertex with x, y and z",
+        ),
+        (ply("ascii", FACES).replace(b"double z", b"double w"), "no element vertex with x, y and z"),
+        (ply("middle_endian", FACES), "format is 'middle_endian'; allowed: ascii, binary_little_endian"),
+        (ply("ascii", FACES).replace(b"double x", b"half x"), "of the type 'half'"),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+            b"element face 1\nproperty int vertex_index\nend_header\n0 0 0\n0\n",
+            "no lists of vertices",
+        ),
     ],
     "a.off": [(b"8 6 0", "does not begin with OFF"), (off(FACES)[:-60], "cut short")],
-    "a.glb": [(b"glTF" + b"\0" * 30, "not a good GLB file"), (b"nothing", "does not begin with glTF")],
+    "a.glb": [
+        (b"glTF" + b"\0" * 30, "not a good GLB file"),
+        (b"nothing", "does not begin with glTF"),
+        (b"glTF" + b"\0" * 8 + b"\2\0\0\0JSON[]", "not a good GLB file: AttributeError"),
+    ],
     "a.3mf": [
         (b"nothing", "not a good 3MF file: File is not a zip file"),
         (archive(b"<model/>"), "3MF"),

@@ -76,6 +76,13 @@ def test_passes_without_length_or_lift_are_no_problem():
     assert moved[:, 1].min() == pytest.approx(-0.02 + rounding, abs=1e-6)
 
 
+def test_passes_that_the_motion_does_not_use_are_told():
+    words = "scene.passes is not used: scene.motion is 'curved'"
+    assert any(words in one for one in cut(passes=Passes(number=3)).warnings())
+    for scene in (cut(), cut(motion="passes", depth=0.03, passes=Passes(length=0.05))):
+        assert not any("scene.passes" in one for one in scene.warnings())
+
+
 def test_passes_that_do_not_fit_are_refused_or_told():
     with pytest.raises(SceneError, match=r"cut 3 would be -0.01 m deep; it must be above 0 m"):
         cut(motion="passes", depth=0.03, passes=Passes(number=3, deepening=-0.02))

@@ -459,6 +459,15 @@ def test_a_wheels_summary_leaves_the_settling_out():
     )
 
 
+def test_a_wheel_that_only_settles_has_no_means_of_driving():
+    scene = wheel(settle=0.195, duration=0.2)
+    poses = scene.body_poses()
+    poses[-1, 2] -= 0.004
+    force = np.ones((len(poses), 3))
+    assert (scene.results(force, force, poses), scene.summary(force, force, poses)) == ({}, "")
+    assert scene.mean_sinkage(poses) == pytest.approx(scene.sinkage(poses)[-1])
+
+
 def test_the_summary_of_a_turned_wheel_is_in_its_own_axes():
     scene = wheel(bed=WIDE, slip_angle=90.0, settle=0.1, duration=0.2)
     poses = scene.body_poses()

@@ -8,7 +8,7 @@ import bagnold
 import numpy as np
 import pytest
 
-from mpm_warp import Bed, Column, Solver
+from mpm_warp import Bed, Column, Incline, Other, Solver, Sphere
 
 LAYER = bagnold.layer(0.003, 1, material=replace(bagnold.BEADS, youngs_modulus=1.0e5), duration=0.5)
 """Glass beads, 3 cm thick, on a slope of 26 degrees: ten cells high, one particle per cell."""
@@ -41,6 +41,14 @@ def test_the_steady_flow_stays():
     np.testing.assert_allclose(travelled, 0.5 * exact, atol=0.02 * 0.5 * exact.max())
 
 
+def test_a_stone_in_the_steady_flow_takes_the_place_of_soil():
+    stone = Other(tool=Sphere(diameter=0.004), position=(0.003, 0.003, -0.01))
+    scene = Incline(others=(stone,))
+    assert len(scene.displaced) > 0
+    steady = scene.steady_velocity(scene.initial_positions()[:, 2] + 0.03)
+    np.testing.assert_array_equal(scene.initial_velocities()[:, 0], steady)
+
+
 def test_a_column_spreads_and_stops_below_the_angle_of_repose():
     """It ends lower and wider, no soil is lost, and no slope is steeper than friction allows."""
     scene = column()
@@ -65,7 +73,9 @@ def test_a_column_is_round_and_as_heavy_as_it_should_be():
     slab = column(shape="slab")
     assert np.ptp(slab.filled[0][:, 1]) > 0.38
     assert len(slab.filled[0]) * slab.filled[1] == pytest.approx(slab.soil_volume)
-    assert len({scene.arrangement_hash, slab.arrangement_hash, column().arrangement_hash}) == 3
+    inside = column(others=(Other(tool=Sphere(diameter=0.04), position=(0.2, 0.2, -0.03)),))
+    assert len(inside.displaced) > 0
+    assert len({one.arrangement_hash for one in (scene, slab, column(), inside)}) == 4
 
 
 def test_the_flow_finds_its_speed():

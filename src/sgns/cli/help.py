@@ -206,7 +206,7 @@ def _found(output: str | None) -> dict[str, Any]:
         soil, result = of["rmse_total_mm"], folder
     elif folder.suffix == ".h5" and folder.is_file():
         with Run(folder) as run:
-            scene = Scene.from_dict(run.scene, run.mesh)
+            scene = Scene.from_dict(run.scene, *run.meshes)
             return scene.results(run.force, run.torque, run.pose) | {"output": output}
     else:
         return {"output": output}

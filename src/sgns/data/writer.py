@@ -42,6 +42,10 @@ from sgns.data.views import VIEWS, write_views
 log = logging.getLogger(__name__)
 
 
+_MOST_IN_CHUNK = 1 << 30
+"""Of an array of a state [bytes]; HDF5 takes less than 4 GB."""
+
+
 # --- What is kept of a run that stopped, and what a run may replace -------------------------------------
 
 
@@ -370,8 +374,12 @@ def _write_state(file: h5py.File, state: State) -> None:
     arrays = state.arrays | ({} if state.whole is None else {WHOLE: state.whole})
     for name, array in arrays.items():
         # Checksummed: no content hash guards them.
+        chunk = (
+            min(len(array), max(1, _MOST_IN_CHUNK * len(array) // max(1, array.nbytes))),
+            *array.shape[1:],
+        )
         group.create_dataset(
-            name, data=array, chunks=array.shape if array.size else None, fletcher32=array.size > 0
+            name, data=array, chunks=chunk if array.size else None, fletcher32=array.size > 0
         )
 
 

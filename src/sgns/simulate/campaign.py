@@ -82,7 +82,7 @@ def run_cost(scene: Scene, effects: Effects | None = None) -> RunCost:
     frames = scene.frame_count
     computed = particles // 2 if effects is not None and effects.symmetry else particles
     size = frames * per_frame + computed * _BYTES_OF_STATE + _BYTES_PER_FILE
-    return RunCost(particles, substeps, frames, size)
+    return RunCost(computed, substeps, frames, size)
 
 
 def cost_line(costs: Sequence[RunCost]) -> str:
@@ -396,6 +396,9 @@ def split_runs(grids: list[list[str]], shares: tuple[float, ...], rng: np.random
     part = {}
     for names in grids:
         validation, test = (max(round(s * len(names)), 1 if s > 0 else 0) for s in shares[1:])
+        if len(grids) == 1 and shares[0] > 0:  # of few runs one is trained on
+            validation = min(validation, len(names) - 1)
+            test = min(test, len(names) - 1 - validation)
         for rank, index in enumerate(rng.permutation(len(names))):
             part[names[index]] = (
                 "validation" if rank < validation else "test" if rank < validation + test else "train"

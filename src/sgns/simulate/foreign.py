@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -230,6 +231,8 @@ def _rate(times: np.ndarray | None, stated: Any, settings: Import, source: Path)
     rate = (
         settings.frame_rate if settings.frame_rate is not None else None if stated is None else float(stated)
     )
+    if rate is not None and not 0.0 < rate < math.inf:
+        raise UserError(f"{source}: frame_rate is {rate:g} Hz; it must be a number above 0")
     if times is None or len(times) < 2:
         if rate is None:
             raise UserError(f"{source} has no time (T,) and no frame_rate; give frame_rate=60 [Hz]")
@@ -267,7 +270,7 @@ def _mesh(
         name = source
         vertices = _checked(arrays["vertices"], (None, 3), "vertices", source)
         triangles = np.asarray(arrays["triangles"])
-        if triangles.dtype.kind not in "iu" or triangles.ndim != 2 or triangles.shape[1] != 3:
+        if triangles.dtype.kind not in "iu" or triangles.shape != (len(triangles), 3) or not len(triangles):
             raise UserError(
                 f"{source}: triangles has shape {triangles.shape}; it needs three whole numbers in each row"
             )

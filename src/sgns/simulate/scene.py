@@ -77,7 +77,7 @@ def scene_from_data(data: dict[str, Any]) -> Scene:
     except SceneError as error:  # its rows are lines of the file
         further = re.search(r"scene\.others\[\d+\]", words := str(error))
         file, lines = read.get(further[0] if further else "scene", (None, []))
-        if file is None:
+        if file is None or "bed.surface" in words:  # whose rows are others
             raise
         words = re.sub(r"\brow (\d+)", lambda row: f"line {lines[int(row[1]) - 1]} of {file}", words)
         raise SceneError(words) from None
@@ -221,6 +221,8 @@ def read_heights(file: Path) -> list[list[float]]:
         content = read_bytes(file, _MOST_BYTES)
         if kind == ".npy":
             found = np.load(io.BytesIO(content), allow_pickle=False)
+            if not isinstance(found, np.ndarray):
+                raise ValueError("it is an archive of arrays; save one array with numpy.save")
         elif kind in (".csv", ".txt"):
             mark = "," if b"," in content else None
             found = np.loadtxt(io.StringIO(content.decode("utf-8-sig")), delimiter=mark, ndmin=2)
@@ -241,7 +243,11 @@ def read_heights(file: Path) -> list[list[float]]:
 def _read_tiff(content: bytes) -> np.ndarray:
     from PIL import Image
 
-    with Image.open(io.BytesIO(content), formats=["TIFF"]) as picture:
+    try:
+        opened = Image.open(io.BytesIO(content), formats=["TIFF"])
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise ValueError(f"{error}; at most {MOST_HEIGHTS} heights are allowed; coarsen it") from None
+    with opened as picture:
         if picture.mode != "F":
             raise ValueError(
                 "its heights are whole numbers, of no unit; save them as decimal numbers, in metres"

@@ -12,18 +12,21 @@ import time
 import types
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import sgns.settings as typed
+from mpm_warp import Excavation, MeshBody, Other
 from mpm_warp.settings import described
 from sgns import Run, __version__
 from sgns.cli.commands import COMMANDS
-from sgns.cli.help import groups_of, options_of
+from sgns.cli.help import _found, groups_of, options_of
 from sgns.cli.settings import sweep_jobs
 from sgns.config import UserError
 from sgns_testing.commands import SHORT, call, composed, python, refusal
 from sgns_testing.commands import sgns as run_sgns
-from sgns_testing.runs import make_run
+from sgns_testing.meshes import box_corners, box_triangles, write_stl
+from sgns_testing.runs import make_run, make_writer, random_frame
 
 
 def call_process(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -326,6 +329,18 @@ def test_the_table_of_a_sweep_of_runs_has_their_forces(empty_folder: Path, monke
         assert [float(cell) for cell in row[1:3]] == pytest.approx([-x, z], rel=1e-6)
     assert rows[2][:3] == ["3", "", ""]
     assert done.stdout.splitlines()[-5].split() == names
+
+
+def test_the_table_has_the_forces_of_a_run_with_a_further_mesh(tmp_path: Path) -> None:
+    file = write_stl(tmp_path / "box.stl", box_corners((0.1, 0.1, 0.1)), box_triangles())
+    stone = Other(tool=MeshBody(file=str(file)), position=(0.4, 0.3, 0.3))
+    scene, frames = Excavation(others=(stone,)), [random_frame(number) for number in range(2)]
+    further = np.eye(7)[None, 6], np.zeros((1, 3)), np.zeros((1, 3))
+    with make_writer(tmp_path / "a.h5", scene=scene.to_dict(), meshes=scene.meshes) as writer:
+        for frame in frames:
+            writer.append(**frame, more=further)
+        writer.finish(1.0)
+    assert _found(str(tmp_path / "a.h5"))["mean_draft_N"] == pytest.approx(-frames[1]["force"][0])
 
 
 def test_wrong_key_in_a_sweep(empty_folder: Path) -> None:

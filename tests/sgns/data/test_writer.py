@@ -13,6 +13,7 @@ import yaml
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from mpm_warp import State
 from sgns.config import UserError
 from sgns.data.run import Run
 from sgns_testing.runs import make_run, make_writer, random_frame
@@ -47,6 +48,18 @@ def test_everything_appended_is_read_back(tmp_path):
         np.testing.assert_array_equal(run.body_points, [each["body_points"] for each in frames])
         for read, key in [(run.positions(), "position"), (run.velocities(), "velocity")]:
             np.testing.assert_array_equal(read, np.array([each[key] for each in frames], np.float32))
+
+
+def test_a_large_array_of_a_state_is_in_several_chunks(tmp_path, monkeypatch):
+    monkeypatch.setattr("sgns.data.writer._MOST_IN_CHUNK", 100)  # HDF5 takes no chunk of 4 GB
+    arrays = {"position": np.arange(90.0).reshape(30, 3), "log_volume": np.arange(5.0), "bond": np.zeros(0)}
+    with make_writer(tmp_path / "a.h5") as writer:
+        writer.append(**random_frame(0))
+        writer.finish(1.0, State(0, arrays))
+    with Run(tmp_path / "a.h5") as run, h5py.File(tmp_path / "a.h5") as file:
+        assert [file["state"][name].chunks for name in arrays] == [(4, 3), (5,), None]
+        for name, array in run.state.arrays.items():
+            np.testing.assert_array_equal(array, arrays[name])
 
 
 def written(path, m=2, **settings):

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from omegaconf import OmegaConf
@@ -14,7 +15,7 @@ from mpm_warp import Effects, Scene, effects_for
 from sgns.config import UserError
 from sgns.data.dataset import SPLITS, Dataset
 from sgns.numbers import duration_words
-from sgns.simulate.campaign import Campaign, finishing_time, plan, run_cost, size_words
+from sgns.simulate.campaign import Campaign, finishing_time, plan, run_cost, size_words, split_runs
 from sgns.simulate.run import simulate_scene
 from sgns.simulate.scene import scene_from_config, warning_summary
 from sgns_testing.campaigns import BASE, EFFECTS, campaign
@@ -82,6 +83,20 @@ def test_runs_are_different_scenes_of_the_grid_and_each_in_one_split(tmp_path):
     assert len(campaign(tmp_path, runs=None).scenes) == 12  # all combinations when no number is given
     name, scene = next(iter(c.scenes.items()))
     assert Scene.from_dict(c.describe()["scenes"][name]) == scene
+
+
+@pytest.mark.parametrize(
+    ("count", "shares", "parts"),
+    [
+        (1, (0.8, 0.1, 0.1), [1, 0, 0]),
+        (2, (0.8, 0.1, 0.1), [1, 1, 0]),
+        (3, (0.1, 0.6, 0.3), [1, 2, 0]),
+        (2, (0.0, 0.0, 1.0), [0, 0, 2]),
+    ],
+)
+def test_of_few_runs_one_is_trained_on(count, shares, parts):
+    split = split_runs([[str(number) for number in range(count)]], shares, np.random.default_rng(0))
+    assert [list(split.values()).count(part) for part in SPLITS] == parts
 
 
 def test_seed_decides_draw_and_split(tmp_path):

@@ -151,6 +151,11 @@ WRONG = [
     (without("force"), "has no force; it has"),
     (without("body_points"), "no body_points and no mesh"),
     (without("time"), "no time (T,) and no frame_rate; give frame_rate=60"),
+    (lambda arrays: arrays.update(frame_rate=0.0), "frame_rate is 0 Hz; it must be a number above 0"),
+    (
+        lambda arrays: arrays.update(vertices=np.eye(3), triangles=np.zeros((0, 3), int)),
+        "triangles has shape (0, 3); it needs three whole numbers in each row",
+    ),
     (changed("position", (3, 5, 2), np.nan), "position is not finite at index (3, 5, 2)"),
     (changed("time", 4, 1.0), "time before frame 4 advances by"),
     (changed("pose", (2, 6), 5.0), "quaternion of frame 2 has length"),

@@ -278,6 +278,14 @@ def test_what_is_wrong_with_poses_is_told_by_the_line_of_the_file(tmp_path, rows
         scene_from_data({"kind": "body", "path": str(tmp_path / "path.csv")})
 
 
+def test_the_rows_of_a_map_are_no_lines_of_the_path(tmp_path):
+    (tmp_path / "path.csv").write_text("0,0.2,0.3,0.2,0,0,0,1")
+    (tmp_path / "map.csv").write_text("0,0\n0,0\n0,nan")
+    data = {"kind": "body", "path": str(tmp_path / "path.csv"), "bed": {"surface": str(tmp_path / "map.csv")}}
+    with pytest.raises(SceneError, match=r"^bed.surface .* in row 3, number 2$"):
+        scene_from_data(data)
+
+
 def test_a_further_body_has_its_path_from_a_file(tmp_path):
     file = tmp_path / "path.csv"
     data = {"others": [{"position": [0.2, 0.2, 0.2]}, {"motion": "path", "path": str(file)}]}
@@ -359,13 +367,19 @@ def test_a_map_that_cannot_be_read(name, content, words, tmp_path):
     assert str(caught.value).startswith("scene.bed.surface: cannot read") and "\n" not in str(caught.value)
 
 
-def test_maps_of_whole_numbers_or_objects_are_refused(tmp_path):
+def test_maps_of_whole_numbers_or_objects_are_refused(tmp_path, monkeypatch):
     Image.fromarray(np.zeros((3, 3), np.uint8)).save(tmp_path / "map.tif")
     with pytest.raises(UserError, match="its heights are whole numbers, of no unit"):
         read_heights(tmp_path / "map.tif")
     Image.fromarray(np.zeros((400, 300), np.float32)).save(tmp_path / "map.tif")
     with pytest.raises(UserError, match="it holds 300 x 400 heights, at most 100000"):
         read_heights(tmp_path / "map.tif")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    with pytest.raises(UserError, match="at most 100000 heights are allowed; coarsen it"):
+        read_heights(tmp_path / "map.tif")
+    np.savez(tmp_path / "map.npz", np.zeros((3, 3)))
+    with pytest.raises(UserError, match="it is an archive of arrays"):
+        read_heights((tmp_path / "map.npz").rename(tmp_path / "map.npy"))
     np.save(tmp_path / "map.npy", np.array([[{}]], dtype=object), allow_pickle=True)
     with pytest.raises(UserError, match="allow_pickle=False"):
         read_heights(tmp_path / "map.npy")
