@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-import sgns.settings as typed
+import sgns.command_settings as typed
 from mpm_warp.settings import described
 from sgns import Run, __version__
 from sgns.cli.commands import COMMANDS
