@@ -30,6 +30,7 @@ def setting_files() -> dict[str, list[Path]]:
 def reference_page() -> str:
     """The page of all settings with default, unit, range and meaning, from the classes that define them."""
     import mpm_warp as mpm
+    import sgns.command_settings as commands
     import sgns.settings as typed
     from mpm_warp.motions import Other, Passes
     from mpm_warp.settings import reference
@@ -60,11 +61,11 @@ def reference_page() -> str:
     groups = [typed.DatasetSettings, typed.PublishedSettings, typed.ReductionSettings]
     groups += [one for kind in typed.MODELS.values() for one in kind] + [
         typed.LossWeights,
-        typed.Errors,
-        typed.Limits,
-        typed.ImportNames,
+        commands.Errors,
+        commands.Limits,
+        commands.ImportNames,
     ]
-    return reference([*soil, *groups, *typed.COMMANDS.values()])
+    return reference([*soil, *groups, *commands.COMMANDS.values()])
 
 
 def settings_page(name: str, files: list[Path]) -> str:

@@ -13,9 +13,9 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
+from sgns.command_settings import Advise
 from sgns.config import UserError
 from sgns.frontier.point import Point, effective_error, read_points, usable
-from sgns.settings import Advise
 
 log = logging.getLogger(__name__)
 

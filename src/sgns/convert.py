@@ -19,7 +19,7 @@ from sgns.config import UserError
 from sgns.data.files import require_new, require_replaceable, whole_file
 from sgns.data.hdf5 import new_hdf5
 from sgns.data.run import Run
-from sgns.data.views import VIEWS, write_steps
+from sgns.data.run_file import VIEWS, write_steps
 from sgns.evaluate.body_shape import bodies, body_triangles
 
 log = logging.getLogger(__name__)

@@ -37,8 +37,20 @@ from sgns.numbers import (
     is_whole,
     real_array,
 )
-from sgns.paths import Followed, Paths, ends_of, followed, mean_pose, one_each, same_pose, told_numbers
-from sgns.state import Rollout, Rollouts, Snapshot, State
+from sgns.state import (
+    Followed,
+    Paths,
+    Rollout,
+    Rollouts,
+    Snapshot,
+    State,
+    ends_of,
+    followed,
+    mean_pose,
+    one_each,
+    same_pose,
+    told_numbers,
+)
 
 # Soil follows the clock for so long after the tool has moved at the pace of the training runs, then the tool [s].
 _SETTLING = 0.5

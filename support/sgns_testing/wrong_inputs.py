@@ -27,6 +27,7 @@ from mpm_warp.bed import Walls
 from mpm_warp.bodies import Box, Cylinder, MeshBody, Plate
 from mpm_warp.scenes import Body, Column, Excavation, Incline, Wheel
 from mpm_warp.settings import Setting
+from sgns import command_settings
 from sgns import settings as typed
 from sgns.cli import COMMANDS
 from sgns_testing.commands import call
@@ -108,7 +109,7 @@ def _groups() -> Iterator[tuple[str, tuple[str, ...], str, Any]]:
         ("material.", Material),
         ("effects.", Effects),
         ("solver.", typed.SolverSettings),
-        ("limits.", typed.Limits),
+        ("limits.", command_settings.Limits),
     ):
         yield "simulate", CUT, prefix, cls
     yield "simulate", ON_PATH, "scene.tool.", Box
@@ -131,7 +132,7 @@ def _groups() -> Iterator[tuple[str, tuple[str, ...], str, Any]]:
     yield "train", PUBLISHED, "dataset.", typed.PublishedSettings
     yield "rollout", CHECKPOINT, "scene.", Excavation
     yield "evaluate", JUDGE, "dataset.", typed.DatasetSettings
-    yield "advise", ADVISE, "error.", typed.Errors
+    yield "advise", ADVISE, "error.", command_settings.Errors
     own = {
         "simulate": CUT,
         "reduce": LEARN[:3],
@@ -145,7 +146,7 @@ def _groups() -> Iterator[tuple[str, tuple[str, ...], str, Any]]:
         "convert": (f"run={RUN}", "output=a.csv"),
         "import": (f"source=[{RUN}]", "output=a.h5"),
     }
-    for name, cls in typed.COMMANDS.items():
+    for name, cls in command_settings.COMMANDS.items():
         yield name, own.get(name, ()), "", cls
     yield "train", PACKED, "dataset.", typed.PackedSettings
 

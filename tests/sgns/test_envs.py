@@ -1,8 +1,7 @@
-"""Environments: many beds step as one simulator does; gymnasium's checks; what is rewarded."""
+"""Environments: gymnasium's checks, and what is rewarded."""
 
 from __future__ import annotations
 
-import copy
 import runpy
 import sys
 from dataclasses import replace
@@ -11,23 +10,15 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-import yaml
 from gymnasium.utils.env_checker import check_env
 
 import mpm_warp
 from mpm_warp.poses import about_y
 from sgns import Simulator, UserError
-from sgns.data.dataset import Dataset
-from sgns.envs import Beds, Dig, DigEnvs, DriveEnvs
-from sgns.reduction.reduce import reduce_dataset
-from sgns.train.command import train
-from sgns_testing.runs import make_run
-from sgns_testing.tiny import BRIEF, FIT, MODEL, POLYNOMIAL, REDUCTION
-from sgns_testing.trained import TrainedKinds
+from sgns.envs import Dig, DigEnvs, DriveEnvs
+from sgns_testing.trained import WHEEL, TrainedKinds, driven_wheels
 
 ROOT = Path(__file__).resolve().parents[2]
-WHEEL = mpm_warp.Wheel(bed=mpm_warp.Bed(size=(0.4, 0.2, 0.08), spacing=0.04), settle=0.05, duration=0.3)
-SHIFT = np.array([1e-3, 0, 0, 0, 0, 0, 0])
 
 
 @pytest.fixture(scope="module")
@@ -37,81 +28,7 @@ def cutter() -> Simulator:
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> TrainedKinds:
-    """Of two loads and slips."""
-    folder = tmp_path_factory.mktemp("wheels")
-    known = {"n": len(WHEEL.initial_positions()), "arrangement_hash": WHEEL.arrangement_hash}
-    split = {"train": ["a", "b", "c"], "validation": ["d"], "test": ["e"]}
-    for seed, name in enumerate("abcde"):
-        scene = replace(WHEEL, load=60.0 + 40.0 * (seed % 2), slip=0.2 + 0.2 * (seed % 2)).to_dict()
-        make_run(folder / "runs" / f"{name}.h5", frames=14, seed=seed, scene=scene, **known)
-    (folder / "dataset.yaml").write_text(yaml.safe_dump({"name": "wheels", "split": split}))
-    data = reduce_dataset(Dataset.open(folder), REDUCTION, progress=False)
-    pose = MODEL | {"context": ["load", "slip"], "body_nodes": "pose"}
-    models = {"network": pose, "points": pose | {"body_nodes": "points"}, "polynomial": POLYNOMIAL}
-    for name, model in models.items():
-        training = FIT if name == "polynomial" else BRIEF
-        train(data, num_modes=4, model=model, training=training, output=folder / name)
-    return TrainedKinds(data, folder)
-
-
-def paths(simulator: Simulator, frames: int = 45) -> np.ndarray:
-    """Three tools: one cuts, one stops on the way, one creeps; shape (3, frames, 7)."""
-    cut = mpm_warp.Scene.from_dict(simulator.scene).body_poses()[:frames]
-    stops = cut[np.minimum(np.arange(frames), 5)]
-    creeps = cut[:1] + np.outer(np.arange(frames), [2e-4, 0, -1e-5, 0, 0, 0, 0])
-    return np.stack([cut, stops, creeps])
-
-
-def agree(beds: Beds, simulators: list[Simulator], path: np.ndarray) -> None:
-    for one, poses in zip(simulators, path, strict=True):
-        one.reset(poses[0])
-    beds.reset(np.ones(len(path), bool), path[:, 0])
-    for poses in path.transpose(1, 0, 2)[1:]:
-        beds.step(poses)
-        states = [one.step(pose) for one, pose in zip(simulators, poses, strict=True)]
-        for name, atol in (("force", 2e-2), ("torque", 2e-3), ("pose", 1e-6)):
-            np.testing.assert_allclose(getattr(beds, name), [getattr(s, name) for s in states], atol=atol)
-        np.testing.assert_allclose(beds.latent[:, -1], [state.latent for state in states], atol=1e-5)
-
-
-def test_beds_side_by_side_are_stepped_as_by_simulators(cutter: Simulator) -> None:
-    """Also those whose soil rests because the tool stops or creeps."""
-    agree(Beds(cutter, 3, cutter.body_points), [copy.copy(cutter) for _ in range(3)], paths(cutter))
-
-
-@pytest.mark.parametrize("kind", ["network", "points", "polynomial"])
-def test_beds_under_wheels_are_stepped_as_by_simulators(kind: str, wheels: TrainedKinds) -> None:
-    one = wheels.simulator(kind)
-    path = np.stack([wheels.run.pose, wheels.run.pose + SHIFT])
-    agree(Beds(one, 2, one.body_points), [copy.copy(one), copy.copy(one)], path)
-
-
-def test_beds_left_out_stay_as_they_are(cutter: Simulator) -> None:
-    path, beds = paths(cutter), Beds(cutter, 3, cutter.body_points)
-    beds.reset(np.ones(3, bool), path[:, 0])
-    for t in range(1, 20):
-        beds.step(path[:, t])
-    whole, force = beds.latent.clone(), beds.force.copy()
-    beds.step(path[:, 20], np.array([True, False, False]))
-    assert (beds.latent[1:] == whole[1:]).all() and (beds.force[1:] == force[1:]).all()
-    assert (beds.latent[0] != whole[0]).any()
-    beds.reset(np.array([False, True, False]), path[1:2, 0])
-    assert (beds.latent[1] == beds.start).all() and not beds.force[1].any() and beds.force[0].any()
-
-
-def test_half_precision_is_near(cutter: Simulator, wheels: TrainedKinds) -> None:
-    path, force = paths(cutter)[:1], []
-    for half in (False, True):
-        beds = Beds(cutter, 1, cutter.body_points, half)
-        beds.reset(np.ones(1, bool), path[:, 0])
-        for t in range(1, path.shape[1]):
-            beds.step(path[:, t])
-        force.append(beds.force[0])
-    np.testing.assert_allclose(force[1], force[0], atol=0.05 * np.abs(force[0]).max())
-    assert (force[0] != force[1]).any()
-    polynomial = wheels.simulator("polynomial")
-    with pytest.raises(UserError, match="half=True is for networks"):
-        Beds(polynomial, 1, polynomial.body_points, half=True)
+    return driven_wheels(tmp_path_factory.mktemp("wheels"), "network")
 
 
 def test_gymnasium_finds_nothing_wrong(wheels: TrainedKinds) -> None:

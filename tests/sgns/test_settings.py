@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from omegaconf import OmegaConf
 import mpm_warp
 import sgns.settings as typed
 from mpm_warp.settings import described
-from sgns.cli import COMMANDS
+from sgns import command_settings
 from sgns.config import UserError
 from sgns.settings import (
     DatasetSettings,
@@ -60,19 +59,6 @@ def test_a_campaign_states_only_what_the_class_knows(name: str) -> None:
         DatasetSettings.from_dict(found).to_dict() | {"split": found["split"]}
         == DatasetSettings().to_dict() | found
     )
-
-
-@pytest.mark.parametrize("name", typed.COMMANDS)
-def test_a_command_has_the_keys_of_its_class_with_their_defaults(name: str) -> None:
-    cls = typed.COMMANDS[name]
-    found = composed(name)
-    groups = {"dataset", "reduction", "model", "training", "preset", "scene", "material", "effects", "solver"}
-    assert set(found) - groups - {"study", "numerics"} == {one.name for one in fields(cls)}
-    for key, default in cls().to_dict().items():
-        place = key == "output" and name not in ("simulate", "rollout")  # with the date
-        plain = list(default) if isinstance(default, tuple) else default  # as YAML has it
-        assert place or found[key] in ("???", plain), key
-    assert ("output" in found) == (COMMANDS[name].output is not None)
 
 
 def test_presets_state_only_what_is_allowed() -> None:
@@ -144,19 +130,6 @@ def test_presets_state_only_what_is_allowed() -> None:
         (DatasetSettings, {"split": [1, 1, 0]}, "dataset.split is [1.0, 1.0, 0.0]; it needs three shares"),
         (DatasetSettings, {"draw": 5}, "dataset.draw is 5; it must be a grid"),
         (DatasetSettings, {"runs": 10.5}, "dataset.runs is 10.5; it must be a whole number"),
-        (typed.Simulate, {"seed": -1}, "seed is -1; it must be a whole number, 0 or more"),
-        (typed.Evaluate, {"new_rollouts": 5}, "new_rollouts is 5; it must be a list of run files"),
-        (
-            typed.Advise,
-            {"error": 5},
-            "error is 5; it must be a group of keys: give error.force, error.position, ",
-        ),
-        (
-            typed.Advise,
-            {"error": {"force": 30}},
-            "error.force is 30.0; it must be a number above 0, at most 1, a share: for 30 % give 0.3",
-        ),
-        (typed.Advise, {"error": {"force": "x"}}, "error.force is 'x'; it must be a finite number"),
     ],
 )
 def test_a_value_that_is_not_allowed(cls: type[Group], values: dict[str, Any], line: str) -> None:
@@ -190,14 +163,14 @@ CLASSES = [
     *(
         typed.SolverSettings,
         typed.LossWeights,
-        typed.Errors,
-        typed.Limits,
+        command_settings.Errors,
+        command_settings.Limits,
         DatasetSettings,
         PublishedSettings,
         ReductionSettings,
     ),
     *(one for kind in typed.MODELS.values() for one in kind),
-    *typed.COMMANDS.values(),
+    *command_settings.COMMANDS.values(),
 ]
 
 

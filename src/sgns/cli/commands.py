@@ -61,7 +61,7 @@ COMMANDS = {
         value="wall_s_per_simulated_s",
     ),
     "reduce": Command(
-        "sgns.reduction.reduce",
+        "sgns.reduction.command",
         "fit the basis (PCA) on a dataset and reduce its runs",
         "folder",
         ("dataset.path",),

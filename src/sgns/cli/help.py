@@ -128,7 +128,7 @@ def command_help(command: str) -> str:
 def key_lines(command: str) -> list[str]:
     """A line for each key of a command, and for the main keys of its groups, from their definitions."""
     from mpm_warp.settings import described  # loads Warp: a second
-    from sgns.settings import COMMANDS, MAIN_KEYS, Errors, ImportNames, Limits
+    from sgns.command_settings import COMMANDS, MAIN_KEYS, Errors, ImportNames, Limits
 
     rows = [
         (f"{group}.{name}", *rest)

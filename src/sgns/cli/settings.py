@@ -27,6 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from sgns import settings as typed
 from sgns.cli.help import describe, groups_of, options_of
 from sgns.cli.hydra_settings import require_own_objects, require_plain_overrides
+from sgns.command_settings import COMMANDS
 from sgns.config import UserError, parse_yaml
 
 # --- How settings are put together: by Hydra, with a look at each result before anybody acts on it ------
@@ -321,11 +322,11 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
     Raises:
         UserError: The line names the key.
     """
-    own: Any = typed.COMMANDS[command]
+    own: Any = COMMANDS[command]
     keys = _keys_of(command)
     if odd := set(cfg) - keys:
         # A file of settings may be for several commands.
-        if odd := odd.difference(*map(_keys_of, typed.COMMANDS)):
+        if odd := odd.difference(*map(_keys_of, COMMANDS)):
             known = ", ".join(sorted(keys))
             raise UserError(f"{min(odd)}: no such key; keys of sgns {command}: {known}")
     campaign = command == "simulate" and cfg.get("dataset") is not None  # may draw what its scene lacks
@@ -370,7 +371,7 @@ def check_shared(cfg: DictConfig, command: str, needed: tuple[str, ...]) -> None
 
 def _keys_of(command: str) -> set[str]:
     """Keys and groups of a command."""
-    return {one.name for one in fields(typed.COMMANDS[command])} | set(groups_of(command))  # type: ignore[arg-type]
+    return {one.name for one in fields(COMMANDS[command])} | set(groups_of(command))  # type: ignore[arg-type]
 
 
 def _shown(value: Any) -> str:

@@ -26,6 +26,8 @@ from sgns.data.run_file import (
     PRODUCERS,
     SPREAD,
     STOPPED,
+    VIEW_ATTRIBUTES,
+    VIEWS,
     open_run,
     read_attributes,
     read_mesh,
@@ -33,8 +35,8 @@ from sgns.data.run_file import (
     require_mesh_was_read,
     series,
     structure_problems,
+    view_arrays,
 )
-from sgns.data.views import VIEW_ATTRIBUTES, VIEWS, view_arrays
 from sgns.data.writer import ContentHash
 
 if TYPE_CHECKING:

@@ -30,14 +30,15 @@ from sgns.data.run_file import (
     SPREAD,
     STATE,
     STOPPED,
+    VIEWS,
     WHOLE,
     Recorded,
     mesh_parts,
     open_run,
     read_attributes,
     series,
+    write_views,
 )
-from sgns.data.views import VIEWS, write_views
 
 log = logging.getLogger(__name__)
 

@@ -19,11 +19,12 @@ import yaml
 
 from mpm_warp import Decision, Effects, Scene, SceneError, substeps_per_frame
 from mpm_warp.settings import short
+from sgns.command_settings import Limits
 from sgns.config import UserError, differences, flattened
 from sgns.data.dataset import SPLITS, read_description
 from sgns.data.files import file_lock, write_whole
 from sgns.numbers import counted, duration_words
-from sgns.settings import DatasetSettings, Limits
+from sgns.settings import DatasetSettings
 from sgns.simulate.scene import decided, replaced, scene_from_data
 
 # --- What runs cost in work, time and disk, before and while they are made ------------------------------

@@ -17,11 +17,11 @@ from tqdm import tqdm
 
 from mpm_warp import Preview, Scene
 from mpm_warp.preview import afterwards
+from sgns.command_settings import Limits
 from sgns.config import Interrupted, UserError, of_dataset
 from sgns.data.files import only_here
 from sgns.data.run import Run
 from sgns.data.writer import require_new_run, stopped_path
-from sgns.settings import Limits
 from sgns.simulate.campaign import cost_line, plan, require_limits, require_space, run_cost
 from sgns.simulate.run import Restart, restart_from, simulate_scene, unfinished
 from sgns.simulate.scene import (

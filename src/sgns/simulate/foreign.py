@@ -25,6 +25,7 @@ from mpm_warp.bodies import UNITS
 from mpm_warp.mesh_files import read_mesh
 from mpm_warp.poses import in_world_frame, rotate
 from mpm_warp.solids import closed_mesh
+from sgns.command_settings import Import
 from sgns.config import UserError
 from sgns.data.check import check_run
 from sgns.data.dataset import IMPORTED, SPLITS
@@ -33,7 +34,6 @@ from sgns.data.sources import ARRAYS, PAGE, found_sources, read_source
 from sgns.data.surface import particle_spacing
 from sgns.data.writer import RunWriter, require_new_run
 from sgns.numbers import counted
-from sgns.settings import Import
 from sgns.simulate.campaign import split_runs
 
 log = logging.getLogger(__name__)

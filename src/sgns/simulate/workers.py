@@ -23,11 +23,11 @@ from tqdm import tqdm
 from mpm_warp import Effects, Frame, Scene, SceneError, Solver, SolverStopped, frames_together
 from mpm_warp.launch import Job, run_concurrently
 from mpm_warp.limits import usable_cores
+from sgns.command_settings import Limits
 from sgns.config import Interrupted, UserError, flattened, heeded_signals
 from sgns.data.files import file_lock, remove_abandoned
 from sgns.data.run import Run
 from sgns.numbers import counted, duration_words, elapsed
-from sgns.settings import Limits
 from sgns.simulate.campaign import (
     Campaign,
     RunCost,

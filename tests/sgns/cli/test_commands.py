@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import sgns.settings as typed
+import sgns.command_settings as typed
 from mpm_warp import Excavation, MeshBody, Other
 from mpm_warp.settings import described
 from sgns import Run, __version__

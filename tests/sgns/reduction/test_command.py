@@ -10,7 +10,8 @@ import yaml
 from omegaconf import OmegaConf
 
 from sgns.reduction.basis import reconstruction_curve
-from sgns.reduction.reduce import main, reduce_dataset
+from sgns.reduction.command import main
+from sgns.reduction.reduce import reduce_dataset
 from sgns_testing.tiny import REDUCTION, make_dataset
 
 

@@ -16,10 +16,10 @@ import aiohttp
 import numpy as np
 import pytest
 
+from sgns.command_settings import View
 from sgns.config import UserError
 from sgns.data.run import Run
 from sgns.model.checkpoint import load_surrogate, pretrained_file
-from sgns.settings import View
 from sgns.simulator import Simulator
 from sgns.view import server
 from sgns.view.server import FILES, serve
