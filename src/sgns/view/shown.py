@@ -100,6 +100,9 @@ class Drive:
         kind = WheelControls if self.simulator.predicts_body else ToolControls
         self.controls: WheelControls | ToolControls = kind(self.scene, self.known, self.rate)
         self.values: dict[str, Any] = self.scene.to_dict()
+        # Runs without points have a network that needs none.
+        own = self.scene.body_points()
+        self.points = own if len(self.simulator.body_points) else own[:0]
         self.kept: list[Kept] = []
         self.paused, self._mark = False, (0, 0.0)
         self.reset()
@@ -179,7 +182,9 @@ class Drive:
         self.controls.reset()
         self.kept.clear()
         self._tell()
-        self.kept.append(Kept.of(self.simulator.reset(self.controls.pose(), values=self.values)))
+        self._before = []
+        begin = self.simulator.reset(self.controls.pose(), values=self.values, body_points=self.points)
+        self.kept.append(Kept.of(begin))
         self.recording, self.count = False, 0
         self.step_time = self.computed = self.real_time = 0.0
         self.pause(self.paused)
@@ -197,7 +202,7 @@ class Drive:
             state = self.simulator.step(self.controls.moved())
         old = self.kept[-1]
         there, soil = (np.stack(pair) for pair in ((old.pose, state.pose), (old.latent, state.latent)))
-        excess = self.known.excess(there, self.simulator.body_points, soil, self._context)
+        excess = self.known.excess(there, self.points, soil, self._context)
         assert excess is not None  # the tool is somewhere
         self.kept.append(Kept.of(state, float(excess.amount[-1]), excess.quantity[-1]))
         if not self.recording:
@@ -225,7 +230,7 @@ class Drive:
             d = self.simulator.history
             before = [*[self.kept[0]] * d, *self.kept][-d:]
             latents, poses = (np.stack(parts) for parts in list(zip(*before, strict=True))[:2])
-            self.simulator.reset(history=(latents, poses), values=self.values)
+            self.simulator.reset(history=(latents, poses), values=self.values, body_points=self.points)
 
     # --- a record -----------------------------------------------------------------------------------------
 
@@ -261,7 +266,7 @@ class Drive:
             forces,
             torques,
             poses,
-            in_world_frame(poses, self.simulator.body_points),
+            in_world_frame(poses, self.points),
             self.computed,
             self._end,
             self.simulator.basis,
