@@ -104,6 +104,7 @@ class Drive:
         own = self.scene.body_points()
         self.points = own if len(self.simulator.body_points) else own[:0]
         self.kept: list[Kept] = []
+        self._before: list[Kept] = []  # what is kept, while a record is shorter than the history
         self.paused, self._mark = False, (0, 0.0)
         self.reset()
 
@@ -228,7 +229,8 @@ class Drive:
         self._context = dict(zip(keys, context_of(self.values, keys).tolist(), strict=True))
         if changed and self.kept:
             d = self.simulator.history
-            before = [*[self.kept[0]] * d, *self.kept][-d:]
+            before = [*self._before, *self.kept]
+            before = [*[before[0]] * d, *before][-d:]
             latents, poses = (np.stack(parts) for parts in list(zip(*before, strict=True))[:2])
             self.simulator.reset(history=(latents, poses), values=self.values, body_points=self.points)
 
@@ -236,6 +238,7 @@ class Drive:
 
     def record(self) -> None:
         """Begin to keep frames, from the newest on."""
+        self._before = [*self._before, *self.kept[:-1]][-self.simulator.history :]
         self.kept, self.recording, self.computed = self.kept[-1:], True, 0.0
 
     def recorded(self, output: Path) -> list[Kept]:

@@ -160,3 +160,28 @@ def test_the_tool_of_the_run_is_driven(tmp_path: Path) -> None:
         assert np.ptp(run.body_points[1, :, 1]) == pytest.approx(0.2)
 
 
+def test_a_heavier_wheel_is_told_to_the_network(wheel: Path) -> None:
+    forces = []
+    for load in (60.0, 90.0):
+        drive = Drive(load_surrogate(wheel), DRIVEN)
+        drive.controls.hear({"load": load})
+        drive.reset()
+        drive.step()
+        forces.append(drive.kept[-1].force)
+    assert math.dist(*forces) > 0.0
+
+
+def test_a_record_changes_nothing_of_the_soil(wheel: Path) -> None:
+    """The numbers that are told change right after it has begun."""
+    latents = []
+    for recording in (False, True):
+        drive = Drive(load_surrogate(wheel), DRIVEN)
+        drive.controls.hear({"way": 1.0})
+        for _ in range(6):
+            drive.step()
+        if recording:
+            drive.record()
+        drive.controls.hear({"load": 85.0})
+        drive.step()
+        latents.append(drive.kept[-1].latent)
+    np.testing.assert_array_equal(*latents)
