@@ -6,6 +6,7 @@ only at the frame's end; what is given until the next frame ends is a choice, se
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -77,12 +78,12 @@ class Coupling:
     def reset(self, pose: Any = None, time: float = 0.0, values: Mapping[str, Any] | None = None) -> Wrench:
         """The bed at rest with the tool's origin at a pose, at a time [s]; values as of `Simulator.reset`. Without a
         pose the tool is where the first step puts it, and the first frame begins there."""
-        self.pose = None if pose is None else check_pose(pose)
-        self.state: State = self.simulator.reset(
-            None if self.pose is None else self._centre(self.pose), values=values
-        )
-        self.time = self._checked(time, -np.inf)
-        self._begin, self._frame = self.time, 0
+        pose, time = None if pose is None else check_pose(pose), self._checked(time, -np.inf)
+        self.state: State = self.simulator.reset(None if pose is None else self._centre(pose), values=values)
+        # All is in order: nothing is changed before.
+        self.pose: np.ndarray | None = pose
+        self.time, self._values = time, values
+        self._begin, self._frame = time, 0
         self._loads = [(np.zeros(3), np.zeros(3))] * 2
         return Wrench(np.zeros(3), np.zeros(3))
 
@@ -94,7 +95,7 @@ class Coupling:
         """
         time, pose = self._checked(time, self.time), check_pose(pose)
         if self.pose is None:
-            self.state = self.simulator.reset(self._centre(pose))
+            self.state = self.simulator.reset(self._centre(pose), values=self._values)
             self._begin, self.pose, self.time = time, pose, time
         while (due := self._begin + (self._frame + 1) * self.period) <= time + _ROUNDING * self.period:
             there = pose
@@ -128,7 +129,7 @@ class Coupling:
             found = float(time)
         except (TypeError, ValueError):
             found = np.nan
-        if not before <= found < np.inf:
+        if not (math.isfinite(found) and before <= found):
             after = (
                 "" if before == -np.inf else f", not before the last one, {before:g} s; to begin again: reset"
             )

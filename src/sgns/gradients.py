@@ -20,7 +20,9 @@ from torch.utils.checkpoint import checkpoint
 
 from mpm_warp import Bed
 from mpm_warp.poses import in_world_frame
+from mpm_warp.settings import short
 from sgns.config import UserError
+from sgns.data.files import one_line
 from sgns.data.surface import soil_surface
 from sgns.model import training_range as known
 from sgns.model.dynamics import Standardiser
@@ -173,10 +175,10 @@ class TorchSimulator:
 
     def step(self, state: TorchState, pose: Tensor | np.ndarray) -> TorchState:
         """The state one frame later, with the tool at a pose (7,) or at poses (B, 7); as `Simulator.step`."""
-        next_pose = self._tensor(pose)
-        paths, _ = self._paths(
-            next_pose.reshape(-1, 1, 7) if next_pose.dim() == 2 else next_pose[None], "pose"
-        )
+        poses, count = self._tensor(pose), len(state.poses)
+        if poses.shape not in ((7,), (count, 7)):
+            raise UserError(f"the pose has shape {tuple(poses.shape)}; it needs (7,) or ({count}, 7)")
+        paths, _ = self._paths(poses.expand(count, 7)[:, None], "pose")
         steps, motion = torch.ones(len(paths), dtype=torch.bool, device=self.device), None
         if state.motion is not None:
             here = [markers(*pair)[0] for pair in zip(*self._plain(paths), strict=True)]
@@ -279,7 +281,10 @@ class TorchSimulator:
     # --- Parts ---
 
     def _tensor(self, value: Any) -> Tensor:
-        return torch.as_tensor(value, dtype=torch.float64, device=self.device)
+        try:
+            return torch.as_tensor(value, dtype=torch.float64, device=self.device)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise UserError(f"{short(value)} cannot be read as numbers ({one_line(error)})") from error
 
     def _paths(self, poses: Any, what: str) -> tuple[Tensor, bool]:
         """Paths (B, T, 7) with exactly unit quaternions, and whether it was one alone."""

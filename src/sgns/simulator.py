@@ -194,6 +194,7 @@ class Simulator:
         scene: Any = None,
         history: tuple[np.ndarray, np.ndarray] | None = None,
         values: Mapping[str, Any] | None = None,
+        body_points: np.ndarray | None = None,
     ) -> State:
         """Start again; returns the state at frame 0.
 
@@ -205,22 +206,25 @@ class Simulator:
                 the bed at rest at its common start.
             values: The scene as plain data, where `scene` is none; a network that was trained with different loads,
                 soils or the like reads them there. None: those of `simulator.scene`.
+            body_points: Of the tool in the body frame [m], shape (M, 3); None: those of the scene, or of the training
+                runs.
 
         Raises:
             UserError: The scene has another bed, or what is given is not of the shape and kind above; then the
                 simulator stays where it was.
         """
-        points, pose = self.body_points, None
+        pose = None
         if scene is not None and hasattr(scene, "body_poses"):
             if scene.arrangement_hash != self.arrangement_hash:
                 raise UserError(
                     f"the scene's particles ({scene.arrangement_hash}) are not those of the checkpoint "
                     f"({self.arrangement_hash}); use the bed of simulator.scene and begin above the soil"
                 )
-            points, pose, values = scene.body_points(), first_pose(scene.body_poses()), scene.to_dict()
+            body_points = scene.body_points() if body_points is None else body_points
+            pose, values = first_pose(scene.body_poses()), scene.to_dict()
         elif scene is not None:
             pose = first_pose(scene)
-        points, context = self._checked_points(points), self._context_of(values)
+        points, context = self._checked_points(body_points), self._context_of(values)
         if history is None:
             latent = self._start_latent.expand(self.history, -1, -1)
             poses = [] if pose is None else [pose] * self.history

@@ -134,6 +134,22 @@ def test_the_first_pose_may_come_with_the_first_step(simulator: Simulator, cut: 
     assert soil.state.frame == 2
 
 
+def test_values_that_come_before_the_first_pose_are_kept(
+    simulator: Simulator, cut: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[Any] = []
+    soil, reset = Coupling(simulator), simulator.reset
+
+    def told(pose: Any = None, values: Any = None) -> Any:
+        given.append(values)
+        return reset(pose, values=values)
+
+    monkeypatch.setattr(simulator, "reset", told)
+    soil.reset(values=simulator.scene)
+    soil.step(0.0, cut[0])
+    assert given == [simulator.scene] * 2
+
+
 def test_most_steps_take_microseconds(simulator: Simulator, cut: np.ndarray) -> None:
     """Only those in which a frame is due cost a step of the network; of the others even a busy machine does 20 in the
     time of two milliseconds."""
@@ -159,7 +175,15 @@ def test_wrong_use_is_refused_and_changes_nothing(simulator: Simulator, cut: np.
     }.items():
         with pytest.raises(UserError, match=message):
             soil.step(*arguments)
-    assert soil.time == 0.1 and soil.state.frame == 6
+    for message, again in {
+        "the time is nan": {"time": np.nan},
+        "the time is -inf; it must be a finite number": {"time": -np.inf},
+        "values is a int": {"values": 3},
+    }.items():
+        with pytest.raises(UserError, match=message):
+            soil.reset(cut[0], **again)
+    assert soil.time == 0.1 and soil.state.frame == 6 and simulator.save().frame == 6
+    assert soil.pose is not None and (soil.pose == cut[5]).all()
     with pytest.raises(UserError, match="allowed: hold, interpolate, extrapolate"):
         Coupling(simulator, "spline")
     with pytest.raises(UserError, match=r"origin has shape \(2,\)"):

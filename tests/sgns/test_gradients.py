@@ -285,6 +285,14 @@ def test_what_does_not_fit_is_refused_in_a_line(trained) -> None:
         differentiable.rollout(poses, segment=0)
     with pytest.raises(UserError, match="not finite"):
         differentiable.rollout(np.full((3, 7), np.nan))
+    with pytest.raises(UserError, match="cannot be read as numbers"):
+        differentiable.rollout("path")
+    two = differentiable.start(np.stack([poses[:1]] * 2))
+    for wrong in (poses[:3], poses[:2, :6], poses[0, :6]):
+        with pytest.raises(UserError, match=r"pose has shape .*; it needs \(7,\) or \(2, 7\)"):
+            differentiable.step(two, wrong)
+    one = differentiable.step(two, poses[1])  # one for all paths
+    np.testing.assert_array_equal(one.force, differentiable.step(two, poses[[1, 1]]).force)
     simulator = trained["wheel"].simulator("pose")
     simulator.dynamics.settings = replace(simulator.dynamics.settings, body_nodes="points")
     with pytest.raises(UserError, match="train with model"):

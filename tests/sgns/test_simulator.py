@@ -214,6 +214,18 @@ def test_another_number_of_body_points_can_be_rolled_out(trained) -> None:
     simulator = trained.simulator("points")
     rollout = simulator.rollout(trained.run.pose, simulator.body_points[:6])
     assert rollout.body_points.shape == (14, 6, 3) and np.isfinite(rollout.latent).all()
+    simulator.reset(trained.run.pose[0], body_points=simulator.body_points[:6])
+    for pose in trained.run.pose[1:]:
+        state = simulator.step(pose)
+    np.testing.assert_allclose(state.latent, rollout.latent[-1], atol=1e-6)
+    # From where another tool has stepped to, too.
+    stepped(simulator, trained.run.pose[:6])
+    on = trained.run.pose[5:], simulator.body_points[:6]
+    one, many = (
+        simulator.rollout(*on, start=simulator.save()),
+        simulator.rollouts(on[0][None], on[1], start=simulator.save()),
+    )
+    np.testing.assert_allclose(one.latent, many.latent[0], atol=1e-6)
 
 
 def test_fewer_modes_than_it_was_trained_with(trained) -> None:

@@ -172,7 +172,10 @@ async def driven(socket: web.WebSocketResponse, drive: Drive, output: Path) -> N
         with suppress(asyncio.CancelledError, ConnectionError):
             await ticking
         if drive.recording:  # the page was closed meanwhile
-            log.info("recorded %s", drive.write(drive.recorded(output), free_name(output)))
+            try:
+                log.info("recorded %s", drive.write(drive.recorded(output), free_name(output)))
+            except UserError as error:  # nobody is left to be told but the terminal
+                log.warning("the record is lost: %s", error)
 
 
 async def tick(socket: web.WebSocketResponse, drive: Drive) -> None:

@@ -100,7 +100,11 @@ class Drive:
         kind = WheelControls if self.simulator.predicts_body else ToolControls
         self.controls: WheelControls | ToolControls = kind(self.scene, self.known, self.rate)
         self.values: dict[str, Any] = self.scene.to_dict()
+        # Runs without points have a network that needs none.
+        own = self.scene.body_points()
+        self.points = own if len(self.simulator.body_points) else own[:0]
         self.kept: list[Kept] = []
+        self._before: list[Kept] = []  # what is kept, while a record is shorter than the history
         self.paused, self._mark = False, (0, 0.0)
         self.reset()
 
@@ -179,7 +183,9 @@ class Drive:
         self.controls.reset()
         self.kept.clear()
         self._tell()
-        self.kept.append(Kept.of(self.simulator.reset(self.controls.pose(), values=self.values)))
+        self._before = []
+        begin = self.simulator.reset(self.controls.pose(), values=self.values, body_points=self.points)
+        self.kept.append(Kept.of(begin))
         self.recording, self.count = False, 0
         self.step_time = self.computed = self.real_time = 0.0
         self.pause(self.paused)
@@ -197,7 +203,7 @@ class Drive:
             state = self.simulator.step(self.controls.moved())
         old = self.kept[-1]
         there, soil = (np.stack(pair) for pair in ((old.pose, state.pose), (old.latent, state.latent)))
-        excess = self.known.excess(there, self.simulator.body_points, soil, self._context)
+        excess = self.known.excess(there, self.points, soil, self._context)
         assert excess is not None  # the tool is somewhere
         self.kept.append(Kept.of(state, float(excess.amount[-1]), excess.quantity[-1]))
         if not self.recording:
@@ -223,14 +229,16 @@ class Drive:
         self._context = dict(zip(keys, context_of(self.values, keys).tolist(), strict=True))
         if changed and self.kept:
             d = self.simulator.history
-            before = [*[self.kept[0]] * d, *self.kept][-d:]
+            before = [*self._before, *self.kept]
+            before = [*[before[0]] * d, *before][-d:]
             latents, poses = (np.stack(parts) for parts in list(zip(*before, strict=True))[:2])
-            self.simulator.reset(history=(latents, poses), values=self.values)
+            self.simulator.reset(history=(latents, poses), values=self.values, body_points=self.points)
 
     # --- a record -----------------------------------------------------------------------------------------
 
     def record(self) -> None:
         """Begin to keep frames, from the newest on."""
+        self._before = [*self._before, *self.kept[:-1]][-self.simulator.history :]
         self.kept, self.recording, self.computed = self.kept[-1:], True, 0.0
 
     def recorded(self, output: Path) -> list[Kept]:
@@ -261,7 +269,7 @@ class Drive:
             forces,
             torques,
             poses,
-            in_world_frame(poses, self.simulator.body_points),
+            in_world_frame(poses, self.points),
             self.computed,
             self._end,
             self.simulator.basis,

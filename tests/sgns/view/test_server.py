@@ -165,6 +165,25 @@ def test_a_second_record_gets_a_number(tmp_path: Path) -> None:
     assert server.free_name(tmp_path / "a.h5").name == "a_4.h5"
 
 
+def test_a_record_of_one_frame_is_lost_in_a_line(tmp_path: Path, drive: Any, caplog: Any) -> None:
+    """The page is closed while the clock stands."""
+
+    async def test() -> None:
+        async with served(drive, tmp_path / "view.h5") as (client, address):
+            async with client.ws_connect(f"{address}/socket") as page:
+                for wish in ("pause", "record"):
+                    await page.send_json({"do": wish})
+                    await told(page, "paused")
+            for _ in range(100):
+                if caplog.records:
+                    break
+                await asyncio.sleep(0.02)
+
+    run(test())
+    found = [(one.levelname, one.getMessage()) for one in caplog.records if one.levelname != "INFO"]
+    assert found == [("WARNING", "the record is lost: nothing was recorded yet: let the clock run first")]
+
+
 def test_what_a_page_may_not_ask_for_is_said(tmp_path: Path, drive: Any) -> None:
     async def test() -> None:
         async with served(drive, tmp_path / "view.h5") as (client, address):

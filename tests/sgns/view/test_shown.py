@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mpm_warp import Bed, Body, Excavation, MeshBody, Wheel
+from mpm_warp import Bed, Body, Excavation, MeshBody, Scene, Wheel
 from mpm_warp.poses import rotate
 from sgns.config import UserError
 from sgns.data.dataset import Dataset
 from sgns.data.run import Run
-from sgns.model.checkpoint import load_surrogate
+from sgns.model.checkpoint import load_surrogate, pretrained_file
 from sgns.model.training_range import TrainingRange
 from sgns.reduction.reduce import reduce_dataset
 from sgns.train.command import train
@@ -147,3 +148,40 @@ def test_a_heavier_wheel_is_told_to_the_network(wheel: Path) -> None:
         drive.step()
         forces.append(drive.kept[-1].force)
     assert math.dist(*forces) > 0.0
+def test_the_tool_of_the_run_is_driven(tmp_path: Path) -> None:
+    surrogate = load_surrogate(pretrained_file("excavation"))
+    scene = Scene.from_dict(surrogate.card["scene"])
+    narrow = replace(scene, blade=replace(scene.blade, width=0.2))
+    drive = Drive(surrogate, SimpleNamespace(scene=narrow.to_dict(), meshes=[None], path=Path("run.h5")))
+    drive.record()
+    drive.step()
+    drive.write(drive.recorded(tmp_path / "narrow.h5"), tmp_path / "narrow.h5")
+    with Run(tmp_path / "narrow.h5") as run:
+        assert np.ptp(run.body_points[1, :, 1]) == pytest.approx(0.2)
+
+
+def test_a_heavier_wheel_is_told_to_the_network(wheel: Path) -> None:
+    forces = []
+    for load in (60.0, 90.0):
+        drive = Drive(load_surrogate(wheel), DRIVEN)
+        drive.controls.hear({"load": load})
+        drive.reset()
+        drive.step()
+        forces.append(drive.kept[-1].force)
+    assert math.dist(*forces) > 0.0
+
+
+def test_a_record_changes_nothing_of_the_soil(wheel: Path) -> None:
+    """The numbers that are told change right after it has begun."""
+    latents = []
+    for recording in (False, True):
+        drive = Drive(load_surrogate(wheel), DRIVEN)
+        drive.controls.hear({"way": 1.0})
+        for _ in range(6):
+            drive.step()
+        if recording:
+            drive.record()
+        drive.controls.hear({"load": 85.0})
+        drive.step()
+        latents.append(drive.kept[-1].latent)
+    np.testing.assert_array_equal(*latents)
