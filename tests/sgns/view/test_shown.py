@@ -148,6 +148,8 @@ def test_a_heavier_wheel_is_told_to_the_network(wheel: Path) -> None:
         drive.step()
         forces.append(drive.kept[-1].force)
     assert math.dist(*forces) > 0.0
+
+
 def test_the_tool_of_the_run_is_driven(tmp_path: Path) -> None:
     surrogate = load_surrogate(pretrained_file("excavation"))
     scene = Scene.from_dict(surrogate.card["scene"])
@@ -158,17 +160,6 @@ def test_the_tool_of_the_run_is_driven(tmp_path: Path) -> None:
     drive.write(drive.recorded(tmp_path / "narrow.h5"), tmp_path / "narrow.h5")
     with Run(tmp_path / "narrow.h5") as run:
         assert np.ptp(run.body_points[1, :, 1]) == pytest.approx(0.2)
-
-
-def test_a_heavier_wheel_is_told_to_the_network(wheel: Path) -> None:
-    forces = []
-    for load in (60.0, 90.0):
-        drive = Drive(load_surrogate(wheel), DRIVEN)
-        drive.controls.hear({"load": load})
-        drive.reset()
-        drive.step()
-        forces.append(drive.kept[-1].force)
-    assert math.dist(*forces) > 0.0
 
 
 def test_a_record_changes_nothing_of_the_soil(wheel: Path) -> None:
