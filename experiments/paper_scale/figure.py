@@ -46,6 +46,7 @@ def lines(rows: list[Row], over: str) -> dict[str, dict[float, list[Row]]]:
 
 def draw(axes: plt.Axes, rows: list[Row], over: str, column: str) -> None:
     """Mean and spread of one error over the seeds; time is that of the trainings."""
+    xs: list[float] = []
     for name, places in lines(rows, over).items():
         x, means, low, high = [], [], [], []
         for place, own in places.items():
@@ -56,8 +57,12 @@ def draw(axes: plt.Axes, rows: list[Row], over: str, column: str) -> None:
             means.append(mean)
             low.append(mean - min(values))
             high.append(max(values) - mean)
+        xs.extend(x)
         axes.errorbar(x, means, yerr=[low, high], marker="o", markersize=3, capsize=2, label=name)
-    axes.set(xscale="log", xlabel="training runs" if over == "runs" else "training [minutes of one core]")
+    axes.set_xscale("log")
+    axes.set_xticks(sorted(set(xs)), [f"{x:.3g}" for x in sorted(set(xs))])
+    axes.set_xticks([], minor=True)
+    axes.set(xlabel="training runs" if over == "runs" else "training [minutes of one core]")
     axes.set_ylabel(SHOWN[column])
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.3)
