@@ -1,7 +1,8 @@
-"""Makes a checkpoint small enough to ship, and its model card: `python -m sgns.ship NAME EVALUATION`.
+"""Makes a checkpoint small enough to ship, and its model card: `python -m sgns.ship NAME EVALUATION [PACKED]`.
 
-Run it in the folder where `sgns evaluate` ran, since the evaluation says which checkpoint it is of. What a rollout does
-not need is left out; numbers are stored in single precision, modes in half precision where a rollout does not feel it.
+Run it in the folder where `sgns evaluate` ran, since the evaluation says which checkpoint it is of. An evaluation of a
+packed dataset has no rollouts; then PACKED, the folder of that dataset, has the runs. What a rollout does not need is
+left out; numbers are stored in single precision, modes in half precision where a rollout does not feel it.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from sgns.model.checkpoint import (
 )
 from sgns.model.training_range import components
 from sgns.numbers import counted
+from sgns.reduction.packed import packed_dataset
 from sgns.simulator import Simulator
 
 MOST_BYTES = 4_000_000
@@ -58,12 +60,21 @@ class Loss(NamedTuple):
         return f"{self.soil:.2g} mm RMS of the soil and {100 * self.force:.2g} % of the force"
 
 
-def ship(name: str, evaluation: Path) -> Path:
+class ToolPath(NamedTuple):
+    """What a simulator is told of a run."""
+
+    poses: np.ndarray  # (T, 7)
+    points: np.ndarray  # in the body frame [m], shape (M, 3)
+    scene: Mapping[str, Any]  # as plain data
+
+
+def ship(name: str, evaluation: Path, packed: Path | None = None) -> Path:
     """Write `<name>.ckpt` and `<name>.md` of an evaluated checkpoint into the package; returns the checkpoint's path.
 
     Args:
         name: What it is to be called.
         evaluation: Output of `sgns evaluate`.
+        packed: Folder of the packed dataset that it is of; None: it is of a dataset with run files.
 
     Raises:
         UserError: That is not a complete evaluation, or the checkpoint is too large.
@@ -75,7 +86,8 @@ def ship(name: str, evaluation: Path) -> Path:
     rows = read_table(evaluation / "metrics.csv", *wrong)
     whole, target = Path(made["checkpoint"]), PRETRAINED / f"{name}.ckpt"
     content = read_checkpoint(whole)
-    paths = [evaluation / "rollouts" / f"{row['run']}.h5" for row in rows[:-1]]
+    names = [row["run"] for row in rows[:-1]]
+    paths = of_rollouts(evaluation / "rollouts", names) if packed is None else of_packed(packed, names)
     for modes in (torch.float16, torch.float32):
         write_checkpoint(smaller(content, modes), target)
         loss = measured_loss(whole, target, paths)
@@ -90,7 +102,8 @@ def ship(name: str, evaluation: Path) -> Path:
             f"{MOST_BYTES / 1e6:g} MB and {100 * MOST_LOSS:g} % of the error can ship: train with fewer modes"
         )
     stored = f"modes in {'half' if modes == torch.float16 else 'single'} precision, the rest in single"
-    text = card(target, evaluation, content["hyper_parameters"], made, rows, f"{stored}: {loss.words()}")
+    digits = f"{stored}: {loss.words()}"
+    text = card(target, evaluation, packed, content["hyper_parameters"], made, rows, digits)
     write_whole(target.with_suffix(".md"), text)
     return target
 
@@ -104,14 +117,32 @@ def smaller(content: Mapping[str, Any], modes: torch.dtype) -> dict[str, Any]:
     return {"state_dict": state, "hyper_parameters": content["hyper_parameters"]}
 
 
-def measured_loss(whole: Path, small: Path, runs: Sequence[Path]) -> Loss:
+def of_rollouts(folder: Path, names: Sequence[str]) -> list[ToolPath]:
+    """The tools' paths of the rollouts that an evaluation has written."""
+    found = []
+    for name in names:
+        with Run(folder / f"{name}.h5") as run:
+            found.append(ToolPath(run.pose, in_body_frame(run.pose[0], run.body_points[0]), run.scene))
+    return found
+
+
+def of_packed(folder: Path, names: Sequence[str]) -> list[ToolPath]:
+    """The tools' paths of these test runs of a packed dataset."""
+    runs = {run.name: run for run in packed_dataset(folder, {"num_modes": 1}).runs("test")}
+    if missing := [name for name in names if name not in runs]:
+        raise UserError(f"{folder} has no test run {missing[0]}; name the packed dataset that was evaluated")
+    known = (runs[name] for name in names)
+    return [ToolPath(run.pose, in_body_frame(run.pose[0], run.body_points[0]), run.scene) for run in known]
+
+
+def measured_loss(whole: Path, small: Path, paths: Sequence[ToolPath]) -> Loss:
     """Both checkpoints along the tool's paths of some runs, from the bed at rest."""
     simulators = [Simulator.load(whole), Simulator.load(small)]
     soil, force = [], []  # squares: of the difference, and what they are shares of
-    for path in runs:
-        with Run(path) as run:
-            pose, points, scene = run.pose, in_body_frame(run.pose[0], run.body_points[0]), run.scene
-        one, other = (simulator.rollout(pose, points, values=scene) for simulator in simulators)
+    for path in paths:
+        one, other = (
+            simulator.rollout(path.poses, path.points, values=path.scene) for simulator in simulators
+        )
         for latents in zip(one.latent, other.latent, strict=True):
             a, b = (s.basis.inverse(latent) for s, latent in zip(simulators, latents, strict=True))
             soil.append(float((a - b).square().mean()))
@@ -126,6 +157,7 @@ def measured_loss(whole: Path, small: Path, runs: Sequence[Path]) -> Loss:
 def card(
     target: Path,
     evaluation: Path,
+    packed: Path | None,
     known: Mapping[str, Any],
     made: Mapping[str, str],
     rows: Sequence[Mapping[str, str]],
@@ -154,7 +186,7 @@ def card(
     commands = [
         training_command(Path(made["checkpoint"]).parent, settings),
         made["command"],
-        f"python -m sgns.ship {name} {shlex.quote(str(evaluation))}",
+        " ".join(["python -m sgns.ship", name, *(shlex.quote(str(p)) for p in (evaluation, packed) if p)]),
     ]
     lines = [
         f"# {name}",
@@ -230,8 +262,10 @@ def table() -> str:
 
 
 if __name__ == "__main__":
+    if not 3 <= len(sys.argv) <= 4:
+        sys.exit("sgns.ship: give NAME, EVALUATION and, of a packed dataset, its folder")
     try:
-        target = ship(sys.argv[1], Path(sys.argv[2]))
+        target = ship(sys.argv[1], *(Path(word) for word in sys.argv[2:4]))
         print(f"{target} and its card; for docs/learning.md:\n\n{table()}")
-    except (UserError, IndexError) as error:
-        sys.exit(f"sgns.ship: {error if isinstance(error, UserError) else 'give NAME and EVALUATION'}")
+    except UserError as error:
+        sys.exit(f"sgns.ship: {error}")

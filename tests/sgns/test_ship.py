@@ -170,16 +170,34 @@ def test_what_ships_rolls_out(name: str, empty_folder: Path, monkeypatch: pytest
     assert done.returncode == 0, done.stderr
 
 
-def test_what_ships_is_as_good_as_its_card_says(empty_folder: Path) -> None:
+def test_the_test_runs_of_a_packed_dataset_are_compared() -> None:
+    folder, name = ROOT / "reduced" / "quick", "0001_motion-curved_rake-0.0_depth-0.04_speed-0.08"
+    [path] = ship.of_packed(folder, [name])
+    assert path.poses.shape[1:] == (7,) and path.points.shape[1:] == (3,)
+    assert path.scene["depth"] == 0.04
+    with pytest.raises(UserError, match="has no test run other; name the packed dataset"):
+        ship.of_packed(folder, [name, "other"])
+
+
+@pytest.mark.parametrize(
+    ("name", "packed", "soil", "force"),
+    [
+        ("excavation", "quick", 2.03, 0.171),
+        pytest.param("paper_excavation", "paper_excavation", 3.31, 0.1005, marks=pytest.mark.long),
+    ],
+)
+def test_what_ships_is_as_good_as_its_card_says(
+    name: str, packed: str, soil: float, force: float, empty_folder: Path
+) -> None:
     """On the packed test runs of the dataset that it was trained on."""
-    file = ROOT / "src" / "sgns" / "pretrained" / "excavation.ckpt"
+    file = ROOT / "src" / "sgns" / "pretrained" / f"{name}.ckpt"
     words = [
-        "dataset=quick_reduced",
-        f"dataset.path={ROOT / 'reduced' / 'quick'}",
+        f"dataset={packed}_reduced",
+        f"dataset.path={ROOT / 'reduced' / packed}",
         f"checkpoint={file}",
         "output=report",
     ]
     assert call("evaluate", *words).returncode == 0
     total = json.loads(Path("report/metrics.json").read_text())["aggregate"]
-    assert total["rmse_total_mm"] == pytest.approx(2.03, abs=0.02)
-    assert total["force_nrmse"] == pytest.approx(0.171, abs=0.002)
+    assert total["rmse_total_mm"] == pytest.approx(soil, abs=0.02)
+    assert total["force_nrmse"] == pytest.approx(force, abs=0.002)
