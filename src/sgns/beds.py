@@ -6,7 +6,6 @@ Letters: B beds, b some of them, d history positions, r modes, M body points, N 
 from __future__ import annotations
 
 import copy
-import math
 from typing import Any
 
 import numpy as np
@@ -15,12 +14,9 @@ from torch import Tensor, nn
 
 from mpm_warp.poses import in_world_frame, rotation_matrices, rotation_vectors
 from sgns.config import UserError
-from sgns.model.features import BodyTrack, context_of, distance, markers
+from sgns.model.features import BodyTrack, Pace, context_of, distance, markers
 from sgns.model.network_dynamics import LatentDynamics
 from sgns.simulator import Simulator
-
-_SETTLING = 0.5  # as of `Simulator`, which a test compares with [s]
-_STILL = 1e-9  # as of `sgns.model.features` [m]
 
 
 class Beds:
@@ -48,10 +44,8 @@ class Beds:
         self.pose[:, 6] = 1.0
         keys = simulator.context_keys
         self.context = np.tile(context_of(simulator.scene, keys), (count, 1))
-        rate, travel = simulator.frame_rate, simulator.card["slowest_travel"]
-        # A predicted body's soil follows the clock, see `sgns.model.features`.
-        self.least = 0.0 if self.dynamics.predicts_body else max(travel, _STILL)
-        self.settling = math.ceil(_SETTLING * rate)
+        # Without a pace the soil follows the clock: every tool is fast enough.
+        self.least, self.settling = simulator.pace or Pace(0.0, 1)
         self.slow = np.full(count, self.settling)
         self.here = self._markers(self.pose)
         self.stepped, self.last = self.here.copy(), self.pose.copy()

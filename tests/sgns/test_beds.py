@@ -50,6 +50,13 @@ def test_beds_side_by_side_are_stepped_as_by_simulators(cutter: Simulator) -> No
     agree(Beds(cutter, 3, cutter.body_points), [copy.copy(cutter) for _ in range(3)], paths(cutter))
 
 
+def test_beds_of_a_simulator_by_the_clock_never_rest(cutter: Simulator) -> None:
+    path = paths(cutter)[1:2]
+    clock = Simulator.pretrained("excavation", rate_independent=False)
+    agree(Beds(clock, 1, clock.body_points), [clock], path)
+    assert np.abs(clock.rollout(path[0]).latent[-1] - cutter.rollout(path[0]).latent[-1]).max() > 1e-4
+
+
 @pytest.mark.parametrize("kind", ["network", "points", "polynomial"])
 def test_beds_under_wheels_are_stepped_as_by_simulators(kind: str, wheels: TrainedKinds) -> None:
     one = wheels.simulator(kind)
