@@ -85,7 +85,8 @@ class SoilEnvs(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Args:
         num_envs: B.
         simulator: A `Simulator`, or a checkpoint's file or name.
-        scene: Whose tool and first pose are taken; None: those of the training runs.
+        scene: Whose tool and first pose are taken, and the numbers that the network is told; None: those of the
+            training runs.
         seconds: Length of an episode.
         frames_per_action: Frames of the soil that an action holds for.
         half: As of `Beds`.
@@ -131,6 +132,7 @@ class SoilEnvs(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             )
         self.start = self.scene.body_poses()[0]
         self.beds = Beds(self.simulator, num_envs, self.scene.body_points(), half)
+        self.beds.context[:] = context_of(self.scene.to_dict(), self.simulator.context_keys)
         self.profile = _Profile(self.simulator, self.scene)
         self.elapsed, self.over = np.zeros(num_envs, int), np.zeros(num_envs, bool)
         self.single_action_space = Box(-1.0, 1.0, (self.actions,), np.float32)

@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env
 import mpm_warp
 from mpm_warp.poses import about_y
 from sgns import Simulator, UserError
-from sgns.envs import Dig, DigEnvs, DriveEnvs
+from sgns.envs import Dig, DigEnvs, DriveEnvs, SoilEnvs
 from sgns_testing.trained import WHEEL, TrainedKinds, driven_wheels
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,6 +45,14 @@ def test_they_are_made_by_their_names(cutter: Simulator) -> None:
     assert many.observation_space.shape == (3, 47) and many.action_space.shape == (3, 2)
     seen, _ = many.reset(seed=1)
     assert many.observation_space.contains(seen)
+
+
+def test_the_network_is_told_the_numbers_of_the_scene(wheels: TrainedKinds) -> None:
+    class Plain(SoilEnvs):
+        free_tool, actions = True, 1
+
+    envs = Plain(2, wheels.simulator("network"), replace(WHEEL, load=77.0, slip=0.3))
+    assert envs.beds.context.tolist() == [[77.0, 0.3]] * 2
 
 
 def test_many_are_as_one_alone_and_begin_again_after_the_last_step(cutter: Simulator) -> None:
