@@ -9,7 +9,9 @@ Letters: B beds, r modes, K columns of the profile.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -125,7 +127,8 @@ class SoilEnvs(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.known = TrainingRange.from_plain(self.simulator.card["training_range"])
         self.num_envs, self.frames = num_envs, frames_per_action
         self.frame_time = 1.0 / self.simulator.frame_rate
-        self.length = round(seconds * self.simulator.frame_rate / frames_per_action)
+        whole = isinstance(seconds, Real) and math.isfinite(seconds)
+        self.length = round(seconds * self.simulator.frame_rate / frames_per_action) if whole else 0
         if self.length < 1:
             raise UserError(
                 f"seconds is {seconds!r}; an episode needs at least one action, {frames_per_action} frames"
@@ -148,8 +151,9 @@ class SoilEnvs(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """All beds at rest, with new targets; options as of the task."""
-        super().reset(seed=seed if seed is None or is_whole(seed) else seed[0])  # type: ignore[arg-type,index]
+        """All beds at rest, with new targets; options as of the task. Targets are drawn one after the other: of a list
+        with a seed for each bed every seed changes all that follows."""
+        super().reset(seed=one_seed(seed, self.num_envs))
         self._started = True
         self.elapsed[:], self.over[:] = 0, False
         self._begin(np.ones(self.num_envs, bool), self.np_random, dict(options or {}))
@@ -190,6 +194,22 @@ class SoilEnvs(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _parts(self) -> list[np.ndarray]:
         """What is seen of the task, (B, any) each."""
         raise NotImplementedError
+
+
+def one_seed(seed: int | Sequence[int | None] | None, count: int) -> int | None:
+    """A seed, or a list of so many, as one; None: nothing is seeded."""
+    if seed is None or is_whole(seed):
+        return seed  # type: ignore[return-value]  # a whole number
+    if not isinstance(seed, (list, tuple)) or len(seed) != count:
+        raise UserError(
+            f"seed is {seed!r}; it must be one whole number, or a list of {count}, one for each bed"
+        )
+    if all(one is None for one in seed):
+        return None
+    if not all(one is None or (is_whole(one) and one >= 0) for one in seed):
+        raise UserError(f"seed is {seed!r}; each must be a whole number of 0 or more, or None")
+    numbers = [np.random.SeedSequence().entropy if one is None else int(one) for one in seed]
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])  # type: ignore[arg-type]  # whole numbers
 
 
 class DigEnvs(SoilEnvs):

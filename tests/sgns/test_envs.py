@@ -74,6 +74,22 @@ def test_many_are_as_one_alone_and_begin_again_after_the_last_step(cutter: Simul
     assert not many.beds.force.any()
 
 
+def test_of_a_list_of_seeds_each_counts(cutter: Simulator) -> None:
+    envs, targets = DigEnvs(2, simulator=cutter, seconds=0.2), []
+    for seed in ([1, 2], [1, 2], [1, 3], [2, 2], 1, 1):
+        envs.reset(seed=seed)
+        targets.append(envs.target.copy())
+    same = [(one == targets[0]).all() for one in targets]
+    assert same == [True, True, False, False, False, False] and (targets[4] == targets[5]).all()
+    for seed, message in {
+        (): "a list of 2",
+        (1,): "a list of 2",
+        (1, -1): "whole number of 0 or more",
+    }.items():
+        with pytest.raises(UserError, match=message):
+            envs.reset(seed=list(seed))
+
+
 def test_digging_the_trench_earns_and_standing_does_not(cutter: Simulator) -> None:
     envs = DigEnvs(2, simulator=cutter, seconds=3.6)
     x = envs.profile.x
@@ -132,6 +148,8 @@ def test_wrong_use_is_refused_in_one_line(cutter: Simulator, wheels: TrainedKind
         "train one: sgns train dataset=quick_wheel": lambda: DriveEnvs(1),
         "num_envs is 0; it must be": lambda: DigEnvs(0, simulator=cutter),
         "at least one action": lambda: DigEnvs(1, simulator=cutter, seconds=0.01),
+        "seconds is nan": lambda: DigEnvs(1, simulator=cutter, seconds=np.nan),
+        "seconds is '4'": lambda: DigEnvs(1, simulator=cutter, seconds="4"),
         "call reset": lambda: DigEnvs(1, simulator=cutter).step(np.zeros((1, 2))),
         "particles": lambda: DigEnvs(1, simulator=cutter, scene=mpm_warp.Excavation()),
         "no pretrained checkpoint|no checkpoint": lambda: DigEnvs(1, simulator="nothing"),
