@@ -291,12 +291,12 @@ class DigEnvs(SoilEnvs):
         for _ in range(self.frames):
             poses = self.beds.pose.copy()
             poses[:, [0, 2]] = np.clip(poses[:, [0, 2]] + self.fastest * self.speed, self.low, self.high)
-            moved = poses[:, :3] - self.beds.pose[:, :3]
+            before = self.beds.pose[:, :3].copy()
             self.beds.step(poses, which)
-            work -= (self.beds.force * moved).sum(1)
-        self.heights, before = self.profile(self.beds.latent[:, -1]), self.error
+            work -= (self.beds.force * (self.beds.pose[:, :3] - before)).sum(1)
+        self.heights, error = self.profile(self.beds.latent[:, -1]), self.error
         self.error = self._error()
-        return (before - self.error) / self.to_dig - EFFORT * work, {"work": work, "error": self.error.copy()}
+        return (error - self.error) / self.to_dig - EFFORT * work, {"work": work, "error": self.error.copy()}
 
     def _parts(self) -> list[np.ndarray]:
         place = (self.beds.pose[:, [0, 2]] - self.start[[0, 2]]) / self.deepest
@@ -381,10 +381,10 @@ class DriveEnvs(SoilEnvs):
         self.slip[moving] = (self.least + 0.5 * (actions[:, 0] + 1.0) * (self.most - self.least))[moving]
         self._tell_slip()
         way = self.rim_speed * self.frame_time * (1.0 - self.slip)
-        turn = self.rim_speed * self.frame_time / self.radius
+        way, turn = way * moving, self.rim_speed * self.frame_time / self.radius * moving
         pulled, driven = np.zeros(self.num_envs), np.zeros(self.num_envs)
         for _ in range(self.frames):
-            self.angle[moving] += turn
+            self.angle += turn
             poses = self.beds.pose.copy()
             poses[:, 0] += way
             poses[:, 3:] = _turned(self.start[3:], self.angle)

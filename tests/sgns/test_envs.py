@@ -69,8 +69,8 @@ def test_many_are_as_one_alone_and_begin_again_after_the_last_step(cutter: Simul
         np.testing.assert_allclose(seen[0], alone, atol=1e-4)
         assert reward[0] == pytest.approx(earned, abs=1e-4)
         assert not ended.any() and (over == (step == 2)).all()
-    again, reward, _, over, _ = many.step(actions)  # a new episode; the actions are not used
-    assert not reward.any() and not over.any() and (again[:, 0] == 1.0).all()
+    again, reward, _, over, info = many.step(actions)  # a new episode; the actions are not used
+    assert not reward.any() and not info["work"].any() and not over.any() and (again[:, 0] == 1.0).all()
     assert not many.beds.force.any()
 
 
