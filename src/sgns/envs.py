@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from mpm_warp import Scene
+from mpm_warp.motions import sinkage
 from mpm_warp.poses import in_world_frame, rotation_matrices
 from sgns.beds import Beds
 from sgns.config import UserError
@@ -331,6 +332,7 @@ class DriveEnvs(SoilEnvs):
             )
         super().__init__(num_envs, simulator, **settings)
         values: Mapping[str, Any] = self.scene.to_dict()
+        self.values = values
         self.radius, self.rim_speed = 0.5 * values["diameter"], float(values["rim_speed"])
         keys = self.simulator.context_keys
         self.low, self.width = np.zeros(len(keys)), np.ones(len(keys))
@@ -365,6 +367,12 @@ class DriveEnvs(SoilEnvs):
         if "slip" in self.column:
             self.beds.context[:, self.column["slip"]] = self.slip
 
+    def _travel(self) -> np.ndarray:
+        """Of the wheels per way of their rims, shape (B,); see `slip` and `travel_speed` of `mpm_warp.Wheel`."""
+        if self.scene.travel_speed is None:  # type: ignore[attr-defined]  # of a wheel
+            return 1.0 - self.slip
+        return np.where(self.slip < 0.0, 1.0 / (1.0 + np.clip(self.slip, -0.99, 0.0)), 1.0 - self.slip)
+
     def _loads(self) -> np.ndarray:
         """Weight that every wheel carries [N], shape (B,)."""
         if "load" in self.column:
@@ -380,7 +388,7 @@ class DriveEnvs(SoilEnvs):
         moving = np.ones(self.num_envs, bool) if which is None else which
         self.slip[moving] = (self.least + 0.5 * (actions[:, 0] + 1.0) * (self.most - self.least))[moving]
         self._tell_slip()
-        way = self.rim_speed * self.frame_time * (1.0 - self.slip)
+        way = self.rim_speed * self.frame_time * self._travel()
         way, turn = way * moving, self.rim_speed * self.frame_time / self.radius * moving
         pulled, driven = np.zeros(self.num_envs), np.zeros(self.num_envs)
         for _ in range(self.frames):
@@ -397,13 +405,13 @@ class DriveEnvs(SoilEnvs):
 
     def _parts(self) -> list[np.ndarray]:
         diameter, loads, (heading, axle) = 2.0 * self.radius, self._loads(), self._axes()
-        place = self.beds.pose[:, [0, 2]] - [self.start[0], self.radius]
+        way, depth = self.beds.pose[:, 0] - self.start[0], sinkage(self.values, self.beds.pose)
         vectors = heading, axle, np.array([0.0, 0.0, 1.0])
         forces = [(self.beds.force * vector).sum(1) / loads for vector in vectors]
         torque = (self.beds.torque * axle).sum(1) / (loads * self.radius)
         context = (self.beds.context - self.low) / np.maximum(self.width, 1e-12)
         heights = self.profile(self.beds.latent[:, -1]) / diameter
-        own = [place[:, 0] / diameter, self.slip, -place[:, 1] / diameter, *forces, torque]
+        own = [way / diameter, self.slip, depth / diameter, *forces, torque]
         return [np.stack(own, 1), context, heights]
 
 

@@ -19,6 +19,7 @@ from sgns.envs import Dig, DigEnvs, DriveEnvs, SoilEnvs
 from sgns_testing.trained import WHEEL, TrainedKinds, driven_wheels
 
 ROOT = Path(__file__).resolve().parents[2]
+GROUSERS = {"grousers": 8, "grouser_height": 0.01, "grouser_thickness": 0.003}
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +138,22 @@ def test_driving_is_rewarded_by_the_work_of_the_pull(wheels: TrainedKinds) -> No
         np.testing.assert_allclose(reward, (info["pull_work"] - 0.2 * info["drive_work"]) / unit)
     assert np.ptp(loads) > 1.0 and np.min(loads) >= 60.0 and np.max(loads) <= 100.0
     assert (loads[0] != loads[1]).all()
+
+
+def test_a_wheel_goes_and_sinks_as_the_scene_says(wheels: TrainedKinds) -> None:
+    """Of a wheel slower than its way slip has two meanings, and grousers reach deeper than the rim."""
+    for scene in (
+        replace(WHEEL, slip=-0.5, **GROUSERS),
+        replace(WHEEL, slip=0.2, travel_speed=2.0 * WHEEL.rim_speed, **GROUSERS),
+    ):
+        envs = DriveEnvs(1, simulator=wheels.simulator("network"), scene=scene, seconds=0.3)
+        envs.least, envs.most = -0.5, 0.5
+        seen, _ = envs.reset()
+        assert seen[0, 3] * scene.diameter == pytest.approx(scene.sinkage(envs.beds.pose)[0], abs=1e-6)
+        before = envs.beds.pose[0, 0]
+        envs.step(np.array([[-1.0]]))
+        assert scene.slip == -0.5
+        assert envs.beds.pose[0, 0] - before == pytest.approx(scene.speed * envs.frames * envs.frame_time)
 
 
 def test_wrong_use_is_refused_in_one_line(cutter: Simulator, wheels: TrainedKinds) -> None:

@@ -228,7 +228,9 @@ class WheelControls(Controls):
 
     def _move(self, dt: float) -> None:
         slip = self.wanted["slip"]
-        travel = self.speed * (1.0 - slip if slip >= 0.0 else 1.0 / (1.0 + slip))
+        # As of `mpm_warp.Wheel`, whose slip follows from a travel speed, or the other way round.
+        as_given = slip >= 0.0 or getattr(self.scene, "travel_speed", None) is None
+        travel = self.speed * (1.0 - slip if as_given else 1.0 / (1.0 + slip))
         self.x = self._along(self.x + travel * dt)
         self.angle += self.speed * dt / self._radius
 

@@ -19,7 +19,7 @@ from sgns.model.checkpoint import load_surrogate, pretrained_file
 from sgns.model.training_range import TrainingRange
 from sgns.reduction.reduce import reduce_dataset
 from sgns.train.command import train
-from sgns.view.controls import ToolControls, rake_of
+from sgns.view.controls import ToolControls, WheelControls, rake_of
 from sgns.view.shown import FIELDS, Drive, driven_scene
 from sgns_testing.meshes import BOX_FACES, box_corners, write_obj
 from sgns_testing.runs import make_run
@@ -51,6 +51,15 @@ def test_a_tool_goes_where_the_sliders_say_and_no_faster() -> None:
     controls.reset()  # the rake is that of the slider
     assert rake_of(controls.pose()[3:]) == pytest.approx(22.0)
     assert tip(controls, controls.pose()) == pytest.approx(first)
+
+
+def test_a_braked_wheel_goes_as_its_scene_says() -> None:
+    for wheel in (replace(WHEEL, slip=-0.5), replace(WHEEL, travel_speed=2.0 * WHEEL.rim_speed)):
+        controls = WheelControls(wheel, WIDE, 60.0)
+        controls.hear({"way": 1.0})
+        path = np.array([controls.moved() for _ in range(20)])
+        assert wheel.slip == controls.wanted["slip"] == -0.5
+        assert 60.0 * (path[-1, 0] - path[-2, 0]) == pytest.approx(wheel.speed)
 
 
 def test_a_second_cut_lifts_goes_back_and_cuts_to_the_same_depth() -> None:
