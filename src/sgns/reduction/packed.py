@@ -51,7 +51,7 @@ def pack(reduced: ReducedDataset, folder: Path) -> str:
     step = PRECISION * math.sqrt(12.0 * basis.num_particles / basis.num_modes)
     runs = [_with_unseen(run, basis) for split in SPLITS for run in reduced.runs(split)]
     size = _write(folder / "runs_00.npz", runs, step)
-    parts = math.ceil(size / MOST_BYTES)
+    parts = min(math.ceil(size / MOST_BYTES), len(runs))
     if parts > 1:
         for part in range(parts):
             share = runs[part * len(runs) // parts : (part + 1) * len(runs) // parts]
