@@ -11,6 +11,7 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ import torch
 
 from mpm_warp.poses import in_body_frame
 from sgns.config import UserError, parse_yaml
-from sgns.data.files import read_json, read_table, write_whole
+from sgns.data.files import read_json, read_table, whole_file, write_whole
 from sgns.data.run import Run
 from sgns.model.checkpoint import (
     PRETRAINED,
@@ -88,22 +89,26 @@ def ship(name: str, evaluation: Path, packed: Path | None = None) -> Path:
     content = read_checkpoint(whole)
     names = [row["run"] for row in rows[:-1]]
     paths = of_rollouts(evaluation / "rollouts", names) if packed is None else of_packed(packed, names)
-    for modes in (torch.float16, torch.float32):
-        write_checkpoint(smaller(content, modes), target)
-        loss = measured_loss(whole, target, paths)
-        share = max(loss.soil / float(rows[-1]["rmse_total_mm"]), loss.force / float(rows[-1]["force_nrmse"]))
-        if share <= MOST_LOSS:
-            break
-    if target.stat().st_size > MOST_BYTES or share > MOST_LOSS:
-        size = target.stat().st_size
-        target.unlink()
-        raise UserError(
-            f"{whole} has {size / 1e6:.3g} MB with fewer digits, which cost {loss.words()}; at most "
-            f"{MOST_BYTES / 1e6:g} MB and {100 * MOST_LOSS:g} % of the error can ship: train with fewer modes"
-        )
-    stored = f"modes in {'half' if modes == torch.float16 else 'single'} precision, the rest in single"
-    digits = f"{stored}: {loss.words()}"
-    text = card(target, evaluation, packed, content["hyper_parameters"], made, rows, digits)
+    with TemporaryDirectory() as folder:  # until it is known to be good, nothing ships
+        small = Path(folder) / target.name
+        for modes in (torch.float16, torch.float32):
+            write_checkpoint(smaller(content, modes), small)
+            loss = measured_loss(whole, small, paths)
+            share = max(
+                loss.soil / float(rows[-1]["rmse_total_mm"]), loss.force / float(rows[-1]["force_nrmse"])
+            )
+            if share <= MOST_LOSS:
+                break
+        if (size := small.stat().st_size) > MOST_BYTES or share > MOST_LOSS:
+            raise UserError(
+                f"{whole} has {size / 1e6:.3g} MB with fewer digits, which cost {loss.words()}; at most "
+                f"{MOST_BYTES / 1e6:g} MB and {100 * MOST_LOSS:g} % of the error can ship: train with fewer modes"
+            )
+        stored = f"modes in {'half' if modes == torch.float16 else 'single'} precision, the rest in single"
+        digits = f"{stored}: {loss.words()}"
+        text = card(small, evaluation, packed, content["hyper_parameters"], made, rows, digits)
+        with whole_file(target) as hidden:
+            hidden.write_bytes(small.read_bytes())
     write_whole(target.with_suffix(".md"), text)
     return target
 

@@ -119,6 +119,10 @@ def test_what_is_too_large_or_loses_too_much_does_not_ship(
             UserError, match=r"MB with fewer digits, .* at most 0.001 MB .*: train with fewer modes"
         ):
             ship.ship("large", Path("report"))
+        before = (work.shipped / "small.ckpt").read_bytes()
+        with pytest.raises(UserError, match="train with fewer modes"):
+            ship.ship("small", Path("report"))
+        assert (work.shipped / "small.ckpt").read_bytes() == before
     monkeypatch.setattr(ship, "MOST_LOSS", 0.0)
     with pytest.raises(UserError, match=r"which cost .* mm RMS of the soil"):
         ship.ship("large", Path("report"))
